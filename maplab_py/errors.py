@@ -1,0 +1,25 @@
+"""The one exception tree. A message is one line for the user: what is wrong, where, and the remedy."""
+
+
+class MaplabError(Exception):
+    """Root of every error that this project raises on purpose."""
+
+
+class UserError(MaplabError):
+    """The request cannot be carried out as given; the user can change it (exit status 2)."""
+
+
+class FlagError(UserError):
+    """A flag is unknown, misspelt, or has a value that does not fit its type."""
+
+
+class MapError(UserError):
+    """A map or one of its files is missing, damaged or inconsistent. Names file and field."""
+
+
+class EstimationError(MaplabError):
+    """An estimation problem has no usable answer: nothing to optimise, singular, or diverged."""
+
+
+class Cancelled(MaplabError):
+    """The user cancelled the running command (exit status 130)."""

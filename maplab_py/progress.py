@@ -1,0 +1,34 @@
+"""How a long computation tells how far it is and learns that it shall stop."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """What algorithms see of the console: a bar, a line of text, and the wish to cancel."""
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        """Say that `done` of `total` is finished; raises Cancelled when the user wants to stop."""
+
+    def line(self, text: str) -> None:
+        """Print one line of intermediate result (a solver iteration)."""
+
+    def check(self) -> None:
+        """Raise Cancelled when the user wants to stop; cheap, call it in every long loop."""
+
+
+class SilentProgress:
+    """Progress that nobody watches and nobody cancels."""
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        """Do nothing."""
+
+    def line(self, text: str) -> None:
+        """Do nothing."""
+
+    def check(self) -> None:
+        """Do nothing."""
+
+
+SILENT: Progress = SilentProgress()

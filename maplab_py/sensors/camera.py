@@ -1,0 +1,64 @@
+"""One camera: projection, distortion and their parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+
+
+class Projection(Enum):
+    """Projection models (values: names in sensors.yaml)."""
+
+    PINHOLE = "pinhole"  # intrinsics fu fv cu cv
+    UNIFIED = "unified-projection"  # intrinsics xi fu fv cu cv
+
+
+class Distortion(Enum):
+    """Distortion models (values: names in sensors.yaml)."""
+
+    NONE = "none"
+    RADTAN = "radial-tangential"  # k1 k2 p1 p2
+    EQUIDISTANT = "equidistant"  # k1 k2 k3 k4
+    FOV = "fisheye"  # w
+
+
+INTRINSICS_SIZE = {Projection.PINHOLE: 4, Projection.UNIFIED: 5}
+DISTORTION_SIZE = {
+    Distortion.NONE: 0,
+    Distortion.RADTAN: 4,
+    Distortion.EQUIDISTANT: 4,
+    Distortion.FOV: 1,
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera. Pixels are of the distorted image; the optical axis is +z of C."""
+
+    id: str  # 32 hexadecimal digits
+    projection: Projection
+    distortion: Distortion
+    intrinsics: NDArray[np.float64]  # [fu fv cu cv] [px], unified: [xi fu fv cu cv]
+    distortion_parameters: NDArray[np.float64]
+    width_px: int
+    height_px: int
+    topic: str = ""
+    description: str = ""
+    time_offset_ns: int = 0  # t_imu = t_camera + offset
+    extra: dict[str, Any] = dataclasses.field(default_factory=dict)  # keys not understood
+
+    def __post_init__(self) -> None:
+        """Check the parameter counts."""
+        wanted = INTRINSICS_SIZE[self.projection], DISTORTION_SIZE[self.distortion]
+        given = len(self.intrinsics), len(self.distortion_parameters)
+        if wanted != given:
+            raise MapError(
+                f"camera {self.id}: {self.projection.value} with {self.distortion.value} distortion "
+                f"needs {wanted[0]} + {wanted[1]} parameters, not {given[0]} + {given[1]}"
+            )

@@ -1,0 +1,43 @@
+"""The inertial measurement unit: noise, saturation, gravity, and scale / misalignment."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def _identity() -> NDArray[np.float64]:
+    return np.eye(3)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImuIntrinsics:
+    """Scale, misalignment and internal rotation (thesis eq. 7.7-7.10).
+
+    w_measured = T_g w_I + b_g;  a_measured = T_a R_AI R_IG (a_G - g_G) + b_a, T upper triangular.
+    """
+
+    T_g: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
+    T_a: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
+    R_A_I: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Imu:
+    """IMU parameters; defaults are maplab's."""
+
+    id: str
+    acc_noise_density: float = 4e-3  # [m/s^2/sqrt(Hz)]
+    acc_bias_random_walk_noise_density: float = 4e-3  # [m/s^3/sqrt(Hz)]
+    gyro_noise_density: float = 1e-4  # [rad/s/sqrt(Hz)]
+    gyro_bias_random_walk_noise_density: float = 1e-4  # [rad/s^2/sqrt(Hz)]
+    saturation_accel_max_mps2: float = 150.0
+    saturation_gyro_max_radps: float = 7.5
+    gravity_magnitude_mps2: float = 9.81
+    intrinsics: ImuIntrinsics | None = None  # None = identity
+    topic: str = ""
+    description: str = ""
+    extra: dict[str, Any] = dataclasses.field(default_factory=dict)

@@ -1,0 +1,46 @@
+"""The visual-inertial map: an immutable value made of columnar tables."""
+
+from maplab_py.vimap.tables import (
+    NO_ROW,
+    AbsolutePoses,
+    Backbone,
+    BaseFrames,
+    Frames,
+    ImuEdges,
+    ImuSamples,
+    Keypoints,
+    LandmarkQuality,
+    Landmarks,
+    LoopClosureEdges,
+    Missions,
+    MissionSensor,
+    ResourceOwner,
+    Resources,
+    TransformationEdges,
+    TransformationKind,
+    Vertices,
+)
+from maplab_py.vimap.vi_map import MapMetadata, VIMap
+
+__all__ = [
+    "NO_ROW",
+    "AbsolutePoses",
+    "Backbone",
+    "BaseFrames",
+    "Frames",
+    "ImuEdges",
+    "ImuSamples",
+    "Keypoints",
+    "LandmarkQuality",
+    "Landmarks",
+    "LoopClosureEdges",
+    "MapMetadata",
+    "MissionSensor",
+    "Missions",
+    "ResourceOwner",
+    "Resources",
+    "TransformationEdges",
+    "TransformationKind",
+    "VIMap",
+    "Vertices",
+]

@@ -1,0 +1,79 @@
+"""128-bit ids: two uint64 words, printed as 32 lower-case hexadecimal digits, all zero = invalid."""
+
+from __future__ import annotations
+
+import uuid
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import UserError
+
+IdArray = NDArray[np.uint64]
+"""Ids as an array (..., 2) of uint64: the first 16 hexadecimal digits, then the last 16."""
+
+HEX_DIGITS = 32
+
+
+def to_hex(id_words: IdArray) -> str:
+    """Format one id (2,) as 32 hexadecimal digits."""
+    return f"{int(id_words[0]):016x}{int(id_words[1]):016x}"
+
+
+def to_hex_list(ids: IdArray) -> list[str]:
+    """Format ids (N, 2) as a list of N strings."""
+    return [f"{high:016x}{low:016x}" for high, low in ids.reshape(-1, 2).tolist()]
+
+
+def from_hex(text: str) -> IdArray:
+    """Parse 32 hexadecimal digits to an id (2,).
+
+    Raises:
+        UserError: The text is not an id.
+    """
+    stripped = text.strip().lower()
+    if len(stripped) != HEX_DIGITS or any(c not in "0123456789abcdef" for c in stripped):
+        raise UserError(f"'{text}' is not an id: 32 hexadecimal digits are wanted")
+    return np.array([int(stripped[:16], 16), int(stripped[16:], 16)], dtype=np.uint64)
+
+
+def invalid(count: int) -> IdArray:
+    """Return `count` invalid (all zero) ids."""
+    return np.zeros((count, 2), dtype=np.uint64)
+
+
+def is_valid(ids: IdArray) -> NDArray[np.bool_]:
+    """Tell for ids (..., 2) which are not all zero."""
+    return np.asarray(np.any(ids != 0, axis=-1))
+
+
+def random_ids(count: int, rng: np.random.Generator | None = None) -> IdArray:
+    """Draw `count` new ids; from the operating system's entropy unless a generator is given."""
+    if rng is None:
+        rng = np.random.default_rng(uuid.uuid4().int)
+    return rng.integers(1, np.iinfo(np.uint64).max, size=(count, 2), dtype=np.uint64)
+
+
+def as_keys(ids: IdArray) -> NDArray[np.void]:
+    """View ids (N, 2) as N opaque 16-byte keys that sort, compare and go through np.unique."""
+    contiguous = np.ascontiguousarray(ids, dtype=">u8")
+    return contiguous.view("V16").reshape(-1)
+
+
+class IdIndex:
+    """Row look-up for a column of unique ids."""
+
+    def __init__(self, ids: IdArray) -> None:
+        """Index ids (N, 2)."""
+        self._order = np.lexsort((ids[:, 1], ids[:, 0]))
+        self._sorted = ids[self._order]
+
+    def rows(self, ids: IdArray) -> NDArray[np.int64]:
+        """Return the row of every id (N, 2), -1 where it is not in the column."""
+        if len(self._sorted) == 0 or len(ids) == 0:
+            return np.full(len(ids), -1, dtype=np.int64)
+        words, inverse = np.unique(np.concatenate([self._sorted, ids]), axis=0, return_inverse=True)
+        inverse = inverse.reshape(-1)
+        row_of_word = np.full(len(words), -1, dtype=np.int64)
+        row_of_word[inverse[: len(self._sorted)]] = self._order
+        return np.asarray(row_of_word[inverse[len(self._sorted) :]])

@@ -1,0 +1,128 @@
+"""Tables: frozen dataclasses of numpy arrays that share their first axis."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+
+def column(dtype: DTypeLike, *shape: int, fill: Any = 0) -> Any:
+    """Declare one column: rows of `shape` entries of `dtype`; -1 in the shape takes any width.
+
+    Args:
+        dtype: Type of the entries.
+        shape: Shape of one row, empty for a scalar column.
+        fill: Value that `Table.filled` gives to a column which was not named (one row or a scalar).
+    """
+    return dataclasses.field(metadata={"dtype": np.dtype(dtype), "shape": shape, "fill": fill})
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """Base of all tables. Columns are read-only: an edit makes a new table that shares the rest."""
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes, and lock the columns against writing."""
+        length = -1
+        for field in dataclasses.fields(self):
+            array = np.asarray(getattr(self, field.name), dtype=field.metadata["dtype"])
+            length = array.shape[0] if length < 0 else length
+            wanted = field.metadata["shape"]
+            fits = len(array.shape) == 1 + len(wanted) and all(
+                w in (-1, n) for w, n in zip(wanted, array.shape[1:], strict=True)
+            )
+            if not fits or array.shape[0] != length:
+                raise ValueError(
+                    f"{type(self).__name__}.{field.name}: shape {array.shape} does not fit "
+                    f"{length} rows of {wanted}"
+                )
+            if array.flags.writeable:
+                array = array.view()
+                array.flags.writeable = False
+            object.__setattr__(self, field.name, array)
+
+    def __len__(self) -> int:
+        first = dataclasses.fields(self)[0].name
+        return int(getattr(self, first).shape[0])
+
+    @classmethod
+    def filled(cls, length: int, **columns: ArrayLike) -> Self:
+        """Make a table of `length` rows; columns that are not given get their fill value."""
+        values: dict[str, Any] = {}
+        for field in dataclasses.fields(cls):
+            if field.name in columns:
+                values[field.name] = columns.pop(field.name)
+                continue
+            row = tuple(max(n, 0) for n in field.metadata["shape"])
+            array = np.empty((length, *row), dtype=field.metadata["dtype"])
+            array[...] = field.metadata["fill"]
+            values[field.name] = array
+        if columns:
+            raise TypeError(f"{cls.__name__} has no column {', '.join(sorted(columns))}")
+        return cls(**values)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Make a table without rows."""
+        return cls.filled(0)
+
+    def replace(self, **columns: ArrayLike) -> Self:
+        """Return a table with some columns exchanged and all others shared."""
+        return dataclasses.replace(self, **columns)
+
+    def take(self, rows: ArrayLike) -> Self:
+        """Return the table of the given rows (indices or a boolean mask)."""
+        index = np.asarray(rows)
+        return type(self)(**{name: array[index] for name, array in self.columns().items()})
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @classmethod
+    def concatenate(cls, tables: list[Self]) -> Self:
+        """Stack tables; columns of free width are padded with zeros to the widest."""
+        if not tables:
+            return cls.empty()
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{n: _stack([getattr(table, n) for table in tables]) for n in names})
+
+    def nbytes(self) -> int:
+        """Return the memory of all columns in bytes."""
+        return sum(array.nbytes for array in self.columns().values())
+
+
+def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    if arrays[0].ndim == 2:
+        width = max(array.shape[1] for array in arrays)
+        arrays = [
+            array
+            if array.shape[1] == width
+            else np.pad(array, ((0, 0), (0, width - array.shape[1])))
+            for array in arrays
+        ]
+    return np.concatenate(arrays)
+
+
+def ragged_rows(start: NDArray[np.int64], rows: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the item indices that belong to the given rows of a CSR layout, in row order.
+
+    Args:
+        start: Offsets (N + 1): items of row i are start[i] .. start[i + 1] - 1.
+        rows: Row indices (M,).
+    """
+    counts = start[1:][rows] - start[:-1][rows]
+    ends = np.cumsum(counts)
+    total = int(ends[-1]) if len(ends) else 0
+    shift = np.repeat(start[:-1][rows] - (ends - counts), counts)
+    return np.asarray(np.arange(total, dtype=np.int64) + shift)
+
+
+def starts_of_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
+    """Turn counts (N,) into CSR offsets (N + 1,)."""
+    start = np.zeros(len(counts) + 1, dtype=np.int64)
+    np.cumsum(counts, out=start[1:])
+    return start

@@ -1,0 +1,157 @@
+"""The VI-map itself: one frozen value that holds every table."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3
+from maplab_py.sensors import SensorSet
+from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap.table import starts_of_counts
+from maplab_py.vimap.tables import (
+    AbsolutePoses,
+    BaseFrames,
+    Frames,
+    ImuEdges,
+    ImuSamples,
+    Keypoints,
+    Landmarks,
+    LoopClosureEdges,
+    Missions,
+    Resources,
+    TransformationEdges,
+    Vertices,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class MapMetadata:
+    """What the map folder's `metadata` file says."""
+
+    description: str = ""
+    map_folder: str = ""
+    resource_folder_in_use: int = -1  # -1 = the map's own
+    map_resource_folder: str = "./resources/"
+    external_resource_folders: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VIMap:
+    """A visual-inertial map. Never written into: edits return a new map that shares columns.
+
+    Derived look-ups (offsets, observations by landmark, id indices) are computed at first use
+    and kept with the value.
+    """
+
+    sensors: SensorSet = dataclasses.field(default_factory=SensorSet)
+    metadata: MapMetadata = dataclasses.field(default_factory=MapMetadata)
+    missions: Missions = dataclasses.field(default_factory=Missions.empty)
+    baseframes: BaseFrames = dataclasses.field(default_factory=BaseFrames.empty)
+    vertices: Vertices = dataclasses.field(default_factory=Vertices.empty)
+    frames: Frames = dataclasses.field(default_factory=Frames.empty)
+    keypoints: Keypoints = dataclasses.field(default_factory=Keypoints.empty)
+    landmarks: Landmarks = dataclasses.field(default_factory=Landmarks.empty)
+    imu_edges: ImuEdges = dataclasses.field(default_factory=ImuEdges.empty)
+    imu_samples: ImuSamples = dataclasses.field(default_factory=ImuSamples.empty)
+    transformation_edges: TransformationEdges = dataclasses.field(
+        default_factory=TransformationEdges.empty
+    )
+    loop_closure_edges: LoopClosureEdges = dataclasses.field(default_factory=LoopClosureEdges.empty)
+    absolute_poses: AbsolutePoses = dataclasses.field(default_factory=AbsolutePoses.empty)
+    resources: Resources = dataclasses.field(default_factory=Resources.empty)
+
+    def replace(self, **parts: Any) -> Self:
+        """Return a map with some tables exchanged and all others shared."""
+        return dataclasses.replace(self, **parts)
+
+    # -- offsets of ragged tables ---------------------------------------------------------------
+
+    @cached_property
+    def keypoint_start(self) -> NDArray[np.int64]:
+        """Offsets (F + 1): keypoints of frame f are rows start[f] .. start[f + 1] - 1."""
+        return starts_of_counts(self.frames.keypoint_count)
+
+    @cached_property
+    def sample_start(self) -> NDArray[np.int64]:
+        """Offsets (E + 1): samples of IMU edge e are rows start[e] .. start[e + 1] - 1."""
+        return starts_of_counts(self.imu_edges.sample_count)
+
+    @cached_property
+    def frame_start(self) -> NDArray[np.int64]:
+        """Offsets (V + 1): frames of vertex v are rows start[v] .. start[v + 1] - 1."""
+        return starts_of_counts(np.bincount(self.frames.vertex, minlength=len(self.vertices)))
+
+    @cached_property
+    def vertex_start(self) -> NDArray[np.int64]:
+        """Offsets (M + 1): vertices of mission m are rows start[m] .. start[m + 1] - 1."""
+        return starts_of_counts(np.bincount(self.vertices.mission, minlength=len(self.missions)))
+
+    # -- keypoints and observations -------------------------------------------------------------
+
+    @cached_property
+    def keypoint_frame(self) -> NDArray[np.int32]:
+        """Frame row of every keypoint (K,)."""
+        rows = np.arange(len(self.frames), dtype=np.int32)
+        return np.repeat(rows, self.frames.keypoint_count)
+
+    @cached_property
+    def keypoint_vertex(self) -> NDArray[np.int32]:
+        """Vertex row of every keypoint (K,)."""
+        return self.frames.vertex[self.keypoint_frame]
+
+    @cached_property
+    def observations(self) -> NDArray[np.int64]:
+        """Keypoint rows (O,) that observe a landmark, sorted by landmark row, then keypoint row."""
+        observing = np.flatnonzero(self.keypoints.landmark >= 0)
+        order = np.argsort(self.keypoints.landmark[observing], kind="stable")
+        return observing[order]
+
+    @cached_property
+    def observation_start(self) -> NDArray[np.int64]:
+        """Offsets (L + 1) into `observations` by landmark row."""
+        observed = self.keypoints.landmark[self.observations]
+        return starts_of_counts(np.bincount(observed, minlength=len(self.landmarks)))
+
+    # -- poses in G -----------------------------------------------------------------------------
+
+    @cached_property
+    def T_G_M(self) -> NDArray[np.float64]:
+        """Base-frame pose of every mission (M, 7)."""
+        return self.baseframes.T_G_M[self.missions.baseframe]
+
+    @cached_property
+    def T_G_I(self) -> NDArray[np.float64]:
+        """Pose of every vertex in G (V, 7)."""
+        return se3.compose(self.T_G_M[self.vertices.mission], self.vertices.T_M_I)
+
+    @cached_property
+    def p_G(self) -> NDArray[np.float64]:
+        """Position of every landmark in G (L, 3)."""
+        return se3.transform(self.T_G_I[self.landmarks.vertex], self.landmarks.p_I)
+
+    # -- ids ------------------------------------------------------------------------------------
+
+    @cached_property
+    def mission_index(self) -> IdIndex:
+        """Look-up of mission rows by id."""
+        return IdIndex(self.missions.id)
+
+    @cached_property
+    def vertex_index(self) -> IdIndex:
+        """Look-up of vertex rows by id."""
+        return IdIndex(self.vertices.id)
+
+    @cached_property
+    def landmark_index(self) -> IdIndex:
+        """Look-up of landmark rows by id."""
+        return IdIndex(self.landmarks.id)
+
+    def nbytes(self) -> int:
+        """Return the memory of all tables in bytes (shared columns counted once each)."""
+        tables = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return sum(table.nbytes() for table in tables if hasattr(table, "nbytes"))
