@@ -1,0 +1,1 @@
+"""The built-in commands, one module per plugin, on the public plugin surface only."""
