@@ -147,7 +147,8 @@ def right_jacobian(phi: ArrayLike) -> F64:
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = angle < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    # 1 - cos(a) = 2 sin(a/2)^2 does not cancel
+    a = np.where(small, 0.5 - angle**2 / 24.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe**2)
     b = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     return np.asarray(np.eye(3) - a * K + b * (K @ K))
 
@@ -159,6 +160,7 @@ def right_jacobian_inverse(phi: ArrayLike) -> F64:
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = angle < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
-    closed = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    # (1 + cos(a)) / sin(a) = cot(a/2) is exact at pi
+    closed = 1.0 / safe**2 - 1.0 / (2.0 * safe * np.tan(0.5 * safe))
     b = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, closed)
     return np.asarray(np.eye(3) + 0.5 * K + b * (K @ K))
