@@ -1,0 +1,227 @@
+"""Lens distortion on the z = 1 plane: forward with Jacobians, and undone.
+
+All radial models are written x_d = s(r) x with r = |x|, so that with s' = ds/dr
+dx_d/dx = s I + (s'/r) x x^T, where s and s'/r are smooth at r = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.sensors.camera import Distortion
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Distorted = tuple[F64, F64, F64]
+"""Distorted points (..., 2), d/dx (..., 2, 2), d/dparameters (..., 2, n)."""
+
+_SMALL_RADIUS = 1e-3
+"""Below this radius series replace quotients by r; their error is under 1e-12."""
+_SMALL_FOV_RAD = 1e-4
+"""Below this field-of-view parameter the FOV model is replaced by its series in w."""
+_MAX_ITERATIONS = 50
+_CONVERGED = 1e-12
+"""Largest change of an undistorted point in the last Newton step."""
+
+
+def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
+    """Distort points (..., 2) of the z = 1 plane and differentiate."""
+    return _FORWARD[kind](parameters, x)
+
+
+def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
+    """Return undistorted points (..., 2) and whether they were found (...,).
+
+    Points beyond the image of the model (for radial-tangential and equidistant: beyond the radius
+    up to which the distortion grows) are not found; their value is without meaning, but finite.
+    """
+    if kind is Distortion.NONE:
+        return x_d, np.ones(x_d.shape[:-1], dtype=np.bool_)
+    if kind is Distortion.FOV:
+        return _undistort_fov(parameters, x_d)
+    if kind is Distortion.EQUIDISTANT:
+        return _undistort_equidistant(parameters, x_d)
+    return _undistort_radtan(parameters, x_d)
+
+
+def largest_radius(kind: Distortion, parameters: F64) -> float:
+    """Return the radius on the z = 1 plane up to which the distorted radius grows.
+
+    Beyond it the polynomial models fold back and show points that no lens would.
+    """
+    if kind is Distortion.RADTAN:
+        return float(np.sqrt(_first_root([1.0, 3 * parameters[0], 5 * parameters[1]])))
+    if kind is Distortion.EQUIDISTANT:
+        theta = _largest_theta(parameters)
+        return float(np.tan(theta)) if theta < 0.5 * np.pi else float(np.inf)
+    return float(np.inf)
+
+
+def _largest_theta(k: F64) -> float:
+    return float(np.sqrt(_first_root([1.0, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]])))
+
+
+def _first_root(ascending: list[float]) -> float:
+    """Return the smallest positive real root of a polynomial, infinity when there is none."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.array(ascending), "b"))
+    real = roots.real[np.abs(roots.imag) <= 1e-12 * np.maximum(np.abs(roots.real), 1e-300)]
+    positive = real[real > 0.0]
+    return float(positive.min()) if len(positive) else float(np.inf)
+
+
+def _none(parameters: F64, x: F64) -> Distorted:
+    J = np.broadcast_to(np.eye(2), (*x.shape[:-1], 2, 2))
+    return x, J, np.zeros((*x.shape, len(parameters)))
+
+
+def _radial(x: F64, s: F64, ds_over_r: F64, ds_dparameters: F64) -> Distorted:
+    """Assemble x_d = s x; s, ds_over_r (...,), ds_dparameters (..., n)."""
+    J = s[..., None, None] * np.eye(2)
+    J = J + ds_over_r[..., None, None] * x[..., :, None] * x[..., None, :]
+    return s[..., None] * x, J, x[..., :, None] * ds_dparameters[..., None, :]
+
+
+def _radtan(parameters: F64, x: F64) -> Distorted:
+    """Brown's model, k1 k2 p1 p2, as OpenCV orders them."""
+    k1, k2, p1, p2 = (float(k) for k in parameters)
+    u, v = x[..., 0], x[..., 1]
+    r2, uv = u * u + v * v, u * v
+    s = 1.0 + k1 * r2 + k2 * r2**2
+    radial, J, d_radial = _radial(x, s, 2.0 * k1 + 4.0 * k2 * r2, np.stack([r2, r2**2], axis=-1))
+    tangential = np.stack(
+        [2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u), p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1
+    )
+    J[..., 0, 0] += 2.0 * p1 * v + 6.0 * p2 * u
+    J[..., 0, 1] += 2.0 * p1 * u + 2.0 * p2 * v
+    J[..., 1, 0] += 2.0 * p1 * u + 2.0 * p2 * v
+    J[..., 1, 1] += 6.0 * p1 * v + 2.0 * p2 * u
+    d_p1 = np.stack([2.0 * uv, r2 + 2.0 * v * v], axis=-1)
+    d_p2 = np.stack([r2 + 2.0 * u * u, 2.0 * uv], axis=-1)
+    d_tangential = np.stack([d_p1, d_p2], axis=-1)
+    return radial + tangential, J, np.concatenate([d_radial, d_tangential], axis=-1)
+
+
+def _equidistant(parameters: F64, x: F64) -> Distorted:
+    """Kannala and Brandt, PAMI 2006: r_d = theta (1 + k1 theta^2 + ... + k4 theta^8)."""
+    k = parameters
+    r = np.linalg.norm(x, axis=-1)
+    small = r < _SMALL_RADIUS
+    safe = np.where(small, 1.0, r)
+    theta = np.arctan(r)
+    ratio = np.where(small, 1.0 - r**2 / 3.0 + r**4 / 5.0, theta / safe)
+    powers = theta[..., None] ** np.array([2, 4, 6, 8])
+    s = ratio * (1.0 + powers @ k)
+    dr_d = (1.0 + powers @ (k * np.array([3.0, 5.0, 7.0, 9.0]))) / (1.0 + r**2)
+    series = 2.0 * (k[0] - 1.0 / 3.0) + 4.0 * (0.2 - k[0] + k[1]) * r**2
+    ds_over_r = np.where(small, series, (dr_d - s) / safe**2)
+    return _radial(x, s, ds_over_r, ratio[..., None] * powers)
+
+
+def _fov(parameters: F64, x: F64) -> Distorted:
+    """Devernay and Faugeras, MVA 2001: r_d = atan(2 r tan(w/2)) / w, as maplab's fisheye."""
+    w = float(parameters[0])
+    r = np.linalg.norm(x, axis=-1)
+    if abs(w) < _SMALL_FOV_RAD:
+        # r_d = r (1 + w^2 (1/12 - r^2/3)) + O(w^4)
+        bend = 1.0 / 12.0 - r**2 / 3.0
+        return _radial(
+            x, 1.0 + w**2 * bend, np.full_like(r, -2.0 / 3.0 * w**2), (2.0 * w * bend)[..., None]
+        )
+    m = 2.0 * np.tan(0.5 * w)
+    small = r < _SMALL_RADIUS
+    safe = np.where(small, 1.0, r)
+    u = m * r
+    slope = m / (w * (1.0 + u**2))
+    s = np.where(small, m / w * (1.0 - u**2 / 3.0 + u**4 / 5.0), np.arctan(u) / (w * safe))
+    series = m**3 / w * (-2.0 / 3.0 + 0.8 * u**2)
+    ds_over_r = np.where(small, series, (slope - s) / safe**2)
+    # dm/dw = 1 + tan(w/2)^2
+    ds_dw = -s / w + (1.0 + 0.25 * m**2) / (w * (1.0 + u**2))
+    return _radial(x, s, ds_over_r, ds_dw[..., None])
+
+
+_FORWARD: dict[Distortion, Callable[[F64, F64], Distorted]] = {
+    Distortion.NONE: _none,
+    Distortion.RADTAN: _radtan,
+    Distortion.EQUIDISTANT: _equidistant,
+    Distortion.FOV: _fov,
+}
+
+
+def _undistort_fov(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
+    """Closed form: r = tan(w r_d) / (2 tan(w/2)), for w r_d < pi/2."""
+    w = float(parameters[0])
+    r_d = np.linalg.norm(x_d, axis=-1)
+    if abs(w) < _SMALL_FOV_RAD:
+        scale = 1.0 - w**2 * (1.0 / 12.0 - r_d**2 / 3.0)
+        return scale[..., None] * x_d, np.ones(r_d.shape, dtype=np.bool_)
+    m = 2.0 * np.tan(0.5 * w)
+    angle = abs(w) * r_d
+    found = angle < 0.5 * np.pi
+    angle = np.where(found, angle, 0.0)
+    small = r_d < _SMALL_RADIUS
+    safe = np.where(small, 1.0, r_d)
+    series = w / m * (1.0 + angle**2 / 3.0 + 2.0 * angle**4 / 15.0)
+    scale = np.where(small, series, np.tan(angle) / (abs(m) * safe))
+    return scale[..., None] * x_d, found
+
+
+def _undistort_equidistant(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
+    """Newton's method on theta, which is one-dimensional and monotone up to the largest theta."""
+    k = parameters
+    r_d = np.linalg.norm(x_d, axis=-1)
+    limit = min(_largest_theta(k), 0.5 * np.pi)
+    theta = np.minimum(r_d, 0.9 * limit)
+    step = np.full_like(theta, np.inf)
+    for _ in range(_MAX_ITERATIONS):
+        powers = theta[..., None] ** np.array([2, 4, 6, 8])
+        value = theta * (1.0 + powers @ k) - r_d
+        slope = 1.0 + powers @ (k * np.array([3.0, 5.0, 7.0, 9.0]))
+        step = value / np.maximum(slope, 1e-6)
+        theta = np.clip(theta - step, 0.0, limit)
+        if np.all(np.abs(step) < _CONVERGED):
+            break
+    found = (np.abs(step) < _CONVERGED) & (theta < limit)
+    theta = np.where(found, theta, 0.0)
+    small = r_d < _SMALL_RADIUS
+    safe = np.where(small, 1.0, r_d)
+    # theta = r_d - k1 r_d^3, tan(theta) = theta + theta^3 / 3, to O(r_d^5)
+    series = 1.0 + (1.0 / 3.0 - k[0]) * r_d**2
+    return np.where(small, series, np.tan(theta) / safe)[..., None] * x_d, found
+
+
+def _undistort_radtan(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
+    """Newton's method on the plane, kept inside the radius where the model grows."""
+    limit = largest_radius(Distortion.RADTAN, parameters)
+    x = _shorten(x_d, 0.9 * limit)
+    change = np.full(x.shape[:-1], np.inf)
+    for _ in range(_MAX_ITERATIONS):
+        value, J, _ = _radtan(parameters, x)
+        error = value - x_d
+        determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+        step = np.stack(
+            [
+                J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1],
+                J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0],
+            ],
+            axis=-1,
+        )
+        moved = _shorten(x - step / determinant[..., None], limit)
+        change = np.linalg.norm(moved - x, axis=-1)
+        x = moved
+        if np.all(change <= _CONVERGED * (1.0 + np.linalg.norm(x, axis=-1))):
+            break
+    radius = np.linalg.norm(x, axis=-1)
+    residual = np.linalg.norm(_radtan(parameters, x)[0] - x_d, axis=-1)
+    near = residual <= 100.0 * _CONVERGED * (1.0 + radius)
+    return x, near & (change <= _CONVERGED * (1.0 + radius)) & (radius < limit)
+
+
+def _shorten(x: F64, limit: float) -> F64:
+    """Scale points (..., 2) down to at most `limit` in length."""
+    radius = np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.asarray(x * np.minimum(1.0, limit / np.maximum(radius, 1e-300)))

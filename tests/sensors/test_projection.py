@@ -1,0 +1,209 @@
+"""Camera models against OpenCV, numeric differences and their own inverses."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.sensors.projection import (
+    back_project,
+    is_inside_image,
+    project,
+    project_with_jacobians,
+)
+
+INTRINSICS = {
+    Projection.PINHOLE: [458.65, 457.30, 367.22, 248.38],
+    Projection.UNIFIED: [0.9, 458.65, 457.30, 367.22, 248.38],
+}
+DISTORTION = {
+    Distortion.NONE: [],
+    Distortion.RADTAN: [-0.2834, 0.0740, 1.936e-4, 1.762e-5],
+    Distortion.EQUIDISTANT: [-0.0132, 0.0207, -0.0128, 0.0025],
+    Distortion.FOV: [0.9325],
+}
+MODELS = [(p, d) for p in Projection for d in Distortion]
+
+
+def make_camera(projection: Projection, distortion: Distortion) -> Camera:
+    return Camera(
+        id="0" * 31 + "1",
+        projection=projection,
+        distortion=distortion,
+        intrinsics=np.array(INTRINSICS[projection]),
+        distortion_parameters=np.array(DISTORTION[distortion]),
+        width_px=752,
+        height_px=480,
+    )
+
+
+def points(count: int = 500, widest: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(7)
+    xy = rng.uniform(-widest, widest, (count, 2))
+    depth = rng.uniform(0.2, 20.0, (count, 1))
+    return np.concatenate([xy * depth, depth], axis=1)
+
+
+def numeric(function, x: np.ndarray, step: float = 1e-6) -> np.ndarray:
+    columns = []
+    for i in range(x.shape[-1]):
+        d = np.zeros(x.shape[-1])
+        d[i] = step
+        columns.append((function(x + d) - function(x - d)) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize(("projection", "distortion"), MODELS)
+def test_jacobians_equal_numeric_differences(projection, distortion) -> None:
+    camera = make_camera(projection, distortion)
+    p = points(200)
+    p[0], p[1] = [0.0, 0.0, 2.0], [1e-5, -2e-5, 1.0]
+    _, d_p, d_k, visible = project_with_jacobians(camera, p)
+    assert visible.all()
+    expected = numeric(lambda q: project(camera, q)[0], p)
+    assert np.max(np.abs(d_p - expected)) < 1e-6 * np.max(np.abs(expected))
+
+    size = len(camera.intrinsics)
+
+    def of_parameters(k: np.ndarray) -> np.ndarray:
+        changed = dataclasses.replace(
+            camera, intrinsics=k[0, :size], distortion_parameters=k[0, size:]
+        )
+        return project(changed, p)[0]
+
+    k = np.concatenate([camera.intrinsics, camera.distortion_parameters])[None]
+    expected = numeric(of_parameters, k, 1e-5)
+    assert d_k.shape == (200, 2, k.shape[1])
+    for column in range(k.shape[1]):
+        scale = max(float(np.max(np.abs(expected[..., column]))), 1.0)
+        assert np.max(np.abs(d_k[..., column] - expected[..., column])) < 1e-6 * scale
+
+
+@pytest.mark.parametrize(("projection", "distortion"), MODELS)
+def test_back_projection_inverts_projection(projection, distortion) -> None:
+    camera = make_camera(projection, distortion)
+    p = np.concatenate([points(300, 1.2), [[0.0, 0.0, 1.0], [1e-7, 0.0, 1.0]]])
+    uv, visible = project(camera, p)
+    ray, valid = back_project(camera, uv)
+    assert visible.all()
+    assert valid.all()
+    assert np.max(np.abs(ray - p / np.linalg.norm(p, axis=1, keepdims=True))) < 1e-9
+
+
+def test_fov_reaches_the_radius_of_the_tango_camera() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.FOV)
+    angle = np.linspace(0.0, 2 * np.pi, 100)
+    p = np.stack([2.84 * np.cos(angle), 2.84 * np.sin(angle), np.ones(100)], axis=1)
+    ray, valid = back_project(camera, project(camera, p)[0])
+    assert valid.all()
+    assert np.max(np.abs(ray / ray[:, 2:] - p)) < 1e-12 * 10
+
+
+def test_fov_formula_is_maplabs() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.FOV)
+    w, (fu, fv, cu, cv) = 0.9325, camera.intrinsics
+    uv, _ = project(camera, np.array([0.3, -0.4, 1.0]))
+    scale = np.arctan(2 * 0.5 * np.tan(w / 2)) / w / 0.5
+    assert uv == pytest.approx([fu * scale * 0.3 + cu, -fv * scale * 0.4 + cv], abs=1e-12)
+
+
+@pytest.mark.parametrize("w", [0.0, 1e-5, 0.99e-4, 1.01e-4, 1e-3])
+def test_fov_with_almost_no_distortion_is_continuous(w) -> None:
+    camera = dataclasses.replace(
+        make_camera(Projection.PINHOLE, Distortion.FOV), distortion_parameters=np.array([w])
+    )
+    straight = make_camera(Projection.PINHOLE, Distortion.NONE)
+    p = points(50)
+    uv, _, d_k, _ = project_with_jacobians(camera, p)
+    assert np.allclose(uv, project(straight, p)[0], atol=500 * w * w + 1e-9)
+    x = p[:, :2] / p[:, 2:]
+    bend = 2 * w * (1 / 12 - np.sum(x * x, axis=1) / 3)
+    expected = camera.intrinsics[:2] * x * bend[:, None]
+    assert np.allclose(d_k[:, :, 4], expected, atol=1e-4 * max(w, 1e-4) * 500)
+    assert np.allclose(back_project(camera, uv)[0], p / np.linalg.norm(p, axis=1)[:, None])
+
+
+def test_radtan_agrees_with_opencv() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.RADTAN)
+    p = points()
+    K = np.array([[458.65, 0, 367.22], [0, 457.30, 248.38], [0, 0, 1.0]])
+    uv, jacobian = cv2.projectPoints(p, np.zeros(3), np.zeros(3), K, camera.distortion_parameters)
+    mine, d_p, d_k, _ = project_with_jacobians(camera, p)
+    assert np.max(np.abs(mine - uv[:, 0])) < 1e-9
+    # OpenCV: rotation 3, translation 3, focal 2, centre 2, distortion
+    theirs = jacobian.reshape(len(p), 2, -1)
+    assert np.allclose(d_p, theirs[:, :, 3:6], rtol=1e-9, atol=1e-9)
+    assert np.allclose(d_k, theirs[:, :, 6:14], rtol=1e-9, atol=1e-9)
+
+
+def test_equidistant_agrees_with_opencv() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.EQUIDISTANT)
+    p = points()
+    K = np.array([[458.65, 0, 367.22], [0, 457.30, 248.38], [0, 0, 1.0]])
+    uv, _ = cv2.fisheye.projectPoints(
+        p[:, None], np.zeros(3), np.zeros(3), K, camera.distortion_parameters
+    )
+    assert np.max(np.abs(project(camera, p)[0] - uv[:, 0])) < 1e-9
+
+
+def test_points_behind_are_not_visible_and_stay_finite() -> None:
+    for projection, distortion in MODELS:
+        camera = make_camera(projection, distortion)
+        p = np.array([[0.1, 0.2, -1.0], [0.0, 0.0, 0.0], [0.1, 0.0, 1.0], [0.0, 0.0, -3.0]])
+        uv, d_p, d_k, visible = project_with_jacobians(camera, p)
+        assert visible.tolist() == [False, False, True, False]
+        assert np.isfinite(uv).all()
+        assert np.isfinite(d_p).all()
+        assert np.isfinite(d_k).all()
+
+
+def test_unified_sees_sideways_and_a_little_behind() -> None:
+    camera = make_camera(Projection.UNIFIED, Distortion.NONE)
+    p = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -0.5], [0.1, 0.0, -1.0]])
+    uv, visible = project(camera, p)
+    assert visible.tolist() == [True, True, False]
+    ray, valid = back_project(camera, uv)
+    assert valid[:2].all()
+    assert np.allclose(ray[:2], p[:2] / np.linalg.norm(p[:2], axis=1)[:, None])
+
+
+def test_folded_distortion_is_not_visible() -> None:
+    camera = dataclasses.replace(
+        make_camera(Projection.PINHOLE, Distortion.RADTAN),
+        distortion_parameters=np.array([-0.3, 0.0, 0.0, 0.0]),
+    )
+    # r (1 - 0.3 r^2) grows up to r = 1.054 only
+    p = np.array([[1.0, 0.0, 1.0], [1.1, 0.0, 1.0], [1.8, 0.0, 1.0]])
+    assert project(camera, p)[1].tolist() == [True, False, False]
+    beyond = camera.intrinsics[2] + camera.intrinsics[0] * np.array([0.70, 0.71])
+    uv = np.stack([beyond, np.full(2, camera.intrinsics[3])], axis=1)
+    assert back_project(camera, uv)[1].tolist() == [True, False]
+
+
+def test_pixels_without_a_ray_are_flagged() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.FOV)
+    ray, valid = back_project(camera, np.array([[1e4, 0.0], [np.nan, 0.0], [367.0, 248.0]]))
+    assert valid.tolist() == [False, False, True]
+    assert np.isfinite(ray).all()
+
+
+def test_batches_of_any_shape() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.RADTAN)
+    p = points(24).reshape(2, 3, 4, 3)
+    uv, d_p, d_k, visible = project_with_jacobians(camera, p)
+    assert (uv.shape, d_p.shape, d_k.shape) == ((2, 3, 4, 2), (2, 3, 4, 2, 3), (2, 3, 4, 2, 8))
+    assert visible.shape == (2, 3, 4)
+    assert project(camera, p[0, 0, 0])[0] == pytest.approx(uv[0, 0, 0])
+    assert project(camera, np.zeros((0, 3)))[0].shape == (0, 2)
+    assert back_project(camera, uv)[0].shape == p.shape
+
+
+def test_inside_image_is_half_open() -> None:
+    camera = make_camera(Projection.PINHOLE, Distortion.NONE)
+    uv = np.array([[0.0, 0.0], [751.9, 479.9], [752.0, 10.0], [-0.1, 5.0], [5.0, 5.0]])
+    assert is_inside_image(camera, uv).tolist() == [True, True, False, False, True]
+    assert is_inside_image(camera, uv, 10.0).tolist() == [False] * 5
