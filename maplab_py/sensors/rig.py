@@ -21,3 +21,4 @@ class CameraRig:
     topic: str = ""
     description: str = ""
     extra: dict[str, Any] = dataclasses.field(default_factory=dict)
+    camera_extra: tuple[dict[str, Any], ...] = ()  # per camera: other keys beside T_B_C, or empty

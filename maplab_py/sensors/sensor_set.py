@@ -30,6 +30,7 @@ class Extrinsics:
 
     base_sensor_id: str
     T_B_S: NDArray[np.float64]  # (7,)
+    extra: dict[str, Any] = dataclasses.field(default_factory=dict)  # other keys, matrix as read
 
 
 Sensor = CameraRig | Imu | OtherSensor
@@ -69,3 +70,38 @@ class SensorSet:
         """Return the pose (7,) of a sensor on its base; identity when it has no entry."""
         entry = self.extrinsics.get(sensor_id)
         return se3.identity() if entry is None else entry.T_B_S
+
+    def T_I_C(self, imu_id: str, ncamera_id: str) -> NDArray[np.float64]:
+        """Return the poses (n, 7) of a rig's cameras on the IMU.
+
+        Raises:
+            MapError: A sensor is missing, or no chain of base sensors joins the two.
+        """
+        imu, rig = self.imu(imu_id), self.camera_rig(ncamera_id)
+        imu_root, T_R_I = self._mounted(imu.id)
+        rig_root, T_R_B = self._mounted(rig.id)
+        if imu_root != rig_root and self._has_mount(imu.id) and self._has_mount(rig.id):
+            raise MapError(
+                f"sensors.yaml: camera rig {rig.id} and IMU {imu.id} have no base sensor in common"
+            )
+        return se3.compose(se3.relative(T_R_I, T_R_B), rig.T_B_C)
+
+    def without_extrinsics(self) -> tuple[str, ...]:
+        """Return the ids of sensors that have no entry and are taken to sit at their base."""
+        return tuple(sensor_id for sensor_id in self.sensors if sensor_id not in self.extrinsics)
+
+    def _has_mount(self, sensor_id: str) -> bool:
+        return sensor_id in self.extrinsics
+
+    def _mounted(self, sensor_id: str) -> tuple[str, NDArray[np.float64]]:
+        """Follow the base sensors to the last one; return it and the sensor's pose (7,) on it."""
+        root, pose, seen = sensor_id, se3.identity(), {sensor_id}
+        while root in self.extrinsics and self.extrinsics[root].base_sensor_id != root:
+            pose = se3.compose(self.extrinsics[root].T_B_S, pose)
+            root = self.extrinsics[root].base_sensor_id
+            if root in seen:
+                raise MapError(
+                    f"sensors.yaml: the base sensors of {sensor_id} go round in a circle"
+                )
+            seen.add(root)
+        return root, pose
