@@ -1,0 +1,1 @@
+"""Estimation: residuals, compiled kernels, IMU integration, solver and linear algebra."""

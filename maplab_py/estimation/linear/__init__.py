@@ -1,0 +1,1 @@
+"""Sparse linear algebra: block Cholesky factorisation of the reduced normal equations."""

@@ -1,0 +1,96 @@
+"""The block structure of a symmetric matrix, checked, and the product with a vector."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BlockPattern:
+    """Where the lower blocks of a symmetric block matrix lie (see `protocol.LinearSolver`)."""
+
+    rows: I64
+    cols: I64
+    num_nodes: int
+    node_size: int
+
+    @classmethod
+    def checked(
+        cls, rows: ArrayLike, cols: ArrayLike, num_nodes: int, node_size: int
+    ) -> BlockPattern:
+        """Make a pattern of block rows and columns (B,).
+
+        Raises:
+            ValueError: Shapes differ, a block is above the diagonal or outside the matrix.
+        """
+        r, c = np.asarray(rows, dtype=np.int64), np.asarray(cols, dtype=np.int64)
+        if r.ndim != 1 or r.shape != c.shape:
+            raise ValueError(f"block rows {r.shape} and columns {c.shape} must be equal vectors")
+        if num_nodes < 0 or node_size < 1:
+            raise ValueError(f"{num_nodes} nodes of size {node_size} make no matrix")
+        if len(r) and (c.min() < 0 or r.max() >= num_nodes or bool(np.any(r < c))):
+            raise ValueError("every block needs 0 <= column <= row < num_nodes")
+        return cls(r, c, num_nodes, node_size)
+
+    @property
+    def size(self) -> int:
+        """Rows of the scalar matrix."""
+        return self.num_nodes * self.node_size
+
+    def check_values(self, values: F64) -> F64:
+        """Return block values (B, d, d) as contiguous doubles; ValueError for another shape."""
+        wanted = (len(self.rows), self.node_size, self.node_size)
+        if values.shape != wanted:
+            raise ValueError(f"block values have shape {values.shape}, expected {wanted}")
+        return np.ascontiguousarray(values, dtype=np.float64)
+
+    def check_right_side(self, right_side: F64) -> F64:
+        """Return a right side as (n, k) doubles; ValueError for another shape."""
+        b = np.asarray(right_side, dtype=np.float64)
+        if b.ndim not in (1, 2) or b.shape[0] != self.size:
+            raise ValueError(f"right side has shape {b.shape}, expected ({self.size},) or (.., k)")
+        return b.reshape(self.size, -1) if b.ndim == 2 or b.size else b.reshape(0, 1)
+
+    @cached_property
+    def _by_row(self) -> tuple[I64, I64, I64, I64]:
+        """CSR of both triangles: (order into [blocks, transposed blocks], offsets, cols, strict)."""
+        strict = np.flatnonzero(self.rows != self.cols)
+        rows = np.concatenate([self.rows, self.cols[strict]])
+        cols = np.concatenate([self.cols, self.rows[strict]])
+        order = np.argsort(rows, kind="stable")
+        start = np.zeros(self.num_nodes + 1, dtype=np.int64)
+        np.cumsum(np.bincount(rows, minlength=self.num_nodes), out=start[1:])
+        return order, start, cols[order], strict
+
+    def multiply(self, values: F64, x: F64) -> F64:
+        """Return A x for block values (B, d, d) and x (n, k)."""
+        from scipy.sparse import bsr_array
+
+        order, start, cols, strict = self._by_row
+        lower = values.copy()
+        diagonal = np.flatnonzero(self.rows == self.cols)
+        lower[diagonal] = symmetric_of_lower(values[diagonal])
+        both = np.concatenate([lower, values[strict].transpose(0, 2, 1)])[order]
+        matrix = bsr_array((both, cols, start), shape=(self.size, self.size))
+        return np.asarray(matrix @ x)
+
+
+def symmetric_of_lower(blocks: F64) -> F64:
+    """Mirror the lower triangles of blocks (..., d, d) to their upper ones."""
+    lower = np.tril(blocks)
+    return np.asarray(lower + np.swapaxes(np.tril(blocks, -1), -1, -2))
+
+
+def sorted_distinct(keys: I64) -> I64:
+    """Return the distinct keys in ascending order (`np.unique` hashes, which is slower here)."""
+    ordered = np.sort(keys)
+    keep = np.ones(len(ordered), dtype=np.bool_)
+    np.not_equal(ordered[1:], ordered[:-1], out=keep[1:])
+    return ordered[keep]
