@@ -1,0 +1,1 @@
+"""Inertial measurements between vertices: preintegration and prediction, batched over edges."""

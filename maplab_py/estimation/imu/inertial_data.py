@@ -1,0 +1,124 @@
+"""The inertial samples of many edges, checked, with what is known of the IMUs."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+from maplab_py.sensors import Imu
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap.tables import MissionSensor
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class InertialData:
+    """Samples of E edges. An edge without an interval (fewer than two samples) lasts 0 s.
+
+    Raises:
+        MapError: Times of an edge run backwards, or a sample is not a number.
+    """
+
+    sample_start: I64  # (E + 1,) offsets
+    timestamp_ns: I64  # (N,)
+    accel_gyro: F64  # (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s, as measured
+    imus: tuple[Imu, ...]
+    imu_of_edge: I64  # (E,) rows of imus
+    edge_id: NDArray[np.uint64] | None = None  # (E, 2), for messages
+
+    def __post_init__(self) -> None:
+        """Check times and numbers."""
+        step = np.diff(self.timestamp_ns)
+        last = self.sample_start[1:-1] - 1  # the step from one edge's last sample to the next edge
+        step[last[(last >= 0) & (last < len(step))]] = 0
+        backwards = np.flatnonzero(step < 0)
+        if len(backwards):
+            at = int(backwards[0])
+            raise MapError(
+                f"{self._edge_name(at)}: the time of sample {at - self._first_sample(at) + 1} is "
+                f"{-int(step[at])} ns before the one before it"
+            )
+        bad = np.flatnonzero(~np.isfinite(self.accel_gyro).all(axis=1))
+        if len(bad):
+            at = int(bad[0])
+            raise MapError(
+                f"{self._edge_name(at)}: sample {at - self._first_sample(at)} is not a number"
+            )
+
+    @classmethod
+    def of_map(cls, vi_map: VIMap, edges: NDArray[np.int64] | None = None) -> InertialData:
+        """Take the samples of some IMU edges (rows, None = all) of a map.
+
+        Raises:
+            MapError: A mission with IMU edges has no IMU, or the samples are bad.
+        """
+        table = vi_map.imu_edges
+        rows = np.arange(len(table)) if edges is None else np.asarray(edges, dtype=np.int64)
+        samples = ragged_rows(vi_map.sample_start, rows)
+        mission = vi_map.vertices.mission[table.from_vertex[rows]]
+        used, imu_of_edge = np.unique(mission, return_inverse=True)
+        ids = vi_map.missions.sensor_id[used, MissionSensor.IMU]
+        return cls(
+            sample_start=starts_of_counts(table.sample_count[rows]),
+            timestamp_ns=vi_map.imu_samples.timestamp_ns[samples],
+            accel_gyro=vi_map.imu_samples.accel_gyro[samples],
+            imus=tuple(vi_map.sensors.imu(to_hex(sensor_id)) for sensor_id in ids),
+            imu_of_edge=np.asarray(imu_of_edge, dtype=np.int64),
+            edge_id=table.id[rows],
+        )
+
+    def __len__(self) -> int:
+        return len(self.sample_start) - 1
+
+    @cached_property
+    def duration_s(self) -> F64:
+        """Time (E,) from the first to the last sample of every edge [s]."""
+        duration = np.zeros(len(self))
+        full = np.flatnonzero(np.diff(self.sample_start) > 0)
+        first, last = self.sample_start[full], self.sample_start[full + 1] - 1
+        duration[full] = (self.timestamp_ns[last] - self.timestamp_ns[first]) * 1e-9
+        return duration
+
+    @cached_property
+    def corrections(self) -> tuple[F64, F64]:
+        """T_g^-1 and (T_a R_A_I)^-1 of every IMU, (K, 3, 3) each (thesis eq. 7.7-7.10)."""
+        gyro = np.tile(np.eye(3), (len(self.imus), 1, 1))
+        accel = gyro.copy()
+        for row, imu in enumerate(self.imus):
+            if imu.intrinsics is not None:
+                gyro[row] = np.linalg.inv(imu.intrinsics.T_g)
+                accel[row] = np.linalg.inv(imu.intrinsics.T_a @ imu.intrinsics.R_A_I)
+        return gyro, accel
+
+    @cached_property
+    def noise_variance_density(self) -> F64:
+        """Squared densities (K, 2) of gyroscope [rad^2/s] and accelerometer [m^2/s^3] noise."""
+        densities = [[imu.gyro_noise_density, imu.acc_noise_density] for imu in self.imus]
+        return np.square(np.array(densities, dtype=np.float64).reshape(-1, 2))
+
+    @cached_property
+    def walk_variance_density(self) -> F64:
+        """Squared densities (K, 2) of the random walks of gyroscope and accelerometer bias."""
+        densities = [
+            [imu.gyro_bias_random_walk_noise_density, imu.acc_bias_random_walk_noise_density]
+            for imu in self.imus
+        ]
+        return np.square(np.array(densities, dtype=np.float64).reshape(-1, 2))
+
+    def _edge_of(self, sample: int) -> int:
+        return int(np.searchsorted(self.sample_start, sample, side="right")) - 1
+
+    def _first_sample(self, sample: int) -> int:
+        return int(self.sample_start[self._edge_of(sample)])
+
+    def _edge_name(self, sample: int) -> str:
+        edge = self._edge_of(sample)
+        return f"IMU edge {edge if self.edge_id is None else to_hex(self.edge_id[edge])}"

@@ -1,0 +1,278 @@
+"""The compiled loops over inertial samples.
+
+One rule serves preintegration and prediction. Between two samples, dt apart, with corrected angular
+velocities w and specific forces f:
+
+    E = Exp((w_0 + w_1) / 2 dt),   R_1 = R_0 E
+    a = (R_0 f_0 + R_1 f_1) / 2
+    v_1 = v_0 + a dt
+    p_1 = p_0 + v_0 dt + a dt^2 / 2
+
+It is of second order: half the step, a quarter of the error. (Forster et al., On-Manifold
+Preintegration, TRO 2017, eq. (30)-(35) hold w and f constant instead, which is of first order.)
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.estimation.linear.jit import compiled
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@compiled(inline="always")
+def _multiply(a: F64, b: F64, out: F64) -> None:
+    """Compute out = a b for 3x3 matrices."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@compiled(inline="always")
+def _rotation(phi: F64, E: F64, J: F64) -> None:
+    """Compute E = Exp(phi) and the right Jacobian J of phi (Forster eq. (3) and (8))."""
+    x, y, z = phi[0], phi[1], phi[2]
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-8:  # Taylor, relative error < 1e-17
+        sine = 1.0 - angle2 / 6.0  # sin(a) / a
+        cosine = 0.5 - angle2 / 24.0  # (1 - cos(a)) / a^2
+        cubic = 1.0 / 6.0 - angle2 / 120.0  # (a - sin(a)) / a^3
+    else:
+        angle = np.sqrt(angle2)
+        sine = np.sin(angle) / angle
+        cosine = (1.0 - np.cos(angle)) / angle2
+        cubic = (1.0 - sine) / angle2
+    for i in range(3):
+        for j in range(3):
+            square = phi[i] * phi[j]  # of skew(phi)^2 = phi phi^T - a^2 I
+            E[i, j] = cosine * square
+            J[i, j] = cubic * square
+        E[i, i] += 1.0 - cosine * angle2
+        J[i, i] += 1.0 - cubic * angle2
+    _add_skew(E, x, y, z, sine)
+    _add_skew(J, x, y, z, -cosine)
+
+
+@compiled(inline="always")
+def _add_skew(matrix: F64, x: float, y: float, z: float, factor: float) -> None:
+    matrix[0, 1] -= factor * z
+    matrix[0, 2] += factor * y
+    matrix[1, 0] += factor * z
+    matrix[1, 2] -= factor * x
+    matrix[2, 0] -= factor * y
+    matrix[2, 1] += factor * x
+
+
+@compiled(inline="always")
+def _times_skew(a: F64, v: F64, out: F64) -> None:
+    """Compute out = a skew(v)."""
+    for i in range(3):
+        out[i, 0] = a[i, 1] * v[2] - a[i, 2] * v[1]
+        out[i, 1] = a[i, 2] * v[0] - a[i, 0] * v[2]
+        out[i, 2] = a[i, 0] * v[1] - a[i, 1] * v[0]
+
+
+@compiled(inline="always")
+def _correct(correction: F64, samples: F64, row: int, first: int, bias: F64, out: F64) -> None:
+    """Compute out = correction (measured - bias) for columns first .. first + 2 of a sample."""
+    x = samples[row, first] - bias[0]
+    y = samples[row, first + 1] - bias[1]
+    z = samples[row, first + 2] - bias[2]
+    for i in range(3):
+        out[i] = correction[i, 0] * x + correction[i, 1] * y + correction[i, 2] * z
+
+
+@compiled(inline="always")
+def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
+    """Multiply the rows of state (9, n), ordered p, theta, v, by the error transition F.
+
+    F = [[I, M dt^2 / 2, I dt], [0, E^T, 0], [0, M dt, I]]; Forster eq. (A.7)-(A.9) with the mean
+    acceleration a, whose derivative by theta is M.
+    """
+    for col in range(state.shape[1]):
+        x, y, z = state[3, col], state[4, col], state[5, col]
+        for i in range(3):
+            turned = dt * (M[i, 0] * x + M[i, 1] * y + M[i, 2] * z)
+            state[i, col] += dt * (state[6 + i, col] + 0.5 * turned)
+            state[6 + i, col] += turned
+            state[3 + i, col] = E[0, i] * x + E[1, i] * y + E[2, i] * z
+
+
+@compiled(inline="always")
+def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: F64) -> None:
+    """Compute gain (9, 3): change of [p, theta, v] per unit of measured value during dt.
+
+    Args:
+        by_accel: Derivative (3, 3) of the mean acceleration a by the corrected value.
+        by_theta: Derivative (3, 3) of the rotation vector per dt by the corrected value.
+        correction: Corrected value = correction (measured - bias).
+        dt: Interval [s].
+        gain: Result.
+    """
+    for i in range(3):
+        for j in range(3):
+            a = 0.0
+            theta = 0.0
+            for k in range(3):
+                a += by_accel[i, k] * correction[k, j]
+                theta += by_theta[i, k] * correction[k, j]
+            gain[i, j] = 0.5 * dt * dt * a
+            gain[3 + i, j] = dt * theta
+            gain[6 + i, j] = dt * a
+
+
+@compiled(inline="always")
+def _add_noise(covariance: F64, gain: F64, variance: float) -> None:
+    """Compute covariance += variance gain gain^T."""
+    for i in range(9):
+        for j in range(9):
+            covariance[i, j] += variance * (
+                gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1] + gain[i, 2] * gain[j, 2]
+            )
+
+
+@compiled(parallel=True)
+def preintegrate(
+    start: I64,
+    stamps: I64,
+    samples: F64,
+    gyro_bias: F64,
+    accel_bias: F64,
+    imu_of_edge: I64,
+    gyro_corrections: F64,
+    accel_corrections: F64,
+    noise: F64,
+    rotation: F64,
+    velocity: F64,
+    position: F64,
+    covariance: F64,
+    bias_jacobian: F64,
+) -> None:
+    """Integrate all edges; edges are shared among threads, each one is summed in order.
+
+    Args:
+        start: Offsets (E + 1,) of the edges' samples.
+        stamps: Times (N,) [ns].
+        samples: Measured [ax ay az gx gy gz] (N, 6).
+        gyro_bias: Linearisation points (E, 3) [rad/s].
+        accel_bias: Linearisation points (E, 3) [m/s^2].
+        imu_of_edge: Row (E,) of the following three arrays.
+        gyro_corrections: T_g^-1 (K, 3, 3).
+        accel_corrections: (T_a R_A_I)^-1 (K, 3, 3).
+        noise: Squared densities (K, 2) of gyroscope and accelerometer.
+        rotation: Result (E, 3, 3), change of orientation.
+        velocity: Result (E, 3).
+        position: Result (E, 3).
+        covariance: Result (E, 9, 9), order p, theta, v.
+        bias_jacobian: Result (E, 9, 6), columns gyroscope bias, accelerometer bias.
+    """
+    for edge in numba.prange(len(start) - 1):
+        imu = imu_of_edge[edge]
+        C_g, C_a = gyro_corrections[imu], accel_corrections[imu]
+        R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
+        P, D = np.zeros((9, 9)), np.zeros((9, 6))
+        E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        turn_0, turn_1, scratch = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        zero = np.zeros((3, 3))
+        gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
+        w_0, w_1, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        for row in range(start[edge], start[edge + 1] - 1):
+            dt = (stamps[row + 1] - stamps[row]) * 1e-9
+            if dt <= 0.0:
+                continue
+            _correct(C_g, samples, row, 3, gyro_bias[edge], w_0)
+            _correct(C_g, samples, row + 1, 3, gyro_bias[edge], w_1)
+            _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
+            _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
+            for i in range(3):
+                w_0[i] = 0.5 * (w_0[i] + w_1[i]) * dt  # the rotation vector from here on
+            _rotation(w_0, E, J)
+            _multiply(R, E, next_R)
+            # derivatives of the mean acceleration: by the orientation at the beginning (M, kept in
+            # turn_0), by the angular velocity (scratch), by the specific force (turn_1)
+            _times_skew(R, f_0, turn_0)
+            _times_skew(next_R, f_1, turn_1)
+            _multiply(turn_1, J, scratch)
+            for i in range(3):
+                for j in range(3):
+                    turn_0[i, j] += (
+                        turn_1[i, 0] * E[j, 0] + turn_1[i, 1] * E[j, 1] + turn_1[i, 2] * E[j, 2]
+                    )
+            for i in range(3):
+                for j in range(3):
+                    turn_0[i, j] *= -0.5
+                    scratch[i, j] *= -0.5 * dt
+                    turn_1[i, j] = 0.5 * (R[i, j] + next_R[i, j])
+            _noise_gain(scratch, J, C_g, dt, gyro_gain)
+            _noise_gain(turn_1, zero, C_a, dt, accel_gain)
+            _transition(P, E, turn_0, dt)
+            for i in range(9):
+                for j in range(i):
+                    P[i, j], P[j, i] = P[j, i], P[i, j]
+            _transition(P, E, turn_0, dt)
+            _add_noise(P, gyro_gain, noise[imu, 0] / dt)
+            _add_noise(P, accel_gain, noise[imu, 1] / dt)
+            _transition(D, E, turn_0, dt)
+            for i in range(9):
+                for j in range(3):
+                    D[i, j] -= gyro_gain[i, j]
+                    D[i, 3 + j] -= accel_gain[i, j]
+            for i in range(3):
+                a = 0.0
+                for j in range(3):
+                    a += 0.5 * (R[i, j] * f_0[j] + next_R[i, j] * f_1[j])
+                p[i] += dt * (v[i] + 0.5 * dt * a)
+                v[i] += dt * a
+            R[:] = next_R
+        rotation[edge], velocity[edge], position[edge] = R, v, p
+        covariance[edge], bias_jacobian[edge] = 0.5 * (P + P.T), D
+
+
+@compiled(parallel=True)
+def propagate(
+    start: I64,
+    stamps: I64,
+    samples: F64,
+    gyro_bias: F64,
+    accel_bias: F64,
+    imu_of_edge: I64,
+    gyro_corrections: F64,
+    accel_corrections: F64,
+    gravity: F64,
+    rotation: F64,
+    velocity: F64,
+    position: F64,
+) -> None:
+    """Predict the state at every sample from the one at the first sample of its edge.
+
+    Args are those of `preintegrate`, but for:
+        gravity: Acceleration (3,) [m/s^2] in the frame of the states.
+        rotation: (N, 3, 3); the row of an edge's first sample is given, the others are results.
+        velocity: (N, 3), likewise.
+        position: (N, 3), likewise.
+    """
+    for edge in numba.prange(len(start) - 1):
+        imu = imu_of_edge[edge]
+        C_g, C_a = gyro_corrections[imu], accel_corrections[imu]
+        E, J = np.empty((3, 3)), np.empty((3, 3))
+        w_0, w_1, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        for row in range(start[edge], start[edge + 1] - 1):
+            dt = (stamps[row + 1] - stamps[row]) * 1e-9
+            _correct(C_g, samples, row, 3, gyro_bias[edge], w_0)
+            _correct(C_g, samples, row + 1, 3, gyro_bias[edge], w_1)
+            _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
+            _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
+            for i in range(3):
+                w_0[i] = 0.5 * (w_0[i] + w_1[i]) * dt
+            _rotation(w_0, E, J)
+            _multiply(rotation[row], E, rotation[row + 1])
+            for i in range(3):
+                a = gravity[i]
+                for j in range(3):
+                    a += 0.5 * (rotation[row, i, j] * f_0[j] + rotation[row + 1, i, j] * f_1[j])
+                position[row + 1, i] = position[row, i] + dt * (velocity[row, i] + 0.5 * dt * a)
+                velocity[row + 1, i] = velocity[row, i] + dt * a
