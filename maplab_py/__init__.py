@@ -1,3 +1,19 @@
-"""Visual-inertial mapping: maps of many sessions, their optimisation, and a console to work on them."""
+"""Visual-inertial mapping: merge, optimise, loop-close and sparsify maps of many sessions."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from maplab_py.console.session import Session, open_map
+
+__all__ = ["Session", "open_map"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the session only when somebody asks for it."""
+    if name in __all__:
+        from maplab_py.console import session
+
+        return getattr(session, name)
+    raise AttributeError(f"module 'maplab_py' has no attribute '{name}'")

@@ -1,0 +1,1 @@
+"""The console: commands, flags, sessions, prompt, scripts. It knows commands, never algorithms."""

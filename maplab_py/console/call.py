@@ -1,0 +1,165 @@
+"""One call of a command: from words or keyword arguments to typed values with their origins."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from maplab_py.console.command import Command
+from maplab_py.console.flag_types import expand_path
+from maplab_py.console.flagfile import read_flagfile
+from maplab_py.console.flags import COMMON_FLAGS, Given, normalise, parse_words
+from maplab_py.console.registry import Registry
+from maplab_py.console.settings import Settings
+from maplab_py.console.suggest import did_you_mean
+from maplab_py.errors import FlagError, UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """A command with everything it needs to run."""
+
+    command: Command
+    values: Mapping[str, Any]  # by flag
+    words: tuple[str, ...] = ()  # for *words
+    given: Mapping[str, str] = dataclasses.field(default_factory=dict)  # typed for this call
+    wants_help: bool = False
+    keeps_flags: bool = False
+    verbosity: int = 0
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the keyword arguments of the command's function."""
+        return self.command.bind(self.values)
+
+
+def call_from_words(words: Sequence[str], registry: Registry, settings: Settings) -> Call:
+    """Read the words of one command line.
+
+    Precedence: default < lasting settings < the command's flag file < the command's own words.
+
+    Raises:
+        UserError: The command is unknown.
+        FlagError: A flag is unknown, misses its value or has one that does not fit.
+    """
+    command = registry.find(words[0])
+    if command.raw_arguments:
+        wants_help = list(words[1:]) == ["--help"]
+        return Call(command, {}, () if wants_help else tuple(words[1:]), {}, wants_help)
+    given, plain = parse_words(words[1:], command.flags, command.name)
+    common = {g.name: g.text for g in given if g.name in COMMON_FLAGS}
+    texts: dict[str, str] = {}
+    for path in (g.text for g in given if g.name == "flagfile"):
+        texts.update(_flagfile_texts(path, command, registry))
+    typed = {g.name: g.text for g in given if g.name in command.flags}
+    placed, rest = _place(plain, command, typed)
+    texts.update(typed | placed)
+    lasting = {name: setting.text for name, setting in settings.for_command(command).items()}
+    wants_help = common.get("help") == "true"
+    values = {} if wants_help else {n: command.flags[n].convert(t) for n, t in texts.items()}
+    for name, text in lasting.items() if not wants_help else ():
+        if name not in values:
+            values[name] = command.flags[name].convert(text)
+    return Call(
+        command,
+        values,
+        tuple(rest),
+        texts,
+        wants_help,
+        common.get("keep_gflags") == "true",
+        _verbosity(common.get("v", "0"), command),
+    )
+
+
+def call_from_keywords(
+    command: Command, words: Sequence[str], keywords: Mapping[str, Any], settings: Settings
+) -> Call:
+    """Make a call from Python values; an options dataclass may be given as a whole.
+
+    Raises:
+        FlagError: A keyword is not a flag of the command, or its value does not fit.
+    """
+    values: dict[str, Any] = {}
+    for name, setting in settings.for_command(command).items():
+        values[name] = command.flags[name].convert(setting.text)
+    for keyword, value in keywords.items():
+        if keyword in command.defaults:
+            values.update(_group_values(command, keyword, value))
+    for keyword, value in keywords.items():
+        name = normalise(keyword).rstrip("_")
+        if keyword in command.defaults:
+            continue
+        if name not in command.flags:
+            known = [*command.flags, *command.defaults]
+            raise FlagError(f"{command.name} has no flag --{name}{did_you_mean(name, known, '--')}")
+        values[name] = command.flags[name].convert(value)
+    placed, rest = _place(list(words), command, {})
+    values.update({name: command.flags[name].convert(text) for name, text in placed.items()})
+    return Call(command, values, tuple(rest))
+
+
+def _group_values(command: Command, parameter: str, group: Any) -> dict[str, Any]:
+    if type(group) is not type(command.defaults[parameter]):
+        wanted = type(command.defaults[parameter]).__name__
+        raise FlagError(f"{command.name}: {parameter} wants a {wanted}")
+    values = {}
+    for flag in command.flags.values():
+        if flag.path[0] == parameter:
+            value = group
+            for field in flag.path[1:]:
+                value = getattr(value, field)
+            values[flag.name] = value
+    return values
+
+
+def _place(
+    plain: list[str], command: Command, typed: Mapping[str, str]
+) -> tuple[dict[str, str], list[str]]:
+    """Give plain words to the positional flags; what is left goes to *words."""
+    placed: dict[str, str] = {}
+    rest = list(plain)
+    for name in command.positional:
+        if not rest:
+            break
+        if name in typed:
+            continue
+        placed[name] = rest.pop(0)
+    if rest and not command.variadic:
+        flag = next((f for f in command.flags.values() if not f.type.is_bool), None)
+        form = f" (flags are written --{flag.name}=value)" if flag else ""
+        raise FlagError(f"{command.name}: unexpected word '{rest[0]}'{form}")
+    return placed, rest
+
+
+def _flagfile_texts(text: str, command: Command, registry: Registry) -> dict[str, str]:
+    """Return what a flag file says to this command; flags of other commands are passed over."""
+    try:
+        path = expand_path(text)
+    except ValueError as error:
+        raise FlagError(f"--flagfile={text}: {error}") from None
+    known = {**registry.all_flags(), **command.flags}
+    texts: dict[str, str] = {}
+    for line in read_flagfile(path or Path()):
+        try:
+            given, plain = parse_words(line.words, known, command.name)
+            if plain:
+                raise FlagError(f"'{plain[0]}' is not a flag (write --name=value)")
+            texts.update(_checked(given, command))
+        except UserError as error:
+            raise FlagError(f"{line.origin}: {error}") from None
+    return texts
+
+
+def _checked(given: Sequence[Given], command: Command) -> dict[str, str]:
+    own = {g.name: g.text for g in given if g.name in command.flags}
+    for name, text in own.items():
+        command.flags[name].convert(text)
+    return own
+
+
+def _verbosity(text: str, command: Command) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise FlagError(f"{command.name}: --v={text}: wants a whole number") from None

@@ -1,0 +1,136 @@
+"""What a command gets from the console."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.console.maps import MapManager
+from maplab_py.console.terminal import Terminal
+from maplab_py.errors import UserError
+from maplab_py.progress import Progress
+from maplab_py.vimap import VIMap
+
+if TYPE_CHECKING:
+    from maplab_py.console.session import Session
+
+
+class CommandContext:
+    """The selected map, progress, and the session around one running command.
+
+    A new map is handed over by `commit`; it becomes the selected map's value when the command
+    ends well, and never when it fails or is cancelled.
+    """
+
+    def __init__(
+        self, session: Session, progress: Progress, terminal: Terminal, command: str = ""
+    ) -> None:
+        """Make the context of one call.
+
+        Args:
+            session: The session that runs the command.
+            progress: Where to tell progress and learn of cancellation.
+            terminal: Where to ask questions.
+            command: Name of the command, for messages and the undo history.
+        """
+        self.session = session
+        self.progress = progress
+        self.terminal = terminal
+        self.command = command
+        self._drafts: dict[str, VIMap] = {}
+
+    @property
+    def maps(self) -> MapManager:
+        """All maps in memory by key."""
+        return self.session.maps
+
+    @property
+    def map_key(self) -> str:
+        """Key of the selected map; raises UserError when none is selected."""
+        return self.maps.selected.key
+
+    @property
+    def vi_map(self) -> VIMap:
+        """The selected map, or what this command has committed for it so far.
+
+        Raises:
+            UserError: No map is selected.
+        """
+        entry = self.maps.selected
+        return self._drafts.get(entry.key, entry.vi_map)
+
+    @property
+    def map_folder(self) -> Path | None:
+        """The folder of the selected map; None when it was never loaded or saved."""
+        return self.maps.selected.folder
+
+    def commit(self, vi_map: VIMap) -> None:
+        """Hand over the new value of the selected map."""
+        self._drafts[self.maps.selected.key] = vi_map
+
+    def apply_drafts(self) -> None:
+        """Make the committed values those of the maps; the session calls it at a good end."""
+        for key, vi_map in self._drafts.items():
+            if key in self.maps:
+                self.maps.update(self.maps.get(key).with_value(vi_map, self.command))
+        self._drafts.clear()
+
+    def mark_saved(self, key: str, vi_map: VIMap, folder: Path) -> None:
+        """Note that a value of a map is on disk now."""
+        entry = dataclasses.replace(self.maps.get(key), saved=vi_map, folder=folder)
+        self.maps.update(entry)
+
+    def mission_rows(
+        self, map_mission: str = "", map_mission_list: str = ""
+    ) -> NDArray[np.int64] | None:
+        """Return the rows of the missions that the user chose, None when he chose none (all).
+
+        Args:
+            map_mission: Id or unambiguous prefix of one mission.
+            map_mission_list: Several, separated by commas.
+
+        Raises:
+            UserError: An id is unknown or ambiguous; the message lists the candidates.
+        """
+        from maplab_py.vimap.queries import find_mission
+
+        prefixes = [part.strip() for part in f"{map_mission},{map_mission_list}".split(",")]
+        chosen = [prefix for prefix in prefixes if prefix]
+        if not chosen:
+            return None
+        rows = [find_mission(self.vi_map, prefix) for prefix in chosen]
+        return np.array(sorted(set(rows)), dtype=np.int64)
+
+    def mission_row(self, map_mission: str) -> int:
+        """Return the row of one mission; without an id the map must have just one.
+
+        Raises:
+            UserError: The id is unknown or ambiguous, or it is empty and the map has not exactly
+                one mission.
+        """
+        from maplab_py.vimap.queries import find_mission
+
+        if map_mission or len(self.vi_map.missions) != 1:
+            return int(find_mission(self.vi_map, map_mission))
+        return 0
+
+    def confirm(self, question: str, *, yes: bool) -> None:
+        """Ask before something is destroyed.
+
+        Args:
+            question: What will happen, as a question.
+            yes: The user has agreed beforehand (the command's flag --yes).
+
+        Raises:
+            UserError: The answer is no, or nobody is there to answer.
+        """
+        if yes:
+            return
+        if not self.terminal.is_interactive:
+            raise UserError(f"{self.command}: nobody can answer '{question}'; give --yes to agree")
+        if not self.terminal.ask(question):
+            raise UserError(f"{self.command}: not done, as you answered no")

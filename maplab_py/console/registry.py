@@ -1,0 +1,162 @@
+"""Which commands there are: plugins found by entry points, and who owns which name."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
+
+from maplab_py.console.command import COMMAND_ATTRIBUTE, Command
+from maplab_py.console.flags import Flag
+from maplab_py.console.suggest import unknown
+from maplab_py.errors import UserError
+
+ENTRY_POINT_GROUP = "maplab_py.plugins"
+PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
+ALWAYS_LOADED = "console"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass
+class Plugin:
+    """A plugin as it was found."""
+
+    name: str
+    module: str = ""
+    version: str = ""
+    commands: list[Command] = dataclasses.field(default_factory=list)
+    error: str = ""  # why it could not be loaded
+    clashes: list[str] = dataclasses.field(default_factory=list)  # names that others had first
+
+
+class Registry:
+    """Commands by name and alias, with the plugins that own them."""
+
+    def __init__(self) -> None:
+        """Start without any command."""
+        self.plugins: list[Plugin] = []
+        self._commands: dict[str, Command] = {}
+        self._owners: dict[str, Plugin] = {}
+
+    @property
+    def commands(self) -> list[Command]:
+        """All commands, by name, each once."""
+        unique = {command.name: command for command in self._commands.values()}
+        return [unique[name] for name in sorted(unique)]
+
+    @property
+    def names(self) -> list[str]:
+        """All names and aliases."""
+        return sorted(self._commands)
+
+    @property
+    def problems(self) -> list[str]:
+        """One line for every broken plugin and every name that two plugins claim."""
+        lines = [f"plugin {p.name} is not available: {p.error}" for p in self.plugins if p.error]
+        return lines + [clash for plugin in self.plugins for clash in plugin.clashes]
+
+    def find(self, name: str) -> Command:
+        """Return the command with this name or alias.
+
+        Raises:
+            UserError: There is none; the message proposes near ones.
+        """
+        found = self._commands.get(name) or self._commands.get(name.replace("-", "_"))
+        if found is not None:
+            return found
+        broken = [plugin.name for plugin in self.plugins if plugin.error]
+        hint = f"plugins not available: {', '.join(broken)} (see: plugins)" if broken else ""
+        raise unknown("command", name, self._commands, hint or "see: help")
+
+    def owner(self, command: Command) -> str:
+        """Return the name of the plugin that brought a command."""
+        return self._owners[command.name].name
+
+    def flags_named(self, name: str) -> list[tuple[Command, Flag]]:
+        """Return every command that has a flag of this name, with the flag."""
+        return [(c, c.flags[name]) for c in self.commands if name in c.flags]
+
+    def all_flags(self) -> dict[str, Flag]:
+        """Return one flag for every flag name of any command."""
+        return {name: flag for command in self.commands for name, flag in command.flags.items()}
+
+    def add(self, command: Command, plugin: Plugin) -> None:
+        """Register a command; a name that is taken stays with its first owner."""
+        if command.name in self._commands:
+            plugin.clashes.append(self._clash(command.name, plugin))
+            return
+        plugin.commands.append(command)
+        self._owners[command.name] = plugin
+        for name in command.names:
+            if name in self._commands:
+                plugin.clashes.append(self._clash(name, plugin))
+            else:
+                self._commands[name] = command
+
+    def add_module(self, module: ModuleType, plugin: Plugin) -> None:
+        """Register the commands that a module or package defines (not those it only imports)."""
+        for value in list(vars(module).values()):
+            command = getattr(value, COMMAND_ATTRIBUTE, None)
+            if not isinstance(command, Command) or isinstance(value, type):
+                continue
+            home = command.function.__module__
+            if home == module.__name__ or home.startswith(module.__name__ + "."):
+                self.add(command, plugin)
+
+    def load(self, entry: EntryPoint) -> None:
+        """Load one plugin; if it fails it is listed with the reason, the traceback in the log."""
+        version = entry.dist.version if entry.dist is not None else ""
+        plugin = Plugin(entry.name, entry.value, version)
+        self.plugins.append(plugin)
+        try:
+            loaded = entry.load()
+        except (Exception, SystemExit) as error:
+            plugin.error = f"{type(error).__name__}: {error}".splitlines()[0]
+            logger.exception("plugin %s (%s) cannot be loaded", entry.name, entry.value)
+            return
+        if not isinstance(loaded, ModuleType):
+            plugin.error = f"entry point '{entry.value}' is not a module"
+            return
+        self.add_module(loaded, plugin)
+        for clash in plugin.clashes:
+            logger.warning("%s", clash)
+
+    def _clash(self, name: str, plugin: Plugin) -> str:
+        first = self.owner(self._commands[name])
+        return (
+            f"command '{name}' of plugin {plugin.name} is taken by plugin {first}, which keeps it"
+        )
+
+
+def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
+    """Load the installed plugins.
+
+    The environment variable MAPLAB_PLUGINS (names separated by commas) restricts which; the
+    console's own commands are always there.
+
+    Raises:
+        UserError: The variable names a plugin that is not installed.
+    """
+    found = sorted(entries or entry_points(group=ENTRY_POINT_GROUP), key=_loading_order)
+    wanted = os.environ.get(PLUGINS_VARIABLE, "").replace(";", ",").split(",")
+    names = {name.strip() for name in wanted if name.strip()}
+    missing = names - {entry.name for entry in found}
+    if missing:
+        raise UserError(
+            f"{PLUGINS_VARIABLE} names plugins that are not installed: {', '.join(sorted(missing))}"
+        )
+    registry = Registry()
+    for entry in found:
+        if not names or entry.name in names or entry.name == ALWAYS_LOADED:
+            registry.load(entry)
+    return registry
+
+
+def _loading_order(entry: EntryPoint) -> tuple[bool, bool, str]:
+    """Built-in plugins come first, so that a stranger's plugin cannot take over a command."""
+    own = entry.value.startswith("maplab_plugins.")
+    return entry.name != ALWAYS_LOADED, not own, entry.name

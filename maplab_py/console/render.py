@@ -1,0 +1,94 @@
+"""Printing reports: plain text, colours on a terminal, or JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, TextIO
+
+from maplab_py.console.layout import Block, Pairs, Paragraph, Table, blocks_of
+from maplab_py.report import Report
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+
+def wants_colour(stream: TextIO) -> bool:
+    """Tell whether control codes may be written: a terminal, and NO_COLOR is not set."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def render(report: Report, stream: TextIO) -> None:
+    """Print a report for people."""
+    blocks = blocks_of(report)
+    if wants_colour(stream):
+        _render_rich(blocks, stream)
+    else:
+        for number, block in enumerate(blocks):
+            stream.write(("\n" if number else "") + plain_text(block) + "\n")
+    stream.flush()
+
+
+def render_json(report: Report, command: str, stream: TextIO) -> None:
+    """Print a report as one JSON object on one line, with the command that made it."""
+    stream.write(json.dumps({"command": command, "report": report.as_json()}) + "\n")
+    stream.flush()
+
+
+def plain_text(block: Block) -> str:
+    """Lay out a block without any control code."""
+    if isinstance(block, Paragraph):
+        return block.text
+    if isinstance(block, Pairs):
+        width = max((len(name) for name, _ in block.rows), default=0)
+        lines = [f"{name:<{width}}  {value}".rstrip() for name, value in block.rows]
+        return "\n".join([block.title, *lines] if block.title else lines)
+    return _plain_table(block)
+
+
+def _plain_table(table: Table) -> str:
+    cells = [table.heads, *table.rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(table.heads))]
+    lines = [
+        "  ".join(
+            f"{cell:>{width}}" if right else f"{cell:<{width}}"
+            for cell, width, right in zip(row, widths, table.is_number, strict=True)
+        ).rstrip()
+        for row in cells
+    ]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join([table.title, *lines] if table.title else lines)
+
+
+def _render_rich(blocks: list[Block], stream: TextIO) -> None:
+    from rich.console import Console
+
+    console = Console(file=stream, highlight=False)
+    for number, block in enumerate(blocks):
+        if number:
+            console.print()
+        _print_block(block, console)
+
+
+def _print_block(block: Block, console: RichConsole) -> None:
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    if isinstance(block, Paragraph):
+        console.print(Text(block.text))
+        return
+    if block.title:
+        console.print(Text(block.title, style="bold"))
+    if isinstance(block, Pairs):
+        grid = RichTable.grid(padding=(0, 2))
+        for name, value in block.rows:
+            grid.add_row(Text(name, style="cyan"), Text(value))
+        console.print(grid)
+        return
+    shown = RichTable(box=box.SIMPLE_HEAD, header_style="bold cyan", pad_edge=False)
+    for head, right in zip(block.heads, block.is_number, strict=True):
+        shown.add_column(Text(head), justify="right" if right else "left", overflow="fold")
+    for row in block.rows:
+        shown.add_row(*(Text(cell) for cell in row))
+    console.print(shown)
