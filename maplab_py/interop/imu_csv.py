@@ -1,0 +1,58 @@
+"""IMU recordings in EuRoC's form: `t[ns], gyro x y z [rad/s], accel x y z [m/s^2]`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+from maplab_py.interop.text_table import format_rows, read_text_table, write_text
+
+_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImuRecording:
+    """IMU samples in the order of time, columns as in the map's `ImuSamples`."""
+
+    times_ns: NDArray[np.int64]  # (N,)
+    accel_gyro: NDArray[np.float64]  # (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s
+
+
+def read_imu_csv(path: Path) -> ImuRecording:
+    """Read an EuRoC IMU file.
+
+    Raises:
+        MapError: The file cannot be read, has other columns, or its stamps do not increase.
+    """
+    table = read_text_table(path)
+    if table.values.shape[1] != 6:
+        raise MapError(
+            f"{path}: 7 columns are wanted (time, gyroscope xyz, accelerometer xyz), "
+            f"not {table.values.shape[1] + 1}"
+        )
+    order = [3, 4, 5, 0, 1, 2]
+    if len(table.header) == 7 and table.header[1].startswith("a"):
+        order = [0, 1, 2, 3, 4, 5]
+    late = np.flatnonzero(np.diff(table.times_ns) <= 0)
+    if len(late):
+        line = table.line_numbers[late[0] + 1]
+        raise MapError(f"{path}:{line}: the time stamp does not come after that of the row above")
+    return ImuRecording(table.times_ns, table.values[:, order])
+
+
+def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = False) -> None:
+    """Write an EuRoC IMU file; values read back bit-identical.
+
+    Raises:
+        UserError: The file exists and `overwrite` is not set, or it cannot be written.
+    """
+    values = recording.accel_gyro[:, [3, 4, 5, 0, 1, 2]]
+    rows = format_rows("%d" + ",%.17g" * 6, [recording.times_ns, values])
+    write_text(path, (text for part in ([_HEADER], rows) for text in part), overwrite=overwrite)

@@ -1,0 +1,179 @@
+"""Trajectory files: every format, exact times, and clear refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import so3
+from maplab_py.interop.imu_csv import ImuRecording, read_imu_csv, write_imu_csv
+from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc, write_tum
+from tests.support.data import shared_data
+
+
+def make_trajectory(count: int = 50, *, with_state: bool = True) -> Trajectory:
+    rng = np.random.default_rng(5)
+    times = 1403715529112143517 + np.cumsum(rng.integers(1, 10**9, count))
+    T = np.concatenate([so3.exp(rng.normal(size=(count, 3))), rng.normal(size=(count, 3))], axis=1)
+    state = rng.normal(size=(3, count, 3)) if with_state else (None, None, None)
+    return Trajectory(times, T, *state)
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "trajectory.txt"
+    path.write_text(text)
+    return path
+
+
+def test_tum_round_trip_keeps_nanoseconds_and_positions(tmp_path: Path) -> None:
+    trajectory = make_trajectory()
+    write_tum(trajectory, tmp_path / "a.txt")
+    read = read_trajectory(tmp_path / "a.txt")
+    assert np.array_equal(read.times_ns, trajectory.times_ns)
+    assert np.array_equal(read.T_R_B[:, 4:], trajectory.T_R_B[:, 4:])
+    assert np.max(np.abs(read.T_R_B - trajectory.T_R_B)) < 1e-15
+    assert read.v_R is None
+
+
+@pytest.mark.parametrize("with_state", [True, False])
+def test_euroc_round_trip(tmp_path: Path, with_state: bool) -> None:
+    trajectory = make_trajectory(with_state=with_state)
+    write_euroc(trajectory, tmp_path / "a.csv")
+    read = read_trajectory(tmp_path / "a.csv")
+    assert np.array_equal(read.times_ns, trajectory.times_ns)
+    assert np.max(np.abs(read.T_R_B - trajectory.T_R_B)) < 1e-15
+    for name in ("v_R", "gyro_bias", "accel_bias"):
+        given, found = getattr(trajectory, name), getattr(read, name)
+        assert (found is None) if given is None else np.array_equal(given, found)
+
+
+def test_seconds_are_exact_beyond_floats(tmp_path: Path) -> None:
+    rows = "1403715529.112143517 1 2 3 0 0 0 1\n1.403715529212142944e+09 4 5 6 0 0 0 1\n"
+    read = read_trajectory(written(tmp_path, "# t x y z qx qy qz qw (comment)\n\n" + rows))
+    assert read.times_ns.tolist() == [1403715529112143517, 1403715529212142944]
+    assert read.T_R_B[1].tolist() == [0, 0, 0, 1, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("text", "pose"),
+    [
+        ("0.5 1 2 3 0.6 0 0 0.8\n", [0.6, 0, 0, 0.8, 1, 2, 3]),
+        ("1400000000000000000,1,2,3,0.8,0.6,0,0\n", [0.6, 0, 0, 0.8, 1, 2, 3]),
+        ("#t,x,y,z,qw,qx,qy,qz\n0.5,1,2,3,0.8,0.6,0,0\n", [0.6, 0, 0, 0.8, 1, 2, 3]),
+        ("time,qx,qy,qz,qw,tx,ty,tz\n0.5,0.6,0,0,0.8,1,2,3\n", [0.6, 0, 0, 0.8, 1, 2, 3]),
+        ("timestamp;\n0.5\t1 2  3 0.6 0 0 0.8", [0.6, 0, 0, 0.8, 1, 2, 3]),
+        (
+            "timestamp [ns], position x [m], position y [m], position z [m], quaternion x, "
+            "quaternion y, quaternion z, quaternion w\n5,1,2,3,0.6,0,0,0.8\n",
+            [0.6, 0, 0, 0.8, 1, 2, 3],
+        ),
+    ],
+)
+def test_formats_are_told_from_content(tmp_path: Path, text: str, pose: list[float]) -> None:
+    read = read_trajectory(written(tmp_path, text))
+    assert len(read) == 1
+    assert read.T_R_B[0] == pytest.approx(pose, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "there are no rows"),
+        ("# only a comment\n", "there are no rows"),
+        ("1 2 3 4 0 0 0 1\n2 3 4\n", r":2: 3 columns, the first row has 8"),
+        ("1 2 3 4 0 0 0 1\n\n2 3 x 4 0 0 0 1\n", r":3: 'x' is not a finite number"),
+        ("1 2 3 nan 0 0 0 1\n", r":1: 'nan' is not a finite number"),
+        ("1 2 3 4 0 0 0 1\nlater 2 3 4 0 0 0 1\n", r":2: 'later' is not a time stamp"),
+        ("1 2 3 4 0 0 0 2\n", r":1: the quaternion is not of unit length"),
+        ("2 2 3 4 0 0 0 1\n1 2 3 4 0 0 0 1\n", r":2: the time stamp lies before"),
+        ("1 2 3\n", "there is no column for px, py, pz, qx"),
+        ("vertex index,px,py,pz,qw,qx,qy,qz\n1,2,3,4,1,0,0,0\n", "must be the time stamp"),
+        ("5\n", "a time stamp and values are wanted"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(MapError, match=message) as caught:
+        read_trajectory(written(tmp_path, text))
+    assert "trajectory.txt" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_binary_files(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"cannot read .*absent"):
+        read_trajectory(tmp_path / "absent.txt")
+    (tmp_path / "binary").write_bytes(b"\xff\x00\xfe")
+    with pytest.raises(MapError, match="not UTF-8"):
+        read_trajectory(tmp_path / "binary")
+
+
+def test_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
+    trajectory, path = make_trajectory(3), tmp_path / "folder" / "a.txt"
+    write_tum(trajectory, path)
+    before = path.read_bytes()
+    with pytest.raises(UserError, match=r"a\.txt exists already: give --overwrite"):
+        write_tum(make_trajectory(5), path)
+    assert path.read_bytes() == before
+    write_tum(make_trajectory(5), path, overwrite=True)
+    assert len(read_trajectory(path)) == 5
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+    with pytest.raises(UserError, match="is a folder"):
+        write_tum(trajectory, path.parent)
+
+
+def test_imu_round_trip(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    recording = ImuRecording(
+        np.arange(5) * 5_000_000 + 1403715273262142976, rng.normal(size=(5, 6))
+    )
+    write_imu_csv(recording, tmp_path / "imu.csv")
+    read = read_imu_csv(tmp_path / "imu.csv")
+    assert np.array_equal(read.times_ns, recording.times_ns)
+    assert np.array_equal(read.accel_gyro, recording.accel_gyro)
+
+
+def test_imu_bad_files(tmp_path: Path) -> None:
+    path = tmp_path / "imu.csv"
+    path.write_text("1,2,3,4\n")
+    with pytest.raises(MapError, match="7 columns are wanted"):
+        read_imu_csv(path)
+    path.write_text("2,1,1,1,1,1,1\n2,1,1,1,1,1,1\n")
+    with pytest.raises(MapError, match=r":2: the time stamp does not come after"):
+        read_imu_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("relative", "count", "has_state"),
+    [
+        ("ground_truth/V1_01_easy.csv", 28712, True),
+        ("euroc_imu/V101.gt.csv", 2895, True),
+        ("tumvi_imu/room1.gt.csv", 16541, False),
+        ("trajectories/V102.txt", 807, False),
+        ("trajectories/freiburg1_xyz-groundtruth.txt", 3000, False),
+    ],
+)
+def test_real_trajectories(relative: str, count: int, has_state: bool) -> None:
+    trajectory = read_trajectory(shared_data(relative))
+    assert len(trajectory) == count
+    assert np.all(np.diff(trajectory.times_ns) >= 0)
+    assert (trajectory.accel_bias is not None) == has_state
+
+
+def test_the_two_ground_truths_of_v1_01_tell_the_same_columns() -> None:
+    a = read_trajectory(shared_data("ground_truth/V1_01_easy.csv"))
+    b = read_trajectory(shared_data("euroc_imu/V101.gt.csv"))
+    row = int(np.argmin(np.abs(a.times_ns - b.times_ns[1000])))
+    assert a.T_R_B[row, 4:] == pytest.approx(b.T_R_B[1000, 4:], abs=0.15)
+    assert a.gyro_bias is not None
+    assert a.gyro_bias[row] == pytest.approx(b.gyro_bias[1000], abs=0.01)
+    assert a.v_R[row] == pytest.approx(b.v_R[1000], abs=0.2)
+
+
+def test_real_imu_recording() -> None:
+    recording = read_imu_csv(shared_data("euroc_imu/V101.imu.csv"))
+    assert recording.accel_gyro.shape == (29120, 6)
+    assert np.median(np.linalg.norm(recording.accel_gyro[:, :3], axis=1)) == pytest.approx(
+        9.8, abs=0.2
+    )
