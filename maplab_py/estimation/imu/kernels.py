@@ -9,7 +9,7 @@ velocities w and specific forces f:
     p_1 = p_0 + v_0 dt + a dt^2 / 2
 
 It is of second order: half the step, a quarter of the error. (Forster et al., On-Manifold
-Preintegration, TRO 2017, eq. (30)-(35) hold w and f constant instead, which is of first order.)
+Preintegration, TRO 2017, eq. (31) holds w and f constant instead, which is of first order.)
 """
 
 from __future__ import annotations
@@ -87,10 +87,60 @@ def _correct(correction: F64, samples: F64, row: int, first: int, bias: F64, out
 
 
 @compiled(inline="always")
+def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: F64) -> None:
+    """Compute the rotation vector phi of the mean angular velocity of two samples during dt."""
+    for i in range(3):
+        phi[i] = 0.0
+        for j in range(3):
+            mean = 0.5 * (samples[row, 3 + j] + samples[row + 1, 3 + j])
+            phi[i] += dt * C_g[i, j] * (mean - bias[j])
+
+
+@compiled(inline="always")
+def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) -> None:
+    """Add the motion under the mean acceleration (R_0 f_0 + R_1 f_1) / 2 to p and v."""
+    for i in range(3):
+        a = 0.0
+        for j in range(3):
+            a += 0.5 * (R_0[i, j] * f_0[j] + R_1[i, j] * f_1[j])
+        p[i] += dt * (v[i] + 0.5 * dt * a)
+        v[i] += dt * a
+
+
+@compiled(inline="always")
+def _acceleration_derivatives(
+    R_0: F64,
+    R_1: F64,
+    f_0: F64,
+    f_1: F64,
+    E: F64,
+    J: F64,
+    dt: float,
+    by_theta: F64,
+    by_gyro: F64,
+    by_accel: F64,
+) -> None:
+    """Compute the derivatives (3, 3) of the mean acceleration a.
+
+    By the orientation at the beginning, -(R_0 [f_0]x + R_1 [f_1]x E^T) / 2; by the mean angular
+    velocity, -R_1 [f_1]x J dt / 2; by the mean specific force, (R_0 + R_1) / 2.
+    """
+    _times_skew(R_0, f_0, by_theta)
+    _times_skew(R_1, f_1, by_accel)  # only kept here until it is used
+    _multiply(by_accel, J, by_gyro)
+    for i in range(3):
+        x, y, z = by_accel[i, 0], by_accel[i, 1], by_accel[i, 2]
+        for j in range(3):
+            by_theta[i, j] = -0.5 * (by_theta[i, j] + x * E[j, 0] + y * E[j, 1] + z * E[j, 2])
+            by_gyro[i, j] *= -0.5 * dt
+            by_accel[i, j] = 0.5 * (R_0[i, j] + R_1[i, j])
+
+
+@compiled(inline="always")
 def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
     """Multiply the rows of state (9, n), ordered p, theta, v, by the error transition F.
 
-    F = [[I, M dt^2 / 2, I dt], [0, E^T, 0], [0, M dt, I]]; Forster eq. (A.7)-(A.9) with the mean
+    F = [[I, M dt^2 / 2, I dt], [0, E^T, 0], [0, M dt, I]]; after Forster, appendix A, with the mean
     acceleration a, whose derivative by theta is M.
     """
     for col in range(state.shape[1]):
@@ -176,57 +226,35 @@ def preintegrate(
         R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
         P, D = np.zeros((9, 9)), np.zeros((9, 6))
         E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        turn_0, turn_1, scratch = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        by_theta, by_gyro, by_accel = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         zero = np.zeros((3, 3))
         gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
-        w_0, w_1, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
         for row in range(start[edge], start[edge + 1] - 1):
             dt = (stamps[row + 1] - stamps[row]) * 1e-9
             if dt <= 0.0:
                 continue
-            _correct(C_g, samples, row, 3, gyro_bias[edge], w_0)
-            _correct(C_g, samples, row + 1, 3, gyro_bias[edge], w_1)
+            _mean_rotation(C_g, samples, row, gyro_bias[edge], dt, phi)
             _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
             _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
-            for i in range(3):
-                w_0[i] = 0.5 * (w_0[i] + w_1[i]) * dt  # the rotation vector from here on
-            _rotation(w_0, E, J)
+            _rotation(phi, E, J)
             _multiply(R, E, next_R)
-            # derivatives of the mean acceleration: by the orientation at the beginning (M, kept in
-            # turn_0), by the angular velocity (scratch), by the specific force (turn_1)
-            _times_skew(R, f_0, turn_0)
-            _times_skew(next_R, f_1, turn_1)
-            _multiply(turn_1, J, scratch)
-            for i in range(3):
-                for j in range(3):
-                    turn_0[i, j] += (
-                        turn_1[i, 0] * E[j, 0] + turn_1[i, 1] * E[j, 1] + turn_1[i, 2] * E[j, 2]
-                    )
-            for i in range(3):
-                for j in range(3):
-                    turn_0[i, j] *= -0.5
-                    scratch[i, j] *= -0.5 * dt
-                    turn_1[i, j] = 0.5 * (R[i, j] + next_R[i, j])
-            _noise_gain(scratch, J, C_g, dt, gyro_gain)
-            _noise_gain(turn_1, zero, C_a, dt, accel_gain)
-            _transition(P, E, turn_0, dt)
+            _acceleration_derivatives(R, next_R, f_0, f_1, E, J, dt, by_theta, by_gyro, by_accel)
+            _noise_gain(by_gyro, J, C_g, dt, gyro_gain)
+            _noise_gain(by_accel, zero, C_a, dt, accel_gain)
+            _transition(P, E, by_theta, dt)  # F P
             for i in range(9):
                 for j in range(i):
                     P[i, j], P[j, i] = P[j, i], P[i, j]
-            _transition(P, E, turn_0, dt)
+            _transition(P, E, by_theta, dt)  # F (F P)^T
             _add_noise(P, gyro_gain, noise[imu, 0] / dt)
             _add_noise(P, accel_gain, noise[imu, 1] / dt)
-            _transition(D, E, turn_0, dt)
+            _transition(D, E, by_theta, dt)
             for i in range(9):
                 for j in range(3):
                     D[i, j] -= gyro_gain[i, j]
                     D[i, 3 + j] -= accel_gain[i, j]
-            for i in range(3):
-                a = 0.0
-                for j in range(3):
-                    a += 0.5 * (R[i, j] * f_0[j] + next_R[i, j] * f_1[j])
-                p[i] += dt * (v[i] + 0.5 * dt * a)
-                v[i] += dt * a
+            _advance(R, next_R, f_0, f_1, dt, v, p)
             R[:] = next_R
         rotation[edge], velocity[edge], position[edge] = R, v, p
         covariance[edge], bias_jacobian[edge] = 0.5 * (P + P.T), D
@@ -259,20 +287,18 @@ def propagate(
         imu = imu_of_edge[edge]
         C_g, C_a = gyro_corrections[imu], accel_corrections[imu]
         E, J = np.empty((3, 3)), np.empty((3, 3))
-        w_0, w_1, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
         for row in range(start[edge], start[edge + 1] - 1):
             dt = (stamps[row + 1] - stamps[row]) * 1e-9
-            _correct(C_g, samples, row, 3, gyro_bias[edge], w_0)
-            _correct(C_g, samples, row + 1, 3, gyro_bias[edge], w_1)
+            _mean_rotation(C_g, samples, row, gyro_bias[edge], dt, phi)
             _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
             _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
-            for i in range(3):
-                w_0[i] = 0.5 * (w_0[i] + w_1[i]) * dt
-            _rotation(w_0, E, J)
+            _rotation(phi, E, J)
             _multiply(rotation[row], E, rotation[row + 1])
+            velocity[row + 1] = velocity[row]
+            position[row + 1] = position[row]
+            v, p = velocity[row + 1], position[row + 1]
+            _advance(rotation[row], rotation[row + 1], f_0, f_1, dt, v, p)
             for i in range(3):
-                a = gravity[i]
-                for j in range(3):
-                    a += 0.5 * (rotation[row, i, j] * f_0[j] + rotation[row + 1, i, j] * f_1[j])
-                position[row + 1, i] = position[row, i] + dt * (velocity[row, i] + 0.5 * dt * a)
-                velocity[row + 1, i] = velocity[row, i] + dt * a
+                p[i] += 0.5 * dt * dt * gravity[i]
+                v[i] += dt * gravity[i]

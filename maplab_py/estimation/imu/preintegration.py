@@ -9,7 +9,7 @@ acceleration, e.g. [0, 0, -9.81]) and any gravity-aligned frame G:
 
 dR, dv, dp do not depend on the states of A, only on its biases, and that to first order by the
 Jacobians given here: dR(b) = dR Exp(J_theta db), dv(b) = dv + J_v db, dp(b) = dp + J_p db.
-Source: Forster et al., On-Manifold Preintegration, TRO 2017, eq. (33), (37), (44), (A.7)-(A.9),
+Source: Forster et al., On-Manifold Preintegration, TRO 2017, eq. (33), (37), (44) and appendix A,
 with the second-order integration of `kernels`.
 
 ORDER of covariance rows and Jacobian rows: p, theta, v; theta is a right perturbation, rotation =
