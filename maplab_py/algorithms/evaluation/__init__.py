@@ -1,0 +1,1 @@
+"""How far a trajectory is from the truth: absolute and relative pose errors."""

@@ -1,0 +1,173 @@
+"""A map's vertices against ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory, match
+from maplab_py.errors import EstimationError
+from maplab_py.geometry import se3, so3
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap, ids
+
+OPTIONS = TrajectoryEvaluationOptions()
+START_NS = 1403715273262142976
+PERIOD_NS = 5_000_000
+
+
+def make_truth(count: int = 4000) -> Trajectory:
+    s = np.arange(count) * 0.005
+    p = np.stack([2 * np.sin(s), 3 * np.cos(0.7 * s), 0.5 * np.sin(1.3 * s)], axis=1)
+    q = so3.exp(np.stack([0.3 * np.sin(s), 0.2 * np.cos(s), 0.5 * s], axis=1))
+    return Trajectory(START_NS + np.arange(count) * PERIOD_NS, se3.make(q, p), source="truth")
+
+
+def make_map(truth: Trajectory, rows: np.ndarray, missions: int = 2) -> VIMap:
+    """Vertices at rows of the truth, cut into missions with base frames of their own."""
+    rng = np.random.default_rng(2)
+    mission = np.sort(np.arange(len(rows)) * missions // len(rows)).astype(np.int32)
+    T_G_M = se3.make(so3.exp(rng.normal(size=(missions, 3))), rng.normal(size=(missions, 3)))
+    T_M_I = se3.compose(se3.inverse(T_G_M[mission]), truth.T_R_B[rows])
+    return VIMap(
+        missions=Missions.filled(
+            missions, id=ids.random_ids(missions, rng), baseframe=np.arange(missions)
+        ),
+        baseframes=BaseFrames.filled(missions, T_G_M=T_G_M),
+        vertices=Vertices.filled(
+            len(rows), mission=mission, T_M_I=T_M_I, timestamp_ns=truth.times_ns[rows]
+        ),
+    )
+
+
+def moved(vi_map: VIMap, delta: np.ndarray) -> VIMap:
+    vertices = vi_map.vertices
+    T_G_I = vi_map.T_G_I.copy()
+    T_G_I[:, 4:] += delta
+    T_M_I = se3.compose(se3.inverse(vi_map.T_G_M[vertices.mission]), T_G_I)
+    return vi_map.replace(vertices=vertices.replace(T_M_I=T_M_I))
+
+
+def test_a_true_map_has_no_error() -> None:
+    truth = make_truth()
+    report = evaluate_trajectory(make_map(truth, np.arange(0, 4000, 40)), truth, OPTIONS)
+    assert (report.vertices, report.matched, report.without_ground_truth) == (100, 100, 0)
+    assert report.ape_m.rmse < 1e-12
+    assert report.ape_deg.rmse < 1e-10
+    assert report.scale == pytest.approx(1.0)
+    assert report.rpe_m is not None
+    assert report.rpe_m.rmse < 1e-12
+    assert len(report.missions) == 2
+    assert report.failure == ""
+
+
+def test_known_errors_come_out() -> None:
+    truth = make_truth()
+    vi_map = make_map(truth, np.arange(0, 4000, 40))
+    delta = np.random.default_rng(1).normal(size=(100, 3)) * 0.1
+    options = dataclasses.replace(OPTIONS, alignment="none")
+    report = evaluate_trajectory(moved(vi_map, delta), truth, options)
+    assert report.ape_m.rmse == pytest.approx(np.sqrt(np.mean(np.sum(delta**2, axis=1))))
+    assert report.ape_m.max == pytest.approx(np.max(np.linalg.norm(delta, axis=1)))
+    aligned = evaluate_trajectory(moved(vi_map, delta), truth, OPTIONS)
+    assert aligned.ape_m.rmse <= report.ape_m.rmse
+    assert aligned.ape_sim3_m is not None
+    assert aligned.ape_sim3_m.rmse <= aligned.ape_m.rmse
+
+
+def test_missions_can_be_chosen_and_are_also_aligned_alone() -> None:
+    truth = make_truth()
+    vi_map = make_map(truth, np.arange(0, 4000, 40))
+    shift = np.where(vi_map.vertices.mission[:, None] == 1, [5.0, 0.0, 0.0], 0.0)
+    broken = moved(vi_map, shift)
+    both = evaluate_trajectory(broken, truth, OPTIONS)
+    assert both.ape_m.rmse > 0.5
+    assert [m.ape_rmse_m for m in both.missions] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert both.rpe_m is not None
+    assert both.rpe_m.max < 1e-12
+    one = evaluate_trajectory(broken, truth, OPTIONS, missions=np.array([1]))
+    assert one.matched == 50
+    assert one.ape_m.rmse < 1e-12
+
+
+def test_interpolation_beats_the_nearest_pose() -> None:
+    truth = make_truth()
+    coarse = Trajectory(truth.times_ns[::10], truth.T_R_B[::10])
+    vi_map = make_map(truth, np.arange(5, 3900, 43))
+    linear = evaluate_trajectory(vi_map, coarse, OPTIONS)
+    nearest = evaluate_trajectory(vi_map, coarse, dataclasses.replace(OPTIONS, interpolate=False))
+    assert linear.ape_m.rmse < 1e-3
+    assert nearest.ape_m.rmse > 10 * linear.ape_m.rmse
+
+
+def test_vertices_outside_the_span_or_in_a_gap_are_left_out() -> None:
+    truth = make_truth()
+    rows = np.arange(0, 4000, 40)
+    kept = (np.arange(4000) >= 1) & ~((np.arange(4000) > 1000) & (np.arange(4000) < 1200))
+    cut = Trajectory(truth.times_ns[kept], truth.T_R_B[kept])
+    report = evaluate_trajectory(make_map(truth, rows), cut, OPTIONS)
+    assert report.without_ground_truth == 1 + 4
+    _, matched = match(cut, truth.times_ns[rows], OPTIONS)
+    assert np.flatnonzero(~matched).tolist() == [0, 26, 27, 28, 29]
+
+
+def test_a_turned_body_frame_spoils_relative_errors_only_unless_aligned() -> None:
+    truth = make_truth()
+    turn = se3.make(so3.exp([0.0, 0.1, 0.0]), np.zeros(3))
+    turned = Trajectory(truth.times_ns, se3.compose(truth.T_R_B, turn))
+    vi_map = make_map(truth, np.arange(0, 4000, 40))
+    report = evaluate_trajectory(vi_map, turned, OPTIONS)
+    assert report.ape_m.rmse < 1e-12
+    assert report.body_rotation_deg == pytest.approx(np.degrees(0.1))
+    assert report.rpe_m is not None
+    assert report.rpe_m.rmse > 0.05
+    options = dataclasses.replace(OPTIONS, align_body_frame=True)
+    aligned = evaluate_trajectory(vi_map, turned, options)
+    assert aligned.rpe_m is not None
+    assert aligned.rpe_m.rmse < 1e-12
+    assert aligned.ape_deg.rmse < 1e-10
+
+
+@pytest.mark.parametrize(("unit", "delta", "count"), [("frames", 5, 90), ("s", 1.0, 90)])
+def test_pieces_stay_within_missions(unit: str, delta: float, count: int) -> None:
+    truth = make_truth()
+    vi_map = make_map(truth, np.arange(0, 4000, 40))
+    options = dataclasses.replace(OPTIONS, rpe_delta=delta, rpe_delta_unit=unit)
+    report = evaluate_trajectory(vi_map, truth, options)
+    assert report.rpe_m is not None
+    assert report.rpe_m.count == count
+
+
+def test_wrong_requests_are_explained() -> None:
+    truth = make_truth(400)
+    vi_map = make_map(truth, np.arange(0, 400, 40))
+    late = Trajectory(truth.times_ns + 10**12, truth.T_R_B)
+    with pytest.raises(EstimationError, match=r"only 0 of 10 vertices have ground truth.* ns, gr"):
+        evaluate_trajectory(vi_map, late, OPTIONS)
+    empty = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 7)))
+    with pytest.raises(EstimationError, match="only 0 of 10"):
+        evaluate_trajectory(vi_map, empty, OPTIONS)
+    with pytest.raises(EstimationError, match="whole number of frames"):
+        evaluate_trajectory(
+            vi_map, truth, dataclasses.replace(OPTIONS, rpe_delta=1.5, rpe_delta_unit="frames")
+        )
+    with pytest.raises(EstimationError, match="rpe_delta_unit must be one of"):
+        evaluate_trajectory(vi_map, truth, dataclasses.replace(OPTIONS, rpe_delta_unit="miles"))
+
+
+def test_motion_on_a_line_has_no_alignment_but_errors_without_one() -> None:
+    truth = make_truth(400)
+    T = truth.T_R_B.copy()
+    T[:, 4:] = np.arange(400)[:, None] * np.array([0.01, 0.0, 0.0])
+    line = Trajectory(truth.times_ns, T)
+    vi_map = make_map(line, np.arange(0, 400, 40))
+    with pytest.raises(EstimationError, match="on one line"):
+        evaluate_trajectory(vi_map, line, OPTIONS)
+    report = evaluate_trajectory(vi_map, line, dataclasses.replace(OPTIONS, alignment="none"))
+    assert report.ape_m.rmse < 1e-12
+    assert (report.ape_sim3_m, report.scale) == (None, None)
+    yaw = evaluate_trajectory(vi_map, line, dataclasses.replace(OPTIONS, alignment="yaw"))
+    assert yaw.ape_m.rmse < 1e-12
