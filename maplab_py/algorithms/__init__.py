@@ -1,0 +1,1 @@
+"""Algorithms: one module or folder per capability, VIMap -> VIMap."""

@@ -1,0 +1,1 @@
+"""Pose-graph relaxation: spread the corrections of loop closures over the trajectories."""

@@ -1,0 +1,86 @@
+"""What a user can set of the relaxation, and what it reports."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.options import option
+from maplab_py.report import Report
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxationOptions:
+    """Flags of pose-graph relaxation.
+
+    The drift rates say how far a mission's own trajectory is trusted between loop closures. They
+    describe random walks: the variance grows with distance or time. The defaults are several times
+    what a good visual-inertial odometry drifts: too small a rate makes true closures look false,
+    too large a one lets false ones bend the trajectory.
+    """
+
+    flag_prefix: ClassVar[str] = "relax_"
+
+    robustness: str = option(
+        "switchable",
+        help="How false loop closures are kept from doing harm: 'switchable' estimates a switch "
+        "variable for each one, 'dcs' is its closed form (dynamic covariance scaling), 'cauchy' a "
+        "Cauchy loss, 'none' trusts all of them.",
+        choices=("switchable", "dcs", "cauchy", "none"),
+    )
+    switch_prior: float = option(
+        20.0,
+        help="Cost of switching a loop closure off: closures whose squared normalised error (six "
+        "degrees of freedom) is above it lose their weight.",
+    )
+    position_drift: float = option(
+        0.05, help="Position random walk of the trajectories.", unit="m/sqrt(m)"
+    )
+    yaw_drift_deg: float = option(
+        0.5, help="Heading random walk of the trajectories.", unit="deg/sqrt(s)"
+    )
+    tilt_drift_deg: float = option(
+        0.02,
+        help="Roll and pitch random walk of the trajectories; small, because gravity shows them.",
+        unit="deg/sqrt(s)",
+    )
+    tilt_sigma_deg: float = option(
+        0.5,
+        help="Uncertainty of the roll and pitch of each mission's first vertex.",
+        unit="deg",
+    )
+    loop_sigma_m: float = option(
+        0.05, help="Position uncertainty of loop closures that come without a covariance.", unit="m"
+    )
+    loop_sigma_deg: float = option(
+        1.0, help="Angular uncertainty of loop closures that come without a covariance.", unit="deg"
+    )
+    num_iterations: int = option(
+        30, help="Iterations of the last optimisation, at most; those before it take a few each."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxationReport(Report):
+    """What a relaxation did."""
+
+    num_loop_closures: int  # used as constraints
+    num_switched_off: int  # of those, given less than half their weight
+    num_ignored: int  # not used at all; `notes` says why
+    num_vertices: int  # that could move
+    num_clusters: int  # groups of missions held together by closures
+    iterations: int
+    cost_before: float
+    cost_after: float
+    mean_correction_m: float
+    max_correction_m: float
+    max_correction_deg: float
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def failure(self) -> str:
+        """Say that nothing was relaxed, and why."""
+        if self.num_loop_closures > 0:
+            return ""
+        return "no loop closure edges" + "".join(f"; {note}" for note in self.notes)
