@@ -1,0 +1,231 @@
+"""Edits of a map: every function takes a map and returns another that shares what did not change."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maplab_py.geometry import se3, so3
+from maplab_py.vimap.ids import IdArray, is_valid, random_ids
+from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
+from maplab_py.vimap.tables import NO_ROW, LandmarkQuality, Landmarks
+from maplab_py.vimap.vertex_removal import move_landmarks, remove_vertices, stores_for
+from maplab_py.vimap.vi_map import VIMap
+
+__all__ = [
+    "add_landmarks",
+    "merge_landmarks",
+    "remove_landmarks",
+    "remove_loop_closure_edges",
+    "remove_missions",
+    "remove_observations",
+    "remove_vertices",
+    "transform_mission",
+    "with_new_ids",
+    "with_p_G",
+]
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
+    """Remove missions with their vertices, edges, resources and landmarks.
+
+    Landmarks that another mission observes move to their first observer there and keep their
+    place in G. Loop closure edges to the removed missions go.
+
+    Args:
+        vi_map: The map.
+        missions: Mission rows or a mask (M,).
+    """
+    gone = as_mask(missions, len(vi_map.missions))
+    vertex_kept = ~gone[vi_map.vertices.mission]
+    homeless = np.flatnonzero(~vertex_kept[vi_map.landmarks.vertex])
+    store = stores_for(vi_map, homeless, vertex_kept, same_mission=False)
+    found = store >= 0
+    vi_map = move_landmarks(vi_map, homeless[found], store[found])
+    return keep_rows(vi_map, missions=np.flatnonzero(~gone))
+
+
+def remove_landmarks(vi_map: VIMap, landmarks: ArrayLike) -> VIMap:
+    """Remove landmarks (rows or a mask (L,)); their keypoints stay and observe nothing."""
+    gone = as_mask(landmarks, len(vi_map.landmarks))
+    return keep_rows(vi_map, landmarks=np.flatnonzero(~gone)) if gone.any() else vi_map
+
+
+def remove_observations(vi_map: VIMap, keypoints: ArrayLike) -> VIMap:
+    """Detach keypoints (rows or a mask (K,)) from their landmarks; the landmarks stay."""
+    landmark = vi_map.keypoints.landmark.copy()
+    landmark[as_rows(keypoints, len(landmark))] = NO_ROW
+    return vi_map.replace(keypoints=vi_map.keypoints.replace(landmark=landmark))
+
+
+def remove_loop_closure_edges(vi_map: VIMap, edges: ArrayLike) -> VIMap:
+    """Remove loop closure edges (rows or a mask)."""
+    gone = as_mask(edges, len(vi_map.loop_closure_edges))
+    return vi_map.replace(loop_closure_edges=vi_map.loop_closure_edges.take(~gone))
+
+
+def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -> VIMap:
+    """Unite landmarks: observations of `from_rows[i]` become those of `into_rows[i]`.
+
+    Pairs may form chains and trees: everything that hangs together becomes one landmark, the
+    lowest row that is only ever merged into (the lowest of all where there is a ring). It keeps
+    its id, place and quality; the others are removed. When a frame would observe a united
+    landmark twice, the keypoint that observed the surviving landmark before stays, else the one
+    with the lowest row; the other keypoints are detached.
+
+    Args:
+        vi_map: The map.
+        from_rows: Landmark rows (N,).
+        into_rows: Landmark rows (N,).
+    """
+    source = np.asarray(from_rows, dtype=np.int64)
+    target = np.asarray(into_rows, dtype=np.int64)
+    if source.shape != target.shape:
+        raise ValueError(f"{len(source)} landmarks cannot merge into {len(target)}")
+    count = len(vi_map.landmarks)
+    as_rows(np.concatenate([source, target]), count)  # range check
+    survivor = _survivors(source, target, count)
+    gone = survivor != np.arange(count)
+    if not gone.any():
+        return vi_map
+    before = vi_map.keypoints.landmark
+    after = np.append(survivor, NO_ROW).astype(np.int32)[before]
+    united = np.zeros(count, dtype=np.bool_)
+    united[survivor[gone]] = True
+    rows = np.flatnonzero((after >= 0) & united[after])
+    frame = vi_map.keypoint_frame[rows]
+    order = np.lexsort((rows, before[rows] != after[rows], frame, after[rows]))
+    rows, frame = rows[order], frame[order]
+    again = np.zeros(len(rows), dtype=np.bool_)
+    again[1:] = (after[rows[1:]] == after[rows[:-1]]) & (frame[1:] == frame[:-1])
+    after[rows[again]] = NO_ROW
+    merged = vi_map.replace(keypoints=vi_map.keypoints.replace(landmark=after))
+    return keep_rows(merged, landmarks=np.flatnonzero(~gone))
+
+
+def _survivors(source: I64, target: I64, count: int) -> I64:
+    """Return the row (count,) that each landmark ends up in."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(source), dtype=np.int8), (source, target)), shape=(count, count))
+    groups, label = connected_components(links, directed=False)
+    is_source = np.zeros(count, dtype=np.bool_)
+    is_source[source[source != target]] = True
+    # the first of each group when sorted by (is a source, row)
+    order = np.lexsort((np.arange(count), is_source, label))
+    first = np.zeros(groups, dtype=np.int64)
+    first[label[order[::-1]]] = order[::-1]
+    return np.asarray(first[label])
+
+
+def add_landmarks(
+    vi_map: VIMap,
+    *,
+    vertex: ArrayLike,
+    p_I: ArrayLike,
+    keypoint_rows: ArrayLike,
+    keypoint_landmark: ArrayLike,
+    ids: IdArray | None = None,
+    quality: ArrayLike = LandmarkQuality.UNKNOWN,
+    feature_type: ArrayLike = 0,
+) -> VIMap:
+    """Append landmarks and attach keypoints to them.
+
+    Args:
+        vi_map: The map.
+        vertex: Store vertex (N,) of each new landmark.
+        p_I: Position (N, 3) in the body frame of that vertex [m].
+        keypoint_rows: Observing keypoints (O,); they leave the landmark they had.
+        keypoint_landmark: For each of them (O,) the new landmark, 0 .. N - 1.
+        ids: Ids (N, 2); by default derived from the map's content, so that equal maps get equal ids.
+        quality: Quality of all or each (N,).
+        feature_type: Feature type of all or each (N,).
+    """
+    store = np.asarray(vertex, dtype=np.int32)
+    count = len(store)
+    if ids is None:
+        ids = random_ids(count, content_rng(vi_map, "landmarks"))
+    table = Landmarks.filled(
+        count,
+        id=ids,
+        vertex=store,
+        p_I=p_I,
+        quality=np.broadcast_to(np.asarray(quality, dtype=np.int8), (count,)),
+        feature_type=np.broadcast_to(np.asarray(feature_type, dtype=np.int32), (count,)),
+    )
+    landmark = vi_map.keypoints.landmark.copy()
+    new_rows = len(vi_map.landmarks) + np.asarray(keypoint_landmark, dtype=np.int64)
+    landmark[np.asarray(keypoint_rows, dtype=np.int64)] = new_rows
+    return vi_map.replace(
+        landmarks=Landmarks.concatenate([vi_map.landmarks, table]),
+        keypoints=vi_map.keypoints.replace(landmark=landmark),
+    )
+
+
+def with_p_G(vi_map: VIMap, landmarks: ArrayLike, p_G: ArrayLike) -> VIMap:
+    """Place landmarks (rows (N,)) at points (N, 3) of G; each stays in its store vertex."""
+    rows = np.asarray(landmarks, dtype=np.int64)
+    T_I_G = se3.inverse(vi_map.T_G_I[vi_map.landmarks.vertex[rows]])
+    p_I = vi_map.landmarks.p_I.copy()
+    p_I[rows] = se3.transform(T_I_G, p_G)
+    return vi_map.replace(landmarks=vi_map.landmarks.replace(p_I=p_I))
+
+
+def transform_mission(vi_map: VIMap, mission: int, T_N_M: F64) -> VIMap:
+    """Express a mission's states in another mission frame N (7,); its place in G changes."""
+    rows = vi_map.vertices.mission == mission
+    v = vi_map.vertices
+    T_M_I, v_M = v.T_M_I.copy(), v.v_M.copy()
+    T_M_I[rows] = se3.compose(T_N_M, T_M_I[rows])
+    v_M[rows] = so3.rotate(T_N_M[:4], v_M[rows])
+    return vi_map.replace(vertices=v.replace(T_M_I=T_M_I, v_M=v_M))
+
+
+def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap:
+    """Give fresh ids to missions, base frames, vertices, frames, landmarks and edges.
+
+    Sensors and resources keep theirs (both name files or entries outside the tables); so does
+    everything without an id. By default the ids are derived from the map's present ids: the same
+    map gets the same new ids in every run, and different ones each time it is applied again.
+
+    Args:
+        vi_map: The map.
+        rng: Where to draw ids from.
+    """
+    if rng is None:
+        rng = content_rng(vi_map, "new ids")
+
+    def fresh(ids: IdArray) -> IdArray:
+        return np.where(is_valid(ids)[:, None], random_ids(len(ids), rng), ids)
+
+    names = (
+        "missions",
+        "baseframes",
+        "vertices",
+        "frames",
+        "landmarks",
+        "imu_edges",
+        "transformation_edges",
+        "loop_closure_edges",
+    )
+    tables = {name: getattr(vi_map, name) for name in names}
+    tables = {name: table.replace(id=fresh(table.id)) for name, table in tables.items()}
+    vertices = tables["vertices"]
+    tables["vertices"] = vertices.replace(nframe_id=fresh(vertices.nframe_id))
+    return vi_map.replace(**tables)
+
+
+def content_rng(vi_map: VIMap, purpose: str, *others: VIMap) -> np.random.Generator:
+    """Return a generator that depends on the ids of the maps and the purpose alone."""
+    digest = hashlib.blake2b(purpose.encode(), digest_size=16)
+    for one in (vi_map, *others):
+        for table in (one.missions, one.vertices, one.landmarks):
+            digest.update(np.ascontiguousarray(table.id, dtype="<u8").tobytes())
+            digest.update(b"/")
+    return np.random.default_rng(int.from_bytes(digest.digest(), "little"))

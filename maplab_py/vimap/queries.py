@@ -1,0 +1,160 @@
+"""Questions about a map that several algorithms and commands ask."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import UserError
+from maplab_py.vimap.ids import HEX_DIGITS, to_hex_list
+from maplab_py.vimap.tables import MissionSensor
+from maplab_py.vimap.vi_map import VIMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def find_mission(vi_map: VIMap, id_prefix: str) -> int:
+    """Return the row of the mission whose id begins with `id_prefix`.
+
+    Raises:
+        UserError: The prefix is empty, matches no mission or several; the message lists them.
+    """
+    prefix = id_prefix.strip().lower()
+    known = to_hex_list(vi_map.missions.id)
+    if not known:
+        raise UserError("the map has no missions")
+    rows = [row for row, mission_id in enumerate(known) if mission_id.startswith(prefix)]
+    if prefix and len(rows) == 1:
+        return rows[0]
+    if not prefix:
+        raise UserError(f"--map_mission is empty: choose one of {', '.join(known)}")
+    if len(prefix) > HEX_DIGITS or not rows:
+        raise UserError(f"no mission begins with '{id_prefix}': the map has {', '.join(known)}")
+    candidates = ", ".join(known[row] for row in rows)
+    raise UserError(f"'{id_prefix}' is ambiguous: it begins missions {candidates}")
+
+
+def mission_mask(vi_map: VIMap, missions: NDArray[Any] | None) -> Mask:
+    """Return which missions (M,) are meant; None = all."""
+    mask = np.zeros(len(vi_map.missions), dtype=np.bool_)
+    mask[slice(None) if missions is None else missions] = True
+    return mask
+
+
+def landmark_mask(vi_map: VIMap, missions: NDArray[Any] | None) -> Mask:
+    """Return which landmarks (L,) are stored in the missions; None = all."""
+    chosen = mission_mask(vi_map, missions)
+    return chosen[vi_map.vertices.mission[vi_map.landmarks.vertex]]
+
+
+def observation_counts(vi_map: VIMap) -> I64:
+    """Return the number of observations (L,) of each landmark."""
+    return np.diff(vi_map.observation_start)
+
+
+def observer_counts(vi_map: VIMap) -> I64:
+    """Return the number of distinct observing vertices (L,) of each landmark."""
+    keypoints = vi_map.observations
+    landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
+    pairs = np.unique(landmark * max(len(vi_map.vertices), 1) + vi_map.keypoint_vertex[keypoints])
+    observed = pairs // max(len(vi_map.vertices), 1)
+    return np.bincount(observed, minlength=len(vi_map.landmarks))
+
+
+def coobservation_counts(vi_map: VIMap) -> I64:
+    """Return the matrix (M, M) of landmarks that both missions observe; the diagonal: by one."""
+    missions, landmarks = len(vi_map.missions), len(vi_map.landmarks)
+    keypoints = vi_map.observations
+    mission = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]]
+    seen = np.zeros((missions, landmarks), dtype=np.bool_)
+    seen[mission, vi_map.keypoints.landmark[keypoints]] = True
+    counts = [[np.count_nonzero(a & b) for b in seen] for a in seen]
+    return np.array(counts, dtype=np.int64).reshape(missions, missions)
+
+
+def mission_clusters(vi_map: VIMap, *, with_loop_closures: bool = True) -> I64:
+    """Label missions (M,) that hang together by shared landmarks or loop closure edges.
+
+    A landmark binds its store vertex' mission to those of its observers. Labels are the lowest
+    mission row of each cluster.
+    """
+    mission = vi_map.vertices.mission
+    keypoints = vi_map.observations
+    home = mission[vi_map.landmarks.vertex[vi_map.keypoints.landmark[keypoints]]]
+    pairs = np.stack([home, mission[vi_map.keypoint_vertex[keypoints]]], axis=1)
+    if with_loop_closures:
+        edges = vi_map.loop_closure_edges
+        ends = np.stack([mission[edges.from_vertex], mission[edges.to_vertex]], axis=1)
+        pairs = np.concatenate([pairs, ends])
+    label = np.arange(len(vi_map.missions))
+    pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    while len(pairs):
+        lowest = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
+        before = label.copy()
+        np.minimum.at(label, pairs[:, 0], lowest)
+        np.minimum.at(label, pairs[:, 1], lowest)
+        if np.array_equal(label, before):
+            break
+    return label
+
+
+def mission_distances_m(vi_map: VIMap) -> F64:
+    """Return the length (M,) of each mission's path over its vertices [m]."""
+    mission = vi_map.vertices.mission
+    step = np.linalg.norm(np.diff(vi_map.vertices.T_M_I[:, 4:], axis=0), axis=1)
+    inside = mission[1:] == mission[:-1]
+    lengths = np.bincount(mission[1:][inside], step[inside], minlength=len(vi_map.missions))
+    return np.asarray(lengths, dtype=np.float64)
+
+
+def mission_time_spans_ns(vi_map: VIMap) -> I64:
+    """Return first and last vertex time (M, 2) of each mission [ns]; zeros for an empty one."""
+    start = vi_map.vertex_start
+    spans = np.zeros((len(vi_map.missions), 2), dtype=np.int64)
+    filled = np.diff(start) > 0
+    spans[filled, 0] = vi_map.vertices.timestamp_ns[start[:-1][filled]]
+    spans[filled, 1] = vi_map.vertices.timestamp_ns[start[1:][filled] - 1]
+    return spans
+
+
+def has_link(vi_map: VIMap) -> Mask:
+    """Tell for each vertex row (V,) whether an IMU or relative-pose edge leads to the next row.
+
+    False at the last vertex of each mission.
+    """
+    linked = np.zeros(len(vi_map.vertices), dtype=np.bool_)
+    mission = vi_map.vertices.mission
+    for edges in (vi_map.imu_edges, vi_map.transformation_edges):
+        low = np.minimum(edges.from_vertex, edges.to_vertex)
+        high = np.maximum(edges.from_vertex, edges.to_vertex)
+        along = (low >= 0) & (high == low + 1)
+        along[along] = mission[low[along]] == mission[high[along]]
+        linked[low[along]] = True
+    return linked
+
+
+def mission_sensor_id(vi_map: VIMap, mission: int, kind: MissionSensor) -> str:
+    """Return the id (32 hexadecimal digits) of a mission's sensor, empty when it has none."""
+    words = vi_map.missions.sensor_id[mission, kind]
+    return to_hex_list(words)[0] if words.any() else ""
+
+
+def T_I_C_of_frames(vi_map: VIMap) -> F64:
+    """Return the camera pose (F, 7) on the IMU of every frame.
+
+    Raises:
+        MapError: A mission with frames has no camera rig or IMU in sensors.yaml.
+    """
+    poses = np.zeros((len(vi_map.frames), 7))
+    mission = vi_map.vertices.mission[vi_map.frames.vertex]
+    for row in np.unique(mission).tolist():
+        frames = np.flatnonzero(mission == row)
+        imu_id = mission_sensor_id(vi_map, row, MissionSensor.IMU)
+        rig_id = mission_sensor_id(vi_map, row, MissionSensor.NCAMERA)
+        T_I_C = vi_map.sensors.T_I_C(imu_id, rig_id)
+        poses[frames] = T_I_C[vi_map.frames.camera_index[frames]]
+    return poses

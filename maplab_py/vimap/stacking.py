@@ -1,0 +1,103 @@
+"""Put the tables of two maps on top of each other."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.vimap.sensor_merge import union
+from maplab_py.vimap.tables import (
+    AbsolutePoses,
+    BaseFrames,
+    Frames,
+    ImuEdges,
+    ImuSamples,
+    Keypoints,
+    Landmarks,
+    LoopClosureEdges,
+    Missions,
+    ResourceOwner,
+    Resources,
+    TransformationEdges,
+    Vertices,
+)
+from maplab_py.vimap.vi_map import MapMetadata, VIMap
+
+I32 = NDArray[np.int32]
+
+
+def stack(base: VIMap, other: VIMap) -> VIMap:
+    """Return a map with the rows of `base`, then those of `other`, references shifted.
+
+    Nothing is united or sorted; base's sensors win where ids are equal.
+    """
+    v, m = len(base.vertices), len(base.missions)
+    missions = other.missions.replace(
+        baseframe=_shift(other.missions.baseframe, len(base.baseframes)),
+        root_vertex=_shift(other.missions.root_vertex, v),
+    )
+    frames = other.frames.replace(vertex=_shift(other.frames.vertex, v))
+    landmarks = other.landmarks.replace(vertex=_shift(other.landmarks.vertex, v))
+    keypoints = other.keypoints.replace(
+        landmark=_shift(other.keypoints.landmark, len(base.landmarks))
+    )
+    absolute = other.absolute_poses.replace(vertex=_shift(other.absolute_poses.vertex, v))
+    metadata, folder = _joined_metadata(base.metadata, other)
+    resources = _shift_resources(other.resources.replace(folder=folder), len(base.frames), m)
+    imu, loops, relative = other.imu_edges, other.loop_closure_edges, other.transformation_edges
+    imu = imu.replace(from_vertex=_shift(imu.from_vertex, v), to_vertex=_shift(imu.to_vertex, v))
+    loops = loops.replace(
+        from_vertex=_shift(loops.from_vertex, v), to_vertex=_shift(loops.to_vertex, v)
+    )
+    relative = relative.replace(
+        from_vertex=_shift(relative.from_vertex, v), to_vertex=_shift(relative.to_vertex, v)
+    )
+    vertices = other.vertices.replace(mission=_shift(other.vertices.mission, m))
+    return base.replace(
+        sensors=union(base.sensors, other.sensors),
+        metadata=metadata,
+        missions=Missions.concatenate([base.missions, missions]),
+        baseframes=BaseFrames.concatenate([base.baseframes, other.baseframes]),
+        vertices=Vertices.concatenate([base.vertices, vertices]),
+        frames=Frames.concatenate([base.frames, frames]),
+        keypoints=Keypoints.concatenate([base.keypoints, keypoints]),
+        landmarks=Landmarks.concatenate([base.landmarks, landmarks]),
+        imu_edges=ImuEdges.concatenate([base.imu_edges, imu]),
+        imu_samples=ImuSamples.concatenate([base.imu_samples, other.imu_samples]),
+        transformation_edges=TransformationEdges.concatenate([base.transformation_edges, relative]),
+        loop_closure_edges=LoopClosureEdges.concatenate([base.loop_closure_edges, loops]),
+        absolute_poses=AbsolutePoses.concatenate([base.absolute_poses, absolute]),
+        resources=Resources.concatenate([base.resources, resources]),
+    )
+
+
+def _shift(rows: I32, offset: int) -> I32:
+    return np.where(rows >= 0, rows + offset, rows).astype(np.int32)
+
+
+def _shift_resources(resources: Resources, frames: int, missions: int) -> Resources:
+    offset = np.where(resources.owner_kind == ResourceOwner.FRAME, frames, missions)
+    owned = (resources.owner_kind != ResourceOwner.NONE) & (resources.owner >= 0)
+    return resources.replace(owner=np.where(owned, resources.owner + offset, resources.owner))
+
+
+def _joined_metadata(base: MapMetadata, other: VIMap) -> tuple[MapMetadata, I32]:
+    """Add the other map's resource folders to the base's; return them and the new folder column.
+
+    Resources in the other map's own folder are found there as in an external one.
+    """
+    folder = other.resources.folder.copy()
+    if len(folder) == 0:
+        return base, folder
+    known = list(base.external_resource_folders)
+    names = dict(enumerate(other.metadata.external_resource_folders))
+    if np.any(folder == -1):
+        own = other.metadata.map_folder.rstrip("/")
+        names[-1] = f"{own}/{other.metadata.map_resource_folder.removeprefix('./')}"
+    for index, name in names.items():
+        if name not in known:
+            known.append(name)
+        folder[other.resources.folder == index] = known.index(name)
+    return dataclasses.replace(base, external_resource_folders=tuple(known)), folder
