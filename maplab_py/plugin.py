@@ -11,6 +11,7 @@ docs/writing_plugins.md.
 
 from maplab_py.console.command import command
 from maplab_py.console.context import CommandContext
+from maplab_py.console.maps import key_of_folder
 from maplab_py.errors import Cancelled, EstimationError, MapError, UserError
 from maplab_py.options import option
 from maplab_py.progress import Progress
@@ -26,5 +27,6 @@ __all__ = [
     "Report",
     "UserError",
     "command",
+    "key_of_folder",
     "option",
 ]

@@ -137,7 +137,7 @@ def describe(
         if _is_options(hints[parameter.name]):
             defaults[parameter.name] = _default_group(parameter, hints[parameter.name])
         elif parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
-            positional.append(parameter.name)
+            positional.append(normalise(parameter.name).rstrip("_"))
     return Command(
         name,
         aliases,

@@ -72,6 +72,11 @@ class CommandContext:
         """Hand over the new value of the selected map."""
         self._drafts[self.maps.selected.key] = vi_map
 
+    @property
+    def has_drafts(self) -> bool:
+        """Tell whether the command has committed anything."""
+        return bool(self._drafts)
+
     def apply_drafts(self) -> None:
         """Make the committed values those of the maps; the session calls it at a good end."""
         for key, vi_map in self._drafts.items():

@@ -32,6 +32,11 @@ class FlagType:
     choices: tuple[str, ...] = ()
 
     @property
+    def text(self) -> str:
+        """The type for people: its name, or the words to choose from."""
+        return "|".join(self.choices) if self.choices and not self.is_bool else self.name
+
+    @property
     def is_bool(self) -> bool:
         """Tell whether the flag can be given without a value."""
         return self.name == "bool"

@@ -86,7 +86,7 @@ def parse_words(
     Args:
         words: The words, without the command.
         flags: The command's flags by name.
-        owner: The command's name, for messages.
+        owner: The command's name, for messages; empty where the flags are those of all commands.
 
     Raises:
         FlagError: A flag is unknown or lacks its value.
@@ -104,9 +104,9 @@ def parse_words(
         typed, has_value, text = word.lstrip("-").partition("=")
         name, implied = resolve_name(typed, flags, owner)
         if implied == "false" and has_value:
-            raise FlagError(f"{owner}: --{typed} takes no value (write --{name}={text})")
+            raise FlagError(f"--{typed} takes no value (write --{name}={text})")
         if not has_value:
-            text = implied or _take_value(name, rest, owner)
+            text = implied or _take_value(name, rest)
             if implied == "true" and rest and rest[0].lower() in ("true", "false"):
                 text = rest.pop(0)
         given.append(Given(name, text))
@@ -129,10 +129,12 @@ def resolve_name(typed: str, flags: Mapping[str, Flag], owner: str) -> tuple[str
         if positive != name and positive in flags and flags[positive].type.is_bool:
             return positive, "false"
     proposal = did_you_mean(name, [*flags, *COMMON_FLAGS], "--")
+    if not owner:
+        raise FlagError(f"no command has a flag --{name}{proposal}")
     raise FlagError(f"{owner} has no flag --{name}{proposal or f' (see: help {owner})'}")
 
 
-def _take_value(name: str, rest: list[str], owner: str) -> str:
+def _take_value(name: str, rest: list[str]) -> str:
     if not rest or looks_like_flag(rest[0]):
-        raise FlagError(f"{owner}: --{name} needs a value (write --{name}=value)")
+        raise FlagError(f"--{name} needs a value (write --{name}=value)")
     return rest.pop(0)

@@ -26,11 +26,6 @@ class _Wish:
 _wish = _Wish()
 
 
-def is_cancelled() -> bool:
-    """Tell whether the user has asked to stop the running command."""
-    return _wish.count > 0
-
-
 def check_cancelled() -> None:
     """Raise Cancelled if the user has asked to stop the running command."""
     if _wish.count:
@@ -54,7 +49,19 @@ def cancellable(command: str) -> Iterator[None]:
     _wish.depth, _wish.count = 1, 0
     try:
         yield
-        check_cancelled()
     finally:
         _wish.depth, _wish.count = 0, 0
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt inside, as while a question waits for its answer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
         signal.signal(signal.SIGINT, before)

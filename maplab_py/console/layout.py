@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.report import Message, Report
+from maplab_py.report import Message
 
 _UNIT_SUFFIXES = {
     "_m": "m",
@@ -65,8 +65,12 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
         head = heading(field)
         if _is_record(value):
             following += blocks_of(value, head)
+        elif _is_records(value) and any(_has_records(record) for record in value):
+            following += [block for record in value for block in blocks_of(record)]
         elif _is_records(value):
             following.append(_table(head, value))
+        elif isinstance(value, Mapping) and value and all(map(_is_records, value.values())):
+            following += [_table(str(key), records) for key, records in value.items()]
         elif isinstance(value, Mapping):
             rows = [(str(key), format_cell(item)) for key, item in value.items()]
             following.append(Pairs(rows, head))
@@ -139,6 +143,10 @@ def _is_records(value: Any) -> bool:
     return isinstance(value, (list, tuple)) and len(value) > 0 and all(map(_is_record, value))
 
 
+def _has_records(record: Any) -> bool:
+    return any(_is_records(getattr(record, field.name)) for field in dataclasses.fields(record))
+
+
 def _is_lines(value: Any) -> bool:
     """Tell a list of sentences, which are set one per line."""
     return (
@@ -174,8 +182,3 @@ def _cell(value: Any) -> str:
             f"{heading(f)} {format_cell(getattr(value, f.name))}" for f in dataclasses.fields(value)
         )
     return "" if _is_absent(value) else format_cell(value)
-
-
-def is_empty(report: Report) -> bool:
-    """Tell whether a report says nothing at all."""
-    return not blocks_of(report)

@@ -11,11 +11,11 @@ from typing import Any, Self
 
 from maplab_py.console.call import Call, call_from_keywords, call_from_words
 from maplab_py.console.context import CommandContext
+from maplab_py.console.lines import split_commands
 from maplab_py.console.maps import MapManager
 from maplab_py.console.registry import Registry, load_registry
-from maplab_py.console.settings import Settings
+from maplab_py.console.settings import Layer, Setting, Settings
 from maplab_py.console.terminal import SilentTerminal, Terminal
-from maplab_py.progress import Progress
 from maplab_py.report import Message, Report
 from maplab_py.vimap import VIMap
 
@@ -49,6 +49,7 @@ class Session:
         self.maps = MapManager()
         self.settings = Settings(self.registry)
         self.timings: list[Timing] = []
+        self.prompt_sign = ""  # put before the prompt
 
     @property
     def vi_map(self) -> VIMap:
@@ -86,18 +87,38 @@ class Session:
         """Read the words of one command line into a call."""
         return call_from_words(words, self.registry, self.settings)
 
-    def execute(self, call: Call, progress: Progress | None = None) -> Report:
+    def run_line(self, text: str, terminal: Terminal) -> None:
+        """Run the commands of a typed line inside another command and show their reports.
+
+        Raises:
+            MaplabError: The first error of any of them.
+        """
+        for words in split_commands(text):
+            call = self.parse(words)
+            terminal.show(self.execute(call), call.command.name)
+
+    def set_flags(self, assignments: Sequence[str]) -> list[Setting]:
+        """Give flags values that last for the session, all or none of them.
+
+        Raises:
+            FlagError: A flag is unknown, or no command with this flag takes the value.
+        """
+        return self.settings.assign(assignments, Layer.SET, "set")
+
+    def execute(self, call: Call) -> Report:
         """Run a call as a transaction: if it fails or is cancelled, all maps are as before."""
         command = call.command
         arguments = call.arguments()
         if command.needs_map:
             _ = self.maps.selected
-        progress = progress or self.terminal.progress(call.verbosity)
-        context = CommandContext(self, progress, self.terminal, command.name)
         before = self.maps.state
         start = time.perf_counter()
         try:
-            report = command.function(context, *_by_position(call, arguments), **arguments)
+            with self.terminal.progress(command.name, call.verbosity) as progress:
+                context = CommandContext(self, progress, self.terminal, command.name)
+                report = command.function(context, *_by_position(call, arguments), **arguments)
+                if context.has_drafts:
+                    progress.check()
             context.apply_drafts()
         except BaseException:
             self.maps.state = before
@@ -113,7 +134,8 @@ def _by_position(call: Call, arguments: dict[str, Any]) -> list[Any]:
     """Take out the arguments that must go before *words."""
     if not call.command.variadic:
         return []
-    return [arguments.pop(name) for name in call.command.positional] + list(call.words)
+    parameters = [call.command.flags[name].path[0] for name in call.command.positional]
+    return [arguments.pop(parameter) for parameter in parameters] + list(call.words)
 
 
 def open_map(folder: str | Path, **flags: Any) -> Session:

@@ -67,7 +67,7 @@ class Settings:
         """
         known = self._registry.all_flags()
         dashed = [w if w.startswith("-") or "=" not in w else f"--{w}" for w in words]
-        given, plain = parse_words(dashed, known, "maplab")
+        given, plain = parse_words(dashed, known, "")
         if plain:
             raise FlagError(f"'{plain[0]}' is not a flag (write --name=value)")
         settings = [Setting(g.name, g.text, origin) for g in given if g.name in known]
@@ -102,7 +102,7 @@ class Settings:
         Raises:
             FlagError: No command has such a flag.
         """
-        flag, _ = resolve_name(normalise(name.lstrip("-")), self._registry.all_flags(), "maplab")
+        flag, _ = resolve_name(normalise(name.lstrip("-")), self._registry.all_flags(), "")
         return self._layers[Layer.SET].pop(flag, None)
 
     def _check(self, setting: Setting) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Protocol
 
 from maplab_py.progress import SILENT, Progress
@@ -18,14 +20,14 @@ class Terminal(Protocol):
     def ask(self, question: str) -> bool:
         """Ask a yes-or-no question."""
 
-    def show(self, report: Report) -> None:
-        """Show a report in the middle of a command."""
+    def show(self, report: Report, command: str) -> None:
+        """Show the report of a command."""
 
-    def clear(self) -> None:
-        """Begin a fresh screen, if there is one."""
+    def progress(self, command: str, verbosity: int = 0) -> AbstractContextManager[Progress]:
+        """Return the progress display around one command."""
 
-    def progress(self, verbosity: int = 0) -> Progress:
-        """Return the progress display for one command."""
+    def transcribe(self, path: Path | None) -> None:
+        """Copy all further output to a file; None ends it."""
 
 
 class SilentTerminal:
@@ -40,12 +42,16 @@ class SilentTerminal:
         """Answer no."""
         return False
 
-    def show(self, report: Report) -> None:
-        """Show nothing."""
+    def show(self, report: Report, command: str) -> None:
+        """Show nothing: the program has the report."""
 
-    def clear(self) -> None:
-        """Do nothing."""
-
-    def progress(self, verbosity: int = 0) -> Progress:  # noqa: ARG002
+    def progress(
+        self,
+        command: str,  # noqa: ARG002
+        verbosity: int = 0,  # noqa: ARG002
+    ) -> AbstractContextManager[Progress]:
         """Return the progress that nobody watches."""
-        return SILENT
+        return nullcontext(SILENT)
+
+    def transcribe(self, path: Path | None) -> None:
+        """Do nothing, as there is no output to copy."""

@@ -1,0 +1,150 @@
+"""The interactive prompt: history, completion, colours, Ctrl-C and Ctrl-D."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Iterable
+
+from prompt_toolkit import PromptSession
+from prompt_toolkit.auto_suggest import AutoSuggestFromHistory
+from prompt_toolkit.completion import CompleteEvent, Completer, Completion
+from prompt_toolkit.document import Document
+from prompt_toolkit.formatted_text import StyleAndTextTuples
+from prompt_toolkit.history import FileHistory, History, InMemoryHistory
+from prompt_toolkit.lexers import Lexer
+from prompt_toolkit.output import ColorDepth
+from prompt_toolkit.styles import Style
+
+from maplab_py.console.colouring import coloured_parts
+from maplab_py.console.completion import complete
+from maplab_py.console.paths import state_folder
+from maplab_py.console.render import wants_colour
+from maplab_py.console.runner import Runner
+from maplab_py.console.session import Session
+from maplab_py.console.status import Status
+
+_STYLE = Style.from_dict(
+    {
+        "key": "ansiyellow",
+        "unsaved": "ansired bold",
+        "sign": "ansigreen",
+        "command": "ansicyan bold",
+        "unknown": "ansired",
+        "flag": "ansiblue",
+        "value": "ansigreen",
+        "comment": "ansibrightblack",
+    }
+)
+
+
+class CommandCompleter(Completer):
+    """Offers the session's candidates to prompt_toolkit."""
+
+    def __init__(self, session: Session) -> None:
+        """Complete for one session."""
+        self._session = session
+
+    def get_completions(
+        self,
+        document: Document,
+        complete_event: CompleteEvent,  # noqa: ARG002
+    ) -> Iterable[Completion]:
+        """Yield the candidates for the text before the cursor."""
+        text = document.text_before_cursor
+        width = max(20, shutil.get_terminal_size().columns - 40)
+        for candidate in complete(text, self._session):
+            note = candidate.help
+            yield Completion(
+                candidate.text,
+                start_position=candidate.start - len(text),
+                display=candidate.shown,
+                display_meta=note if len(note) <= width else note[: width - 1] + "…",
+            )
+
+
+class CommandLexer(Lexer):
+    """Colours commands, flags and values; an unknown command is red."""
+
+    def __init__(self, session: Session) -> None:
+        """Colour for one session."""
+        self._session = session
+
+    def lex_document(self, document: Document) -> Callable[[int], StyleAndTextTuples]:
+        """Return the coloured parts of each line."""
+        lines = document.lines
+
+        def line_parts(number: int) -> StyleAndTextTuples:
+            parts = coloured_parts(lines[number], self._session.registry)
+            return [(f"class:{style}" if style else "", text) for style, text in parts]
+
+        return line_parts
+
+
+def prompt_parts(session: Session) -> StyleAndTextTuples:
+    """Return the prompt: `maplab <key>:/$ `, with `*` when the map has unsaved changes."""
+    key = session.maps.selected_key
+    parts: StyleAndTextTuples = []
+    if session.prompt_sign:
+        parts.append(("class:sign", session.prompt_sign + " "))
+    parts += [("", "maplab "), ("class:key", f"<{key}>")]
+    if key and not session.maps.selected.is_saved:
+        parts.append(("class:unsaved", "*"))
+    return [*parts, ("", ":/$ ")]
+
+
+def run_prompt(runner: Runner) -> Status:
+    """Read and run lines until the user leaves; return the exit status (always 0 then)."""
+    session = runner.session
+    plain = not wants_colour(sys.stdout)
+    prompt: PromptSession[str] = PromptSession(
+        completer=CommandCompleter(session),
+        lexer=None if plain else CommandLexer(session),
+        history=_history(),
+        auto_suggest=AutoSuggestFromHistory(),
+        complete_while_typing=False,
+        style=_STYLE,
+        color_depth=ColorDepth.DEPTH_1_BIT if plain else None,
+    )
+    for problem in session.registry.problems:
+        runner.terminal.warning(problem)
+    while True:
+        try:
+            line = prompt.prompt(lambda: prompt_parts(session))
+        except KeyboardInterrupt:
+            continue
+        except EOFError:
+            runner.wants_exit = True
+            line = ""
+        if line.strip():
+            runner.run_text(line)
+        if runner.wants_exit and _may_leave(runner):
+            return Status.OK
+        runner.wants_exit = False
+
+
+def _may_leave(runner: Runner) -> bool:
+    """Ask before unsaved changes are lost."""
+    unsaved = [entry.key for entry in runner.session.maps.unsaved]
+    if not unsaved:
+        return True
+    from maplab_py.errors import Cancelled
+
+    try:
+        return runner.terminal.ask(
+            f"unsaved changes in {', '.join(unsaved)}; leave without saving?"
+        )
+    except Cancelled:
+        return False
+
+
+def _history() -> History:
+    """Return the history file in the user's state folder; only memory where none can be written."""
+    path = state_folder() / "history"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        sys.stderr.write(f"warning: the history is not kept: {error}\n")
+        return InMemoryHistory()
+    return FileHistory(str(path))

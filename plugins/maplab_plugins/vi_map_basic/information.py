@@ -1,0 +1,122 @@
+"""What is in the selected map, and whether it is consistent."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.plugin import CommandContext, Report, UserError, command
+from maplab_py.vimap.ids import to_hex_list
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseFrameLine:
+    """The base frame of one mission."""
+
+    mission: str
+    is_known: bool
+    p_G_M: NDArray[np.float64] = dataclasses.field(metadata={"unit": "m"})
+    q_G_M_xyzw: NDArray[np.float64]
+    yaw_deg: float
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseFrameList(Report):
+    """The base frames of all missions."""
+
+    baseframes: tuple[BaseFrameLine, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraLine:
+    """The calibration of one camera."""
+
+    rig: str
+    camera: int
+    projection: str
+    intrinsics: NDArray[np.float64]
+    distortion: str
+    distortion_parameters: NDArray[np.float64]
+    size_px: str
+    p_B_C: NDArray[np.float64] = dataclasses.field(metadata={"unit": "m"})
+    q_B_C_xyzw: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraList(Report):
+    """The calibrations of all cameras."""
+
+    cameras: tuple[CameraLine, ...]
+
+
+@command("map_stats", "ms")
+def map_stats(context: CommandContext) -> Report:
+    """Count what is in the map, mission by mission."""
+    from maplab_py.vimap.statistics import map_statistics
+
+    return map_statistics(context.vi_map)
+
+
+@command("mission_coobservability_stats", "mcs")
+def mission_coobservability_stats(context: CommandContext) -> Report:
+    """Show which missions share landmarks."""
+    from maplab_py.vimap.statistics import coobservability_statistics
+
+    return coobservability_statistics(context.vi_map)
+
+
+@command("print_baseframes")
+def print_baseframes(context: CommandContext) -> BaseFrameList:
+    """Print the base frame T_G_M of every mission and whether it is known."""
+    vi_map = context.vi_map
+    if not len(vi_map.missions):
+        raise UserError(f"print_baseframes: map '{context.map_key}' has no missions")
+    T_G_M = vi_map.T_G_M
+    x, y, z, w = T_G_M[:, :4].T
+    yaw_deg = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    ids = to_hex_list(vi_map.missions.id)
+    return BaseFrameList(
+        tuple(
+            BaseFrameLine(ids[row], bool(known[row]), pose[4:], pose[:4], float(yaw_deg[row]))
+            for row, pose in enumerate(T_G_M)
+        )
+    )
+
+
+@command("print_camera_calibrations")
+def print_camera_calibrations(context: CommandContext) -> CameraList:
+    """Print intrinsics, distortion and mounting of every camera."""
+    from maplab_py.sensors import CameraRig
+
+    lines = []
+    for sensor in context.vi_map.sensors.sensors.values():
+        if not isinstance(sensor, CameraRig):
+            continue
+        for index, (camera, T_B_C) in enumerate(zip(sensor.cameras, sensor.T_B_C, strict=True)):
+            lines.append(
+                CameraLine(
+                    sensor.id,
+                    index,
+                    camera.projection.value,
+                    camera.intrinsics,
+                    camera.distortion.value,
+                    camera.distortion_parameters,
+                    f"{camera.width_px} x {camera.height_px}",
+                    T_B_C[4:],
+                    T_B_C[:4],
+                )
+            )
+    if not lines:
+        raise UserError(f"print_camera_calibrations: map '{context.map_key}' has no cameras")
+    return CameraList(tuple(lines))
+
+
+@command("check_map_consistency")
+def check_map_consistency(context: CommandContext) -> Report:
+    """Check that everything in the map fits together; fails when something does not."""
+    from maplab_py.vimap.consistency import check_consistency
+
+    return check_consistency(context.vi_map)

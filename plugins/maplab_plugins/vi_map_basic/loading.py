@@ -1,0 +1,311 @@
+"""Loading maps from disk: alone, or merged into the selected map."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from maplab_py.plugin import CommandContext, Report, UserError, command, key_of_folder
+from maplab_py.vimap import VIMap
+
+
+@dataclasses.dataclass(frozen=True)
+class FolderList(Report):
+    """Map folders found below a folder."""
+
+    maps_folder: Path
+    map_folders: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedMap:
+    """One map that was loaded."""
+
+    map_key: str
+    missions: int
+    vertices: int
+    landmarks: int
+    folder: Path
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedMaps(Report):
+    """What was loaded, each map under its key."""
+
+    maps: tuple[LoadedMap, ...]
+    details: tuple[Report, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MergedMaps(Report):
+    """What was loaded and merged into one map."""
+
+    map_key: str
+    missions: int
+    vertices: int
+    landmarks: int
+    merged_folders: tuple[str, ...]
+    details: tuple[Report, ...]
+
+
+@command("list_maps_on_file_system", example="list_maps_on_file_system ~/maps", needs_map=False)
+def list_maps_on_file_system(
+    context: CommandContext,  # noqa: ARG001
+    maps_folder: Path,
+) -> FolderList:
+    """List the map folders below a folder.
+
+    Args:
+        maps_folder: Where to look, in all sub-folders.
+    """
+    return FolderList(maps_folder, tuple(str(p) for p in _folders_below(maps_folder)))
+
+
+@command("load", example="load --map_folder=maps/v1_01", needs_map=False)
+def load(
+    context: CommandContext,
+    map_folder: Path,
+    *,
+    map_key: str = "",
+    assign_new_ids: bool = False,
+    proto_max_size_megabytes: int = 2000,
+    repair: bool = False,
+) -> Report:
+    """Load a map into memory and select it.
+
+    Args:
+        map_folder: Folder of the map.
+        map_key: Key of the map in memory; empty = the folder's name.
+        assign_new_ids: Give missions, vertices, landmarks and edges new ids.
+        proto_max_size_megabytes: Refuse map files that unpack to more than this.
+        repair: Drop what refers to things that do not exist instead of refusing the map.
+    """
+    from maplab_py.storage.native import load_map
+
+    from maplab_py.vimap.edits import with_new_ids
+
+    key = context.maps.check_new_key(map_key or key_of_folder(map_folder))
+    vi_map, report = load_map(
+        map_folder,
+        max_size_megabytes=proto_max_size_megabytes,
+        repair=repair,
+        progress=context.progress,
+    )
+    if assign_new_ids:
+        vi_map = with_new_ids(vi_map)
+    context.maps.add(key, vi_map, folder=map_folder, is_saved=not (assign_new_ids or repair))
+    return LoadedMaps((_loaded(key, vi_map, map_folder),), (report,))
+
+
+@command("load_all", example="load_all --maps_folder=maps", needs_map=False)
+def load_all(
+    context: CommandContext, maps_folder: Path, *, assign_new_ids: bool = False
+) -> LoadedMaps:
+    """Load every map below a folder, each under the name of its folder; the last is selected.
+
+    Args:
+        maps_folder: Where to look, in all sub-folders.
+        assign_new_ids: Give missions, vertices, landmarks and edges new ids.
+    """
+    from maplab_py.vimap.edits import with_new_ids
+
+    folders = _folders_below(maps_folder)
+    keys = [context.maps.check_new_key(key_of_folder(folder)) for folder in folders]
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    if twice:
+        raise UserError(
+            f"load_all: two folders would get the map key '{twice[0]}'; load them singly"
+        )
+    loaded = _load_each(context, folders)
+    lines = []
+    for key, folder, (vi_map, _) in zip(keys, folders, loaded, strict=True):
+        value = with_new_ids(vi_map) if assign_new_ids else vi_map
+        context.maps.add(key, value, folder=folder, is_saved=not assign_new_ids)
+        lines.append(_loaded(key, value, folder))
+    return LoadedMaps(tuple(lines), ())
+
+
+@command("load_merge_map", example="load_merge_map --map_folder=maps/v1_02")
+def load_merge_map(
+    context: CommandContext, map_folder: Path, *, assign_new_ids: bool = False
+) -> MergedMaps:
+    """Load a map and merge its missions into the selected map.
+
+    Args:
+        map_folder: Folder of the map.
+        assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids.
+    """
+    return _merge_all(context, [map_folder], "", assign_new_ids=assign_new_ids)
+
+
+@command("load_merge_all_maps", example="load_merge_all_maps --maps_folder=maps", needs_map=False)
+def load_merge_all_maps(
+    context: CommandContext,
+    maps_folder: Path,
+    *,
+    target_map_key: str = "",
+    assign_new_ids: bool = False,
+) -> MergedMaps:
+    """Load every map below a folder and merge all missions into the selected map or a new one.
+
+    Args:
+        maps_folder: Where to look, in all sub-folders.
+        target_map_key: Key of a new map for the result; empty = the selected map, or if there is
+            none a new map named after the folder.
+        assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids, so that
+            one recording can serve as several.
+    """
+    key = _target_key(context, maps_folder, target_map_key)
+    return _merge_all(context, _folders_below(maps_folder), key, assign_new_ids=assign_new_ids)
+
+
+@command("load_merge_submap", example="load_merge_submap --map_folder=submap_1", needs_map=False)
+def load_merge_submap(
+    context: CommandContext, map_folder: Path, *, assign_new_ids: bool = False
+) -> MergedMaps:
+    """Load a piece of a mission and append it to that mission in the selected map.
+
+    Without a selected map the piece is loaded as a new map.
+
+    Args:
+        map_folder: Folder of the submap.
+        assign_new_ids: Give the piece new ids: it becomes a mission of its own.
+    """
+    key = _target_key(context, map_folder, "")
+    if assign_new_ids:
+        return _merge_all(context, [map_folder], key, assign_new_ids=True)
+    return _append_all(context, [map_folder], key, assign_new_ids=False)
+
+
+@command(
+    "load_merge_all_submaps",
+    example="load_merge_all_submaps --maps_folder=euroc_v1_01",
+    needs_map=False,
+)
+def load_merge_all_submaps(
+    context: CommandContext,
+    maps_folder: Path,
+    *,
+    target_map_key: str = "",
+    assign_new_ids: bool = False,
+) -> MergedMaps:
+    """Load the pieces of missions below a folder in time order and join them.
+
+    Args:
+        maps_folder: Where to look, in all sub-folders.
+        target_map_key: Key of a new map for the result; empty = the selected map, or if there is
+            none a new map named after the folder.
+        assign_new_ids: Give the joined missions, vertices, landmarks and edges new ids.
+    """
+    key = _target_key(context, maps_folder, target_map_key)
+    return _append_all(context, _folders_below(maps_folder), key, assign_new_ids=assign_new_ids)
+
+
+def _merge_all(
+    context: CommandContext, folders: list[Path], new_key: str, *, assign_new_ids: bool
+) -> MergedMaps:
+    """Load folders and merge them into the selected map, or into a new one if a key is given."""
+    from maplab_py.vimap.edits import with_new_ids
+    from maplab_py.vimap.merge import merge_maps
+
+    loaded = _load_each(context, folders)
+    base = context.vi_map if context.maps.selected_key else None
+    details: list[Report] = []
+    for vi_map, _ in loaded:
+        context.progress.check()
+        if base is None:
+            base = with_new_ids(vi_map) if assign_new_ids else vi_map
+            continue
+        base, report = merge_maps(base, vi_map, assign_new_ids=assign_new_ids)
+        details.append(report)
+    return _hand_over(context, base, new_key, folders, details)
+
+
+def _append_all(
+    context: CommandContext, folders: list[Path], new_key: str, *, assign_new_ids: bool
+) -> MergedMaps:
+    """Load folders in time order and append each to its mission, which the first of it begins."""
+    from maplab_py.vimap.edits import with_new_ids
+    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap.submaps import append_submap
+
+    loaded = _load_each(context, folders)
+    pieces = sorted((vi_map for vi_map, _ in loaded), key=_start_time_ns)
+    selected = context.vi_map if context.maps.selected_key else None
+    base = None if assign_new_ids else selected
+    details: list[Report] = []
+    for piece in pieces:
+        context.progress.check()
+        if base is None:
+            base = piece
+            continue
+        joins = bool((base.mission_index.rows(piece.missions.id) >= 0).any())
+        base, report = append_submap(base, piece) if joins else merge_maps(base, piece)
+        details.append(report)
+    if base is not None and assign_new_ids:
+        if selected is None:
+            base = with_new_ids(base)
+        else:
+            base, merge_report = merge_maps(selected, base, assign_new_ids=True)
+            details.append(merge_report)
+    return _hand_over(context, base, new_key, folders, details)
+
+
+def _hand_over(
+    context: CommandContext,
+    vi_map: VIMap | None,
+    new_key: str,
+    folders: list[Path],
+    details: list[Report],
+) -> MergedMaps:
+    if vi_map is None:
+        raise UserError("there is nothing to merge")
+    if new_key:
+        context.maps.add(new_key, vi_map)
+    else:
+        context.commit(vi_map)
+    return MergedMaps(
+        context.map_key,
+        len(vi_map.missions),
+        len(vi_map.vertices),
+        len(vi_map.landmarks),
+        tuple(str(folder) for folder in folders),
+        tuple(details),
+    )
+
+
+def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> str:
+    """Return the key of the new map that shall take the result, empty for the selected map."""
+    if target_map_key == "" and context.maps.selected_key:
+        return ""
+    return context.maps.check_new_key(target_map_key or key_of_folder(folder))
+
+
+def _load_each(context: CommandContext, folders: list[Path]) -> list[tuple[VIMap, Report]]:
+    from maplab_py.storage.native import load_map
+
+    loaded = []
+    for done, folder in enumerate(folders):
+        context.progress.step(done, len(folders), f"load {folder.name}")
+        loaded.append(load_map(folder))
+    return loaded
+
+
+def _folders_below(maps_folder: Path) -> list[Path]:
+    from maplab_py.storage.native import find_maps
+
+    if not maps_folder.is_dir():
+        raise UserError(f"--maps_folder={maps_folder}: there is no such folder")
+    folders = find_maps(maps_folder)
+    if not folders:
+        raise UserError(f"--maps_folder={maps_folder}: there is no map in it or below it")
+    return folders
+
+
+def _start_time_ns(vi_map: VIMap) -> int:
+    return int(vi_map.vertices.timestamp_ns.min()) if len(vi_map.vertices) else 0
+
+
+def _loaded(key: str, vi_map: VIMap, folder: Path) -> LoadedMap:
+    counts = len(vi_map.missions), len(vi_map.vertices), len(vi_map.landmarks)
+    return LoadedMap(key, *counts, folder)
