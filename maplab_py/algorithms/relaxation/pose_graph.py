@@ -55,7 +55,7 @@ def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses
     first = np.flatnonzero(np.diff(vertices.mission) == 0)
     A, B = vi_map.T_G_I[first], vi_map.T_G_I[first + 1]
     T_A_B = se3.relative(A, B)
-    elapsed_s = np.diff(vertices.timestamp_ns)[first] * 1e-9
+    elapsed_s = (vertices.timestamp_ns[first + 1] - vertices.timestamp_ns[first]) * 1e-9
     root_s = np.sqrt(np.maximum(elapsed_s, _SHORTEST_S))
     distance_m = np.linalg.norm(T_A_B[:, 4:], axis=1)
     sigma_p = np.hypot(options.position_drift * np.sqrt(distance_m), _FLOOR_M_PER_SQRT_S * root_s)
@@ -77,10 +77,9 @@ def loop_edges(edges: LoopClosureEdges, options: RelaxationOptions) -> RelativeP
     fallback = np.repeat([options.loop_sigma_m, np.deg2rad(options.loop_sigma_deg)], 3) ** 2
     covariance = np.array(edges.covariance)
     symmetric = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    finite = np.isfinite(symmetric).all(axis=(1, 2))
-    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], symmetric, np.eye(6)))[:, 0]
-    usable = finite & (smallest > 0.0)
-    symmetric[~usable] = np.diag(fallback)
+    symmetric[~np.isfinite(symmetric).all(axis=(1, 2))] = 0.0
+    positive = np.linalg.eigvalsh(symmetric).min(axis=1) > 0.0
+    symmetric[~positive] = np.diag(fallback)
     widened = symmetric + np.diag(_LOOP_FLOOR)
     W = np.linalg.inv(np.linalg.cholesky(widened))  # covariance = L L^T, so L^-1 whitens
     return RelativePoses(
