@@ -77,14 +77,29 @@ class SensorSet:
         Raises:
             MapError: A sensor is missing, or no chain of base sensors joins the two.
         """
-        imu, rig = self.imu(imu_id), self.camera_rig(ncamera_id)
+        rig = self.camera_rig(ncamera_id)
+        return se3.compose(self.T_I_S(imu_id, rig.id), rig.T_B_C)
+
+    def T_I_S(self, imu_id: str, sensor_id: str) -> NDArray[np.float64]:
+        """Return the pose (7,) of a sensor, or of one camera of a rig, on the IMU.
+
+        Raises:
+            MapError: A sensor is missing, or no chain of base sensors joins the two.
+        """
+        imu = self.imu(imu_id)
+        for rig in self.sensors.values():
+            for row, camera in enumerate(rig.cameras if isinstance(rig, CameraRig) else ()):
+                if camera.id == sensor_id:
+                    return np.asarray(self.T_I_C(imu_id, rig.id)[row])
+        if sensor_id not in self.sensors:
+            raise MapError(f"sensors.yaml has no sensor with id {sensor_id}")
         imu_root, T_R_I = self._mounted(imu.id)
-        rig_root, T_R_B = self._mounted(rig.id)
-        if imu_root != rig_root and self._has_mount(imu.id) and self._has_mount(rig.id):
+        sensor_root, T_R_S = self._mounted(sensor_id)
+        if imu_root != sensor_root and self._has_mount(imu.id) and self._has_mount(sensor_id):
             raise MapError(
-                f"sensors.yaml: camera rig {rig.id} and IMU {imu.id} have no base sensor in common"
+                f"sensors.yaml: sensor {sensor_id} and IMU {imu.id} have no base sensor in common"
             )
-        return se3.compose(se3.relative(T_R_I, T_R_B), rig.T_B_C)
+        return se3.relative(T_R_I, T_R_S)
 
     def without_extrinsics(self) -> tuple[str, ...]:
         """Return the ids of sensors that have no entry and are taken to sit at their base."""
