@@ -102,7 +102,7 @@ def _closures(
         from_vertex=np.concatenate([first, a]),
         to_vertex=np.concatenate([second, b]),
         T_A_B=np.concatenate([true, false]),
-        covariance=np.diag(sigma**2),
+        covariance=np.tile(np.diag(sigma**2), (80 + num_false, 1, 1)),
     )
 
 
