@@ -68,6 +68,8 @@ def largest_ray_angle(directions: ArrayLike, start: ArrayLike) -> F64:
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     counts = np.diff(start)
     angles = np.zeros(len(counts))
+    if len(counts) == 0:
+        return angles
     order = np.argsort(counts, kind="stable")
     sizes, first = np.unique(counts[order], return_index=True)
     for size, groups in zip(sizes.tolist(), np.split(order, first[1:]), strict=True):
@@ -84,8 +86,12 @@ def largest_ray_angle(directions: ArrayLike, start: ArrayLike) -> F64:
 def _widest_pair(rays: F64) -> F64:
     """Return the largest angle (m,) within groups of unit rays (m, n, 3)."""
     groups, size = rays.shape[:2]
-    cosines = (rays @ rays.transpose(0, 2, 1)).reshape(groups, size * size)
-    first, second = np.divmod(np.argmin(cosines, axis=1), size)
+    # from the first ray on, so that the differences of nearly parallel rays keep their digits
+    offsets = rays - rays[:, :1]
+    products = offsets @ offsets.transpose(0, 2, 1)
+    squares = np.diagonal(products, axis1=1, axis2=2)
+    chords = squares[:, :, None] + squares[:, None, :] - 2.0 * products
+    first, second = np.divmod(np.argmax(chords.reshape(groups, -1), axis=1), size)
     rows = np.arange(groups)
     a, b = rays[rows, first], rays[rows, second]
     # exact near 0 and pi, where acos is not (Kahan)

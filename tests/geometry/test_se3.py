@@ -1,0 +1,70 @@
+"""Rigid motions: group axioms, matrices, and the tangent space of the project."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from maplab_py.geometry import se3, so3
+
+tangents = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
+SHAPES = [(), (1,), (5,), (2, 3), (0,)]
+
+
+def pose(tangent: np.ndarray) -> np.ndarray:
+    return se3.retract(se3.identity(), tangent)
+
+
+@given(tangents, tangents, tangents)
+def test_group_axioms(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> None:
+    a, b, c = pose(x), pose(y), pose(z)
+    left = se3.compose(se3.compose(a, b), c)
+    assert np.allclose(se3.local(left, se3.compose(a, se3.compose(b, c))), 0.0, atol=1e-12)
+    assert np.allclose(se3.local(se3.compose(a, se3.inverse(a)), se3.identity()), 0.0, atol=1e-13)
+    assert np.allclose(se3.compose(se3.identity(), a), a, atol=1e-15)
+    assert np.allclose(se3.compose(a, se3.relative(a, b)), b, atol=1e-12) or np.allclose(
+        se3.local(se3.compose(a, se3.relative(a, b)), b), 0.0, atol=1e-12
+    )
+
+
+@given(tangents, tangents)
+def test_matrices_are_a_homomorphism(x: np.ndarray, y: np.ndarray) -> None:
+    a, b = pose(x), pose(y)
+    product = se3.to_matrix(a) @ se3.to_matrix(b)
+    assert np.allclose(se3.to_matrix(se3.compose(a, b)), product, atol=1e-13)
+    assert np.allclose(se3.local(se3.from_matrix(product), se3.compose(a, b)), 0.0, atol=1e-13)
+    p = y[:3]
+    assert np.allclose(se3.transform(a, p), (se3.to_matrix(a) @ [*p, 1.0])[:3], atol=1e-13)
+
+
+@given(tangents, tangents)
+def test_local_inverts_retract(x: np.ndarray, delta: np.ndarray) -> None:
+    a = pose(x)
+    angle = np.linalg.norm(delta[3:])
+    if angle > 3.0:
+        delta = delta * np.array([1, 1, 1, *[3.0 / angle] * 3])
+    assert np.allclose(se3.local(a, se3.retract(a, delta)), delta, atol=1e-12)
+
+
+def test_perturbation_is_on_the_right_and_position_in_the_outer_frame() -> None:
+    a = se3.make(so3.exp([0.0, 0.0, np.pi / 2]), [1.0, 2.0, 3.0])
+    moved = se3.retract(a, [1.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+    assert moved[4:] == pytest.approx([2.0, 2.0, 3.0])
+    expected = so3.multiply(a[:4], so3.exp([0.1, 0.0, 0.0]))
+    assert moved[:4] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_batch_shapes(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    T = se3.make(so3.exp(rng.normal(size=(*shape, 3))), rng.normal(size=(*shape, 3)))
+    assert T.shape == (*shape, 7)
+    one = se3.identity()
+    assert se3.compose(T, one).shape == se3.compose(one, T).shape == T.shape
+    assert se3.inverse(T).shape == se3.relative(T, one).shape == T.shape
+    assert se3.transform(T, np.zeros(3)).shape == (*shape, 3)
+    assert se3.local(one, T).shape == (*shape, 6)
+    assert se3.from_matrix(se3.to_matrix(T)).shape == T.shape
+    assert se3.identity(*shape).shape == T.shape
