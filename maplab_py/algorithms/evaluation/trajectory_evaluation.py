@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _MIN_MATCHED = 3
+_GAP_STEPS = 3
 
 
 def evaluate_trajectory(
@@ -55,7 +56,10 @@ def evaluate_trajectory(
     rows = _vertex_rows(vi_map, missions)
     T_R_B, matched = match(ground_truth, vi_map.vertices.timestamp_ns[rows], options)
     if np.count_nonzero(matched) < _MIN_MATCHED:
-        raise EstimationError(_no_match_message(vi_map, rows, ground_truth, matched))
+        message = _no_match_message(vi_map, rows, ground_truth, matched)
+        raise EstimationError(
+            f"{message} (max_time_difference_s {options.max_time_difference_s:g})"
+        )
     rows, T_R_B = rows[matched], T_R_B[matched]
     T_G_I = vi_map.T_G_I[rows]
     T_R_I, scale = pose_errors.align(T_R_B, T_G_I, options.alignment)
@@ -87,7 +91,11 @@ def evaluate_trajectory(
 def match(
     ground_truth: Trajectory, times_ns: I64, options: TrajectoryEvaluationOptions
 ) -> tuple[F64, NDArray[np.bool_]]:
-    """Return the ground-truth poses (N, 7) at the times (N,) and where there is one (N,)."""
+    """Return the ground-truth poses (N, 7) at the times (N,) and where there is one (N,).
+
+    There is one where a pose lies within the tolerance; interpolated poses must not bridge a gap,
+    which is more than twice the tolerance and more than three usual steps of the ground truth.
+    """
     if len(ground_truth) == 0:
         return se3.identity(len(times_ns)), np.zeros(len(times_ns), dtype=np.bool_)
     # of several poses at one instant the first
@@ -98,7 +106,9 @@ def match(
     is_near = np.abs(stamps[nearest] - times_ns) <= tolerance_ns
     if not options.interpolate:
         return poses[nearest], is_near
-    T_R_B, inside = interpolate_poses(stamps, poses, times_ns, max_gap_ns=2 * tolerance_ns)
+    usual_step_ns = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
+    gap_ns = max(2 * tolerance_ns, _GAP_STEPS * usual_step_ns, 1)
+    T_R_B, inside = interpolate_poses(stamps, poses, times_ns, max_gap_ns=gap_ns)
     return T_R_B, is_near & inside
 
 

@@ -11,8 +11,9 @@ from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory, match
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.trajectories import Trajectory
+from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap, ids
+from tests.support.data import shared_data
 
 OPTIONS = TrajectoryEvaluationOptions()
 START_NS = 1403715273262142976
@@ -114,6 +115,14 @@ def test_vertices_outside_the_span_or_in_a_gap_are_left_out() -> None:
     assert np.flatnonzero(~matched).tolist() == [0, 26, 27, 28, 29]
 
 
+def test_a_tight_tolerance_still_interpolates_coarse_ground_truth() -> None:
+    truth = make_truth()
+    coarse = Trajectory(truth.times_ns[::10], truth.T_R_B[::10])
+    options = dataclasses.replace(OPTIONS, max_time_difference_s=0.01)
+    _, matched = match(coarse, truth.times_ns[[100, 101, 103, 110]] + 24, options)
+    assert matched.tolist() == [True, True, False, True]
+
+
 def test_a_turned_body_frame_spoils_relative_errors_only_unless_aligned() -> None:
     truth = make_truth()
     turn = se3.make(so3.exp([0.0, 0.1, 0.0]), np.zeros(3))
@@ -171,3 +180,27 @@ def test_motion_on_a_line_has_no_alignment_but_errors_without_one() -> None:
     assert (report.ape_sim3_m, report.scale) == (None, None)
     yaw = evaluate_trajectory(vi_map, line, dataclasses.replace(OPTIONS, alignment="yaw"))
     assert yaw.ape_m.rmse < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("relative", "matched", "rmse"),
+    [("ground_truth/V1_01_easy.csv", 149, 0.1177), ("euroc_imu/V101.gt.csv", 151, 0.1153)],
+)
+def test_raw_euroc_submaps(relative: str, matched: int, rmse: float) -> None:
+    native = pytest.importorskip("maplab_py.storage.native")
+    folder = shared_data("maplab_maps/euroc_v1_01")
+    maps = [native.load_map(path)[0] for path in sorted(folder.iterdir())]
+    times = np.concatenate([one.vertices.timestamp_ns for one in maps])
+    T_G_I = np.concatenate([one.T_G_I for one in maps])
+    times, first = np.unique(times, return_index=True)
+    vi_map = VIMap(
+        missions=Missions.filled(1, baseframe=[0]),
+        baseframes=BaseFrames.filled(1),
+        vertices=Vertices.filled(
+            len(times), mission=np.zeros(len(times)), T_M_I=T_G_I[first], timestamp_ns=times
+        ),
+    )
+    report = evaluate_trajectory(vi_map, read_trajectory(shared_data(relative)), OPTIONS)
+    assert (report.vertices, report.matched) == (152, matched)
+    assert report.ape_m.rmse == pytest.approx(rmse, abs=1e-4)
+    assert report.scale == pytest.approx(0.9965, abs=1e-3)

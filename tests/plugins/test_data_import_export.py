@@ -1,0 +1,111 @@
+"""The export commands: where they write, what they refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from maplab_plugins import data_import_export
+
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from maplab_py.errors import UserError
+from maplab_py.interop.trajectories import read_trajectory
+from maplab_py.sensors.sensors_yaml import read_sensors
+from maplab_py.sensors.yaml_text import parse_yaml
+from maplab_py.vimap import VIMap, ids
+from tests.interop.small_map import RIG_ID, make_map
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    session = Session(load_registry())
+    folder = tmp_path / "map"
+    folder.mkdir()
+    session.maps.add("small", make_map(), folder=folder)
+    return session
+
+
+def test_csv_export(tmp_path: Path, session: Session) -> None:
+    path = tmp_path / "csv"
+    report = session.run("csv_export", csv_export_path=path, csv_export_descriptors=False)
+    assert (report.missions, report.files) == (2, 10)
+    mission = ids.to_hex(session.vi_map.missions.id[1])
+    assert not (path / mission / "descriptors.csv").exists()
+    with pytest.raises(UserError, match="exists already: give --overwrite"):
+        session.run("csv_export", csv_export_path=path)
+    session.run("csv_export", csv_export_path=path, overwrite=True)
+    assert (path / mission / "descriptors.csv").exists()
+
+
+def test_csv_export_vertices_only(tmp_path: Path, session: Session) -> None:
+    path = tmp_path / "csv"
+    mission = ids.to_hex(session.vi_map.missions.id[0])
+    report = session.run("csv_export_vertices_only", csv_export_path=path, map_mission=mission[:6])
+    assert report.vertices == 6
+    assert [file.name for file in path.rglob("*.csv")] == ["vertices.csv"]
+
+
+def test_trajectory_goes_to_the_map_folder_by_default(session: Session) -> None:
+    folder = session.maps.selected.folder
+    report = session.run("ettc")
+    assert report.files == (folder / "vertex_poses_velocities_biases.csv",)
+    assert report.rows == 12
+    report = session.run("ettc", csv_export_format="rpg")
+    read = read_trajectory(folder / "stamped_traj_estimate.txt")
+    assert np.max(np.abs(read.T_R_B - session.vi_map.T_G_I)) < 1e-15
+    with pytest.raises(UserError, match="exists already"):
+        session.run("ettc")
+
+
+def test_trajectory_options(tmp_path: Path, session: Session) -> None:
+    report = session.run(
+        "export_trajectory_to_csv",
+        pose_export_file=tmp_path / "a.csv",
+        pose_export_reference_sensor_id=RIG_ID,
+        interpolate_to_imu_timestamps=True,
+    )
+    assert report.rows == 502
+    session.maps.add("homeless", make_map())
+    with pytest.raises(UserError, match="give --pose_export_file"):
+        session.run("ettc")
+    with pytest.raises(UserError, match="csv_export_format"):
+        session.run("ettc", csv_export_format="kitti")
+
+
+def test_ncamera_calibration_reads_back(tmp_path: Path, session: Session) -> None:
+    report = session.run("encc", ncamera_calibration_export_folder=tmp_path / "calibration")
+    rig = read_sensors(report.files[0]).camera_rig(RIG_ID)
+    expected = session.vi_map.sensors.camera_rig(RIG_ID)
+    assert np.array_equal(rig.cameras[0].intrinsics, expected.cameras[0].intrinsics)
+    assert np.allclose(rig.T_B_C, expected.T_B_C, atol=1e-15)
+    with pytest.raises(UserError, match="exists already"):
+        session.run("encc", ncamera_calibration_export_folder=tmp_path / "calibration")
+    session.maps.add("empty", VIMap())
+    with pytest.raises(UserError, match="no camera rig"):
+        session.run("encc", ncamera_calibration_export_folder=tmp_path / "other")
+
+
+def test_mission_info_lists_every_map(tmp_path: Path, session: Session) -> None:
+    session.maps.add("other", VIMap(), select=False)
+    path = tmp_path / "info.yaml"
+    report = session.run("export_mission_info", mission_info_export_path=path)
+    missions = ids.to_hex_list(session.vi_map.missions.id)
+    assert parse_yaml(path.read_text(), "info") == {"small": missions, "other": []}
+    assert report.rows == 2
+
+
+@pytest.mark.parametrize(
+    "command", ["csv_export", "csv_export_vertices_only", "encc", "export_mission_info"]
+)
+def test_a_place_to_write_to_is_needed(session: Session, command: str) -> None:
+    with pytest.raises(UserError, match="no place to write to: give --"):
+        session.run(command)
+
+
+def test_help_is_complete() -> None:
+    for name in ("csv_export", "csv_export_vertices_only", "export_trajectory_to_csv"):
+        described = getattr(data_import_export, name).maplab_command
+        assert all(flag.help for flag in described.flags.values())
+        assert "overwrite" in described.flags

@@ -1,0 +1,65 @@
+"""The evaluation command, called as a function and through its flags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from maplab_plugins.evaluation import evaluate_trajectory
+
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from maplab_py.errors import EstimationError, MapError, UserError
+from maplab_py.interop.trajectories import Trajectory, write_euroc
+from tests.interop.small_map import make_map
+
+
+@pytest.fixture
+def session() -> Session:
+    session = Session(load_registry())
+    session.maps.add("small", make_map())
+    return session
+
+
+def write_truth(path: Path, session: Session) -> Path:
+    vi_map = session.vi_map
+    write_euroc(Trajectory(vi_map.vertices.timestamp_ns, vi_map.T_G_I), path)
+    return path
+
+
+def test_the_command_reports_no_error_for_the_truth(tmp_path: Path, session: Session) -> None:
+    truth = write_truth(tmp_path / "truth.csv", session)
+    report = session.run("evaluate_trajectory", ground_truth=truth)
+    assert (report.matched, report.without_ground_truth) == (12, 0)
+    assert report.ape_m.rmse < 1e-12
+    assert report.as_json()["ape_m"]["count"] == 12
+    one = session.run(
+        "evaluate_trajectory",
+        ground_truth=truth,
+        alignment="yaw",
+        interpolate=False,
+        map_mission=report.missions[1].mission_id[:8],
+    )
+    assert (one.matched, one.alignment) == (6, "yaw")
+
+
+def test_wrong_requests(tmp_path: Path, session: Session) -> None:
+    with pytest.raises(MapError, match=r"cannot read .*absent"):
+        session.run("evaluate_trajectory", ground_truth=tmp_path / "absent.csv")
+    with pytest.raises(UserError, match="ground_truth"):
+        session.run("evaluate_trajectory")
+    truth = write_truth(tmp_path / "truth.csv", session)
+    with pytest.raises(UserError, match="alignment"):
+        session.run("evaluate_trajectory", ground_truth=truth, alignment="affine")
+    early = Trajectory(np.array([1, 2]), session.vi_map.T_G_I[:2])
+    write_euroc(early, tmp_path / "early.csv")
+    with pytest.raises(EstimationError, match="only 0 of 12 vertices"):
+        session.run("evaluate_trajectory", ground_truth=tmp_path / "early.csv")
+
+
+def test_help_is_complete() -> None:
+    described = evaluate_trajectory.maplab_command
+    assert all(flag.help for flag in described.flags.values())
+    wanted = {"ground_truth", "map_mission", "alignment", "max_time_difference_s", "interpolate"}
+    assert wanted <= set(described.flags)
