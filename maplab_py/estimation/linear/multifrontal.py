@@ -57,7 +57,7 @@ class Blas(NamedTuple):
         return cls(letters, np.array([1.0, -1.0, 0.0]), np.zeros(8, dtype=np.int32))
 
 
-# -- BLAS on parts of arrays: every matrix comes with its leading dimension ------------------------
+# -- BLAS on flat arrays: every matrix comes with its leading dimension ----------------------------
 
 
 @compiled()
@@ -69,7 +69,7 @@ def _cholesky(blas: Blas, matrix: F64, order: int, leading: int) -> int:
     dpotrf(lower.ctypes, sizes[0:].ctypes, matrix.ctypes, sizes[1:].ctypes, sizes[2:].ctypes)
     bad_column = int(sizes[2])
     for column in range(order if bad_column == 0 else 0):  # OpenBLAS lets NaN pass
-        if not 0.0 < matrix[column, column] < np.inf:
+        if not 0.0 < matrix[column * leading + column] < np.inf:
             return column + 1
     return bad_column
 
@@ -213,7 +213,7 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
         plan: Structure.
         values: Blocks of the matrix (B, d, d).
         factor: Room for the panels.
-        front: Room for the largest update matrix.
+        front: Room for the largest update matrix, kept from its beginning on.
         stack: Room for the waiting update matrices.
         blas: Workspace.
     """
@@ -238,13 +238,14 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
             top -= rows * rows
             child_update = stack[top : top + rows * rows].reshape(rows, rows)
             _add_child_update(panel, update, child_update, place, d)
-        bad_column = _cholesky(blas, panel, w, w + n)
+        triangle = panel.reshape(-1)
+        bad_column = _cholesky(blas, triangle, w, w + n)
         if bad_column != 0:
             return int(plan.first_node[s] + (bad_column - 1) // d)
         if n > 0:
             below = factor[plan.panel_start[s] + w :]  # L21 starts below L11 in every column
-            _solve_triangle(blas, RIGHT, TRANSPOSED, panel, w + n, below, n, w, w + n)
-            _subtract_square(blas, below, w + n, n, w, update)
+            _solve_triangle(blas, RIGHT, TRANSPOSED, triangle, w + n, below, n, w, w + n)
+            _subtract_square(blas, below, w + n, n, w, front)
             stack[top : top + n * n] = front[: n * n]
             top += n * n
             waiting[num_waiting] = s
@@ -259,21 +260,26 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
 def solve(plan: FrontPlan, factor: F64, right_sides: F64, blas: Blas) -> F64:
     """Return x (k, n * d) of L L^T x = b for right sides in rows (k, n * d)."""
     d, order = plan.node_size, plan.order
-    x = np.empty_like(right_sides)
-    for place in range(len(order)):
-        x[:, place * d : place * d + d] = right_sides[:, order[place] * d : order[place] * d + d]
+    k, total = right_sides.shape
+    x = np.empty((k, total))
+    for col in range(k):
+        for place in range(len(order)):
+            for r in range(d):
+                x[col, place * d + r] = right_sides[col, order[place] * d + r]
     supernodes = len(plan.first_node) - 1
     tallest = 1
     for s in range(supernodes):
         tallest = max(tallest, (plan.below_start[s + 1] - plan.below_start[s]) * d)
-    gathered = np.empty((x.shape[0], tallest))
+    gathered = np.empty((k, tallest))
     for s in range(supernodes):
         _solve_up(plan, s, factor, x, gathered, blas)
     for s in range(supernodes - 1, -1, -1):
         _solve_down(plan, s, factor, x, gathered, blas)
-    result = np.empty_like(x)
-    for place in range(len(order)):
-        result[:, order[place] * d : order[place] * d + d] = x[:, place * d : place * d + d]
+    result = np.empty((k, total))
+    for col in range(k):
+        for place in range(len(order)):
+            for r in range(d):
+                result[col, order[place] * d + r] = x[col, place * d + r]
     return result
 
 
@@ -286,12 +292,12 @@ def _solve_up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64, blas:
     below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
     n = len(below) * d
     panel = factor[plan.panel_start[s] :]
-    own = x.reshape(-1)[first:]
+    own, flat = x.reshape(-1)[first:], gathered.reshape(-1)
     _solve_triangle(blas, LEFT, PLAIN, panel, w + n, own, w, k, total)
     if n == 0:
         return
     shape = (n, k, w)
-    _multiply(blas, shape, PLAIN, panel[w:], w + n, own, total, ONE, ZERO, gathered, tallest)
+    _multiply(blas, shape, PLAIN, panel[w:], w + n, own, total, ONE, ZERO, flat, tallest)
     for col in range(k):
         for i in range(len(below)):
             for r in range(d):
@@ -307,7 +313,7 @@ def _solve_down(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64, bla
     below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
     n = len(below) * d
     panel = factor[plan.panel_start[s] :]
-    own = x.reshape(-1)[first:]
+    own, flat = x.reshape(-1)[first:], gathered.reshape(-1)
     if n > 0:
         for col in range(k):
             for i in range(len(below)):
@@ -315,7 +321,7 @@ def _solve_down(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64, bla
                     gathered[col, i * d + r] = x[col, below[i] * d + r]
         shape = (w, k, n)
         _multiply(
-            blas, shape, TRANSPOSED, panel[w:], w + n, gathered, tallest, MINUS_ONE, ONE, own, total
+            blas, shape, TRANSPOSED, panel[w:], w + n, flat, tallest, MINUS_ONE, ONE, own, total
         )
     _solve_triangle(blas, LEFT, TRANSPOSED, panel, w + n, own, w, k, total)
 
@@ -361,21 +367,17 @@ def invert_panels(plan: FrontPlan, factor: F64, stack: F64, blas: Blas) -> F64:
 def _invert_front(blas: Blas, panel: F64, w: int, n: int, z22: F64) -> F64:
     """Return the inverse over a front (w + n, w + n) from its panel of L and Z22 (n, n)."""
     z = np.empty((w + n, w + n))
-    inverse_triangle = np.eye(w)
-    _solve_triangle(blas, LEFT, PLAIN, panel, w + n, inverse_triangle, w, w, w)
+    unit = np.eye(w).reshape(-1)
+    _solve_triangle(blas, LEFT, PLAIN, panel, w + n, unit, w, w, w)  # now L11^-1
     z11 = np.empty((w, w))
-    shape = (w, w, w)
-    _multiply(blas, shape, TRANSPOSED, inverse_triangle, w, inverse_triangle, w, ONE, ZERO, z11, w)
+    _multiply(blas, (w, w, w), TRANSPOSED, unit, w, unit, w, ONE, ZERO, z11.reshape(-1), w)
     if n > 0:
-        y, z21 = np.empty((w, n)), np.empty((w, n))  # [column, row]
-        shape = (n, w, w)
-        _multiply(blas, shape, PLAIN, panel[w:], w + n, inverse_triangle, w, ONE, ZERO, y, n)
-        shape = (n, w, n)
-        _multiply(blas, shape, PLAIN, z22, n, y, n, MINUS_ONE, ZERO, z21, n)
-        shape = (w, w, n)
-        _multiply(blas, shape, TRANSPOSED, y, n, z21, n, MINUS_ONE, ONE, z11, w)
-        z[:w, w:] = z21
-        z[w:, :w] = z21.T
+        y, z21 = np.empty(w * n), np.empty(w * n)  # column after column
+        _multiply(blas, (n, w, w), PLAIN, panel[w:], w + n, unit, w, ONE, ZERO, y, n)
+        _multiply(blas, (n, w, n), PLAIN, z22.reshape(-1), n, y, n, MINUS_ONE, ZERO, z21, n)
+        _multiply(blas, (w, w, n), TRANSPOSED, y, n, z21, n, MINUS_ONE, ONE, z11.reshape(-1), w)
+        z[:w, w:] = z21.reshape(w, n)
+        z[w:, :w] = z21.reshape(w, n).T
         z[w:, w:] = z22
     z[:w, :w] = 0.5 * (z11 + z11.T)
     return z

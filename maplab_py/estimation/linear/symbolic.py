@@ -6,7 +6,8 @@ With nodes numbered in elimination order:
    the factor (Liu 1990). Numbering nodes in POSTORDER of the tree keeps the fill and puts every
    subtree in one piece.
 2. COLUMN STRUCTURES: the rows of column j of the factor are those of column j of the matrix and
-   those of its children's columns, without the rows above (Davis, Direct Methods, ch. 4).
+   those of its children's columns, without the rows above (Davis, Direct Methods, ch. 4); row by
+   row, they are paths of the tree.
 3. SUPERNODES: neighbouring columns with the same structure are kept as one dense panel (Ng and
    Peyton 1993). Small ones are merged with their parents although that stores some zeros, because
    BLAS likes larger panels (Ashcraft and Grimes 1989).
@@ -66,14 +67,13 @@ class SymbolicFactor:
 
 def analyse(pattern: BlockPattern) -> SymbolicFactor:
     """Order the nodes and find the factor's structure."""
-    n = pattern.num_nodes
     order = minimum_degree(pattern)
     parent = elimination_tree(*_upper_columns(pattern, _inverse(order)))
     order = order[postorder(parent)]
     position = _inverse(order)
     start, upper = _upper_columns(pattern, position)
     parent = elimination_tree(start, upper)
-    structure_start, structure = column_structures(*_transposed(start, upper, n), parent)
+    structure_start, structure = column_structures(start, upper, parent)
     first_node = supernodes(structure_start, parent, pattern.node_size)
     return _plan_fronts(pattern, order, position, first_node, structure_start, structure)
 
@@ -163,12 +163,6 @@ def _upper_columns(pattern: BlockPattern, position: I64) -> tuple[I64, I64]:
     return _offsets(np.bincount(col, minlength=pattern.num_nodes)), row
 
 
-def _transposed(start: I64, upper: I64, n: int) -> tuple[I64, I64]:
-    """Return the strictly lower pattern by columns of the upper pattern by columns."""
-    col = np.repeat(np.arange(n), np.diff(start))
-    return _offsets(np.bincount(upper, minlength=n)), col[np.argsort(upper, kind="stable")]
-
-
 @compiled()
 def elimination_tree(start: I64, upper: I64) -> I64:
     """Return the parent (n,) of every node, -1 for roots, of the upper pattern by columns.
@@ -223,44 +217,35 @@ def postorder(parent: I64) -> I64:
 
 
 @compiled()
-def column_structures(start: I64, lower: I64, parent: I64) -> tuple[I64, I64]:
-    """Return the rows below the diagonal of every factor column: (offsets (n + 1,), sorted rows)."""
+def column_structures(start: I64, upper: I64, parent: I64) -> tuple[I64, I64]:
+    """Return the rows below the diagonal of every factor column: (offsets (n + 1,), sorted rows).
+
+    Row i of the factor has an entry in every column on the tree's paths from the columns of the
+    matrix' row i up to i (Liu 1986, the row subtree). Rows are visited in ascending order, so every
+    column's rows come sorted; the first round counts them, the second writes them down.
+    """
     n = len(parent)
     structure_start = np.zeros(n + 1, np.int64)
-    structure = np.empty(4 * len(lower) + n, np.int64)
-    seen_by = np.full(n, -1, np.int64)
-    first_child = np.full(n, -1, np.int64)
-    next_sibling = np.full(n, -1, np.int64)
-    for node in range(n):
-        begin = end = structure_start[node]
-        need = start[node + 1] - start[node]
-        child = first_child[node]
-        while child != -1:
-            need += structure_start[child + 1] - structure_start[child]
-            child = next_sibling[child]
-        if end + need > len(structure):
-            grown = np.empty(2 * len(structure) + need, np.int64)
-            grown[:end] = structure[:end]
-            structure = grown
-        for entry in range(start[node], start[node + 1]):
-            seen_by[lower[entry]] = node
-            structure[end] = lower[entry]
-            end += 1
-        child = first_child[node]
-        while child != -1:
-            for entry in range(structure_start[child], structure_start[child + 1]):
-                row = structure[entry]
-                if row != node and seen_by[row] != node:
-                    seen_by[row] = node
-                    structure[end] = row
-                    end += 1
-            child = next_sibling[child]
-        structure[begin:end] = np.sort(structure[begin:end])
-        structure_start[node + 1] = end
-        if parent[node] >= 0:
-            next_sibling[node] = first_child[parent[node]]
-            first_child[parent[node]] = node
-    return structure_start, structure[: structure_start[n]].copy()
+    structure = np.empty(0, np.int64)
+    next_entry = np.zeros(n, np.int64)
+    for is_counting in (True, False):
+        visited_by = np.full(n, -1, np.int64)
+        for row in range(n):
+            visited_by[row] = row
+            for entry in range(start[row], start[row + 1]):
+                col = upper[entry]
+                while visited_by[col] != row:
+                    visited_by[col] = row
+                    if not is_counting:
+                        structure[structure_start[col] + next_entry[col]] = row
+                    next_entry[col] += 1
+                    col = parent[col]
+        if is_counting:
+            for col in range(n):
+                structure_start[col + 1] = structure_start[col] + next_entry[col]
+                next_entry[col] = 0
+            structure = np.empty(structure_start[n], np.int64)
+    return structure_start, structure
 
 
 @compiled()
