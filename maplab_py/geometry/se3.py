@@ -75,3 +75,35 @@ def local(T_A_B: ArrayLike, T_A_C: ArrayLike) -> F64:
     a, b = np.asarray(T_A_B, dtype=np.float64), np.asarray(T_A_C, dtype=np.float64)
     dtheta = so3.log(so3.multiply(so3.inverse(a[..., :4]), b[..., :4]))
     return np.concatenate([b[..., 4:] - a[..., 4:], dtheta], axis=-1)
+
+
+def exp(tangent: ArrayLike) -> F64:
+    """Map group tangent vectors (..., 6) = [rho, phi] to poses (..., 7): p = V(phi) rho.
+
+    This is the group's exponential (a screw motion), not `retract`, which moves the position
+    by itself. Source: Barfoot, State Estimation for Robotics, 2017, eq. (7.86).
+    """
+    d = np.asarray(tangent, dtype=np.float64)
+    # V is the left Jacobian of SO(3): J_l(phi) = J_r(-phi)
+    V = so3.right_jacobian(-d[..., 3:])
+    p = (V @ d[..., :3, None])[..., 0]
+    return np.concatenate([so3.exp(d[..., 3:]), p], axis=-1)
+
+
+def log(T_A_B: ArrayLike) -> F64:
+    """Map poses (..., 7) to group tangent vectors (..., 6) = [rho, phi], |phi| <= pi."""
+    T = np.asarray(T_A_B, dtype=np.float64)
+    phi = so3.log(T[..., :4])
+    rho = (so3.right_jacobian_inverse(-phi) @ T[..., 4:, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def adjoint(T_A_B: ArrayLike) -> F64:
+    """Return Ad (..., 6, 6) with T exp(d) = exp(Ad d) T for tangents [rho, phi]."""
+    T = np.asarray(T_A_B, dtype=np.float64)
+    R = so3.to_matrix(T[..., :4])
+    Ad = np.zeros((*T.shape[:-1], 6, 6))
+    Ad[..., :3, :3] = R
+    Ad[..., :3, 3:] = so3.skew(T[..., 4:]) @ R
+    Ad[..., 3:, 3:] = R
+    return Ad

@@ -68,3 +68,39 @@ def test_batch_shapes(shape: tuple[int, ...]) -> None:
     assert se3.local(one, T).shape == (*shape, 6)
     assert se3.from_matrix(se3.to_matrix(T)).shape == T.shape
     assert se3.identity(*shape).shape == T.shape
+
+
+screws = st.one_of(
+    tangents.map(lambda d: d * np.array([1, 1, 1, 0.55, 0.55, 0.55])),
+    st.sampled_from([0.0, 1e-300, 1e-12, 0.99e-4, 1.01e-4, 1e-3, np.pi - 1e-7]).map(
+        lambda angle: np.array([1.0, -2.0, 3.0, 0.6 * angle, 0.0, 0.8 * angle])
+    ),
+)
+
+
+@given(screws)
+def test_log_inverts_exp(d: np.ndarray) -> None:
+    assert np.allclose(se3.log(se3.exp(d)), d, atol=1e-11)
+
+
+@given(screws)
+def test_exp_is_a_one_parameter_group(d: np.ndarray) -> None:
+    part, whole = se3.exp(d / 64), se3.identity()
+    for _ in range(64):
+        whole = se3.compose(whole, part)
+    assert np.allclose(se3.local(se3.exp(d), whole), 0.0, atol=1e-12)
+    assert np.allclose(se3.local(se3.exp(-d), se3.inverse(se3.exp(d))), 0.0, atol=1e-12)
+
+
+@given(screws, screws)
+def test_adjoint_moves_a_tangent_to_the_other_side(x: np.ndarray, d: np.ndarray) -> None:
+    T, d = se3.exp(x), 0.1 * d
+    left = se3.compose(se3.exp(se3.adjoint(T) @ d), T)
+    assert np.allclose(se3.local(left, se3.compose(T, se3.exp(d))), 0.0, atol=1e-12)
+
+
+def test_batches_of_exp_and_log() -> None:
+    d = np.random.default_rng(1).normal(size=(2, 3, 6))
+    assert se3.exp(d).shape == (2, 3, 7)
+    assert np.allclose(se3.log(se3.exp(d)), d)
+    assert se3.adjoint(se3.exp(d)).shape == (2, 3, 6, 6)
