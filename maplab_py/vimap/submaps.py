@@ -195,7 +195,7 @@ def _twin_frames(stacked: VIMap, vertex: I64, base_frames: int) -> I64:
     slot = vertex[frames.vertex] * width + frames.camera_index
     of_slot = np.full(len(vertex) * width, -1, dtype=np.int64)
     of_slot[slot[:base_frames]] = np.arange(base_frames)
-    twin = of_slot[slot]
+    twin: I64 = of_slot[slot]
     twin[:base_frames] = -1
     rows = np.flatnonzero(twin >= 0)
     differ = rows[frames.keypoint_count[rows] != frames.keypoint_count[twin[rows]]]

@@ -1,0 +1,123 @@
+"""Remove bad landmarks, and observations that contradict their landmark."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.landmarks.options import InvalidObservationOptions
+from maplab_py.algorithms.landmarks.reports import InvalidObservationReport, RemovalReport
+from maplab_py.algorithms.landmarks.sightings import Residuals, is_lidar, residuals
+from maplab_py.algorithms.landmarks.tracks import add_tracks, group_tracks
+from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.edits import remove_landmarks, remove_observations
+from maplab_py.vimap.queries import landmark_mask, observation_counts
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def remove_bad(
+    vi_map: VIMap, *, missions: NDArray[np.int64] | None = None, progress: Progress = SILENT
+) -> tuple[VIMap, RemovalReport]:
+    """Remove every landmark of quality bad that is stored in the missions (None = all)."""
+    progress.check()
+    chosen = landmark_mask(vi_map, missions)
+    bad = chosen & (vi_map.landmarks.quality == LandmarkQuality.BAD)
+    result = remove_landmarks(vi_map, bad)
+    unknown = vi_map.landmarks.quality == LandmarkQuality.UNKNOWN
+    report = RemovalReport(
+        landmarks_removed=int(bad.sum()),
+        observations_removed=int(observation_counts(vi_map)[bad].sum()),
+        landmarks_left=int((chosen & ~bad).sum()),
+        unknown_left=int((chosen & unknown).sum()),
+    )
+    return result, report
+
+
+def remove_invalid_observations(
+    vi_map: VIMap,
+    options: InvalidObservationOptions,
+    *,
+    missions: NDArray[np.int64] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, InvalidObservationReport]:
+    """Detach observations that contradict their landmark, and make new landmarks from their tracks.
+
+    Invalid are: the second and further observations of one landmark in one frame (the one with the
+    smallest reprojection error stays), points behind the camera, and reprojection errors above
+    the limit. Detached keypoints of one landmark and one feature track that triangulate and agree
+    become a landmark of unknown quality.
+
+    Args:
+        vi_map: The map.
+        options: The limits.
+        missions: Rows of the missions that store the landmarks; None = all.
+        progress: Where to learn of cancellation.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
+    progress.check()
+    chosen = landmark_mask(vi_map, missions)
+    keypoints = vi_map.observations[chosen[vi_map.keypoints.landmark[vi_map.observations]]]
+    landmark = vi_map.keypoints.landmark[keypoints]
+    seen = residuals(vi_map, keypoints, vi_map.p_G[landmark])
+    twice, behind, far = _reasons(vi_map, keypoints, seen, options.max_reprojection_error_px)
+    gone = twice | behind | far
+    progress.check()
+    result = remove_observations(vi_map, keypoints[gone])
+    added, reattached = 0, 0
+    if options.make_new_landmarks:
+        result, added, reattached = _from_detached(
+            result, keypoints[gone], landmark[gone].astype(np.int64), options
+        )
+    had = np.diff(vi_map.observation_start) > 0
+    lost = had & (observation_counts(result)[: len(had)] == 0)
+    report = InvalidObservationReport(
+        observations=len(keypoints),
+        twice_in_frame=int(twice.sum()),
+        behind_camera=int((behind & ~twice).sum()),
+        too_large_error=int((far & ~behind & ~twice).sum()),
+        landmarks_added=added,
+        observations_reattached=reattached,
+        landmarks_without_observations=int(lost.sum()),
+    )
+    return result, report
+
+
+def _reasons(
+    vi_map: VIMap, keypoints: I64, seen: Residuals, max_error_px: float
+) -> tuple[Mask, Mask, Mask]:
+    """Return which observations (O,) are repeated in a frame, behind the camera, or far off."""
+    landmark, frame = vi_map.keypoints.landmark[keypoints], vi_map.keypoint_frame[keypoints]
+    order = np.lexsort((keypoints, seen.error_px, frame, landmark))
+    again = np.zeros(len(keypoints), dtype=np.bool_)
+    again[1:] = (landmark[order[1:]] == landmark[order[:-1]]) & (
+        frame[order[1:]] == frame[order[:-1]]
+    )
+    twice = np.zeros(len(keypoints), dtype=np.bool_)
+    twice[order] = again
+    visual = ~is_lidar(vi_map, landmark)
+    behind = visual & (seen.signed_distance_m <= 0.0)
+    return twice, behind, visual & (seen.error_px > max_error_px)
+
+
+def _from_detached(
+    vi_map: VIMap, keypoints: I64, landmark: I64, options: InvalidObservationOptions
+) -> tuple[VIMap, int, int]:
+    """Make landmarks from detached keypoints (N,) of one former landmark (N,) and track."""
+    tracked = vi_map.keypoints.track_id[keypoints] >= 0
+    rows, start = group_tracks(vi_map, keypoints[tracked], landmark[tracked])
+    if len(start) == 1:
+        return vi_map, 0, 0
+    p_G, _, usable = triangulate_keypoints(vi_map, rows, start)
+    group = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    error = residuals(vi_map, rows, p_G[group]).error_px
+    worst = np.maximum.reduceat(error, start[:-1])
+    usable &= worst <= options.max_reprojection_error_px
+    result, observations = add_tracks(vi_map, rows, start, p_G, usable)
+    return result, int(usable.sum()), observations

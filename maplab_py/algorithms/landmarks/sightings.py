@@ -1,0 +1,101 @@
+"""Observations as geometry: rays in G, points in camera frames, reprojection errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3, so3
+from maplab_py.sensors import Camera, Projection
+from maplab_py.sensors.projection import back_project, project
+from maplab_py.vimap import MissionSensor, VIMap
+from maplab_py.vimap.queries import mission_sensor_id
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LIDAR_FEATURE_TYPES = (21,)
+"""Feature types (proto values) whose keypoints carry a 3-D position."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Residuals:
+    """How points appear to the keypoints that observe them."""
+
+    error_px: F64  # (O,), infinite where the point does not project into the camera
+    signed_distance_m: F64  # (O,), negative behind the camera
+    error_m: F64  # (O,), lidar observations; NaN for all others
+
+
+def cameras_of(vi_map: VIMap, keypoints: I64) -> Iterator[tuple[Camera, F64, I64]]:
+    """Yield each mission's cameras with T_I_C (7,) and the positions in `keypoints` of their own.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
+    frame = vi_map.keypoint_frame[keypoints]
+    mission = vi_map.vertices.mission[vi_map.frames.vertex[frame]].astype(np.int64)
+    index = vi_map.frames.camera_index[frame]
+    key = mission * (int(index.max(initial=0)) + 1) + index
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    for rows in np.split(order, first[1:]) if len(order) else ():
+        row = int(mission[rows[0]])
+        rig_id = mission_sensor_id(vi_map, row, MissionSensor.NCAMERA)
+        imu_id = mission_sensor_id(vi_map, row, MissionSensor.IMU)
+        camera = int(index[rows[0]])
+        T_I_C = vi_map.sensors.T_I_C(imu_id, rig_id)[camera]
+        yield vi_map.sensors.camera_rig(rig_id).cameras[camera], T_I_C, rows
+
+
+def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:
+    """Tell which landmarks (N,) are seen as 3-D points."""
+    if vi_map.keypoints.position_3d.shape[1] != 3:
+        return np.zeros(len(landmarks), dtype=np.bool_)
+    return np.isin(vi_map.landmarks.feature_type[landmarks], LIDAR_FEATURE_TYPES)
+
+
+def rays_in_G(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, Mask]:
+    """Return camera centres (O, 3), unit rays (O, 3) in G, and which rays exist (O,).
+
+    Cameras are taken to be at their vertex' pose: time offsets between a vertex and its images
+    are below a millisecond in maplab's maps.
+    """
+    origins, directions = np.zeros((len(keypoints), 3)), np.zeros((len(keypoints), 3))
+    valid = np.zeros(len(keypoints), dtype=np.bool_)
+    for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
+        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[keypoints[rows]]], T_I_C)
+        bearing, ok = back_project(camera, vi_map.keypoints.uv_px[keypoints[rows]])
+        origins[rows] = T_G_C[:, 4:]
+        directions[rows] = so3.rotate(T_G_C[:, :4], bearing)
+        valid[rows] = ok
+    return origins, directions, valid
+
+
+def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
+    """Compare points (O, 3) of G, one for each keypoint (O,), with what was measured."""
+    error_px = np.full(len(keypoints), np.inf)
+    distance, error_m = np.zeros(len(keypoints)), np.full(len(keypoints), np.nan)
+    table = vi_map.keypoints
+    lidar = np.zeros(len(keypoints), dtype=np.bool_)
+    observing = table.landmark[keypoints] >= 0
+    lidar[observing] = is_lidar(vi_map, table.landmark[keypoints[observing]])
+    for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
+        own = keypoints[rows]
+        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[own]], T_I_C)
+        p_C = se3.transform(se3.inverse(T_G_C), p_G[rows])
+        uv, visible = project(camera, p_C)
+        error = np.linalg.norm(uv - table.uv_px[own], axis=1)
+        error_px[rows] = np.where(visible, error, np.inf)
+        in_front = p_C[:, 2] > 0.0 if camera.projection is Projection.PINHOLE else visible
+        distance[rows] = np.where(in_front, 1.0, -1.0) * np.linalg.norm(p_C, axis=1)
+        points = rows[lidar[rows]]
+        if len(points):
+            measured = table.position_3d[keypoints[points]]
+            error_m[points] = np.linalg.norm(p_C[lidar[rows]] - measured, axis=1)
+            distance[points] = np.abs(distance[points])  # a lidar sees all round
+    return Residuals(error_px, distance, error_m)

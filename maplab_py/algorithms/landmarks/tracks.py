@@ -1,0 +1,101 @@
+"""New landmarks from feature tracks that have none."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.reports import TrackReport
+from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangulate_keypoints
+from maplab_py.geometry import se3
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import add_landmarks
+from maplab_py.vimap.queries import mission_mask
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def init_tracks(
+    vi_map: VIMap,
+    options: LandmarkQualityOptions,
+    *,
+    missions: NDArray[np.int64] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, TrackReport]:
+    """Make landmarks from keypoints without one that share mission, camera and track id.
+
+    A track needs two keypoints of different frames (of two in one frame the first counts), rays
+    that meet, and a point in front of its cameras; the landmark is stored in its first observer.
+    All landmarks of the missions are triangulated afterwards, as in maplab.
+
+    Args:
+        vi_map: The map.
+        options: Thresholds of the quality.
+        missions: Mission rows; None = all.
+        progress: Where to learn of cancellation.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
+    progress.check()
+    chosen = mission_mask(vi_map, missions)
+    unused = (vi_map.keypoints.landmark < 0) & (vi_map.keypoints.track_id >= 0)
+    rows = np.flatnonzero(unused)
+    rows = rows[chosen[vi_map.vertices.mission[vi_map.keypoint_vertex[rows]]]]
+    keypoints, start = group_tracks(vi_map, rows, np.zeros(len(rows), dtype=np.int64))
+    p_G, _, usable = triangulate_keypoints(vi_map, keypoints, start)
+    progress.check()
+    added, observations = add_tracks(vi_map, keypoints, start, p_G, usable)
+    result, retriangulation = retriangulate(added, options, missions=missions, progress=progress)
+    report = TrackReport(
+        tracks=len(usable),
+        landmarks_added=int(usable.sum()),
+        observations_added=observations,
+        undetermined=int((~usable).sum()),
+        retriangulation=retriangulation,
+    )
+    return result, report
+
+
+def group_tracks(vi_map: VIMap, rows: I64, label: I64) -> tuple[I64, I64]:
+    """Group keypoints (N,) by mission, camera, track id and label (N,).
+
+    Returns:
+        Keypoint rows in groups of two or more, one per frame, and the groups' offsets.
+    """
+    frame = vi_map.keypoint_frame[rows]
+    mission = vi_map.vertices.mission[vi_map.frames.vertex[frame]]
+    camera, track = vi_map.frames.camera_index[frame], vi_map.keypoints.track_id[rows]
+    order = np.lexsort((rows, track, label, camera, mission))
+    rows, frame = rows[order], frame[order]
+    keys = np.stack([mission[order], camera[order], label[order], track[order]])
+    begins = np.ones(len(rows), dtype=np.bool_)
+    begins[1:] = np.any(keys[:, 1:] != keys[:, :-1], axis=0)
+    again = np.zeros(len(rows), dtype=np.bool_)
+    again[1:] = ~begins[1:] & (frame[1:] == frame[:-1])
+    group = np.cumsum(begins) - 1
+    counts = np.bincount(group[~again], minlength=int(begins.sum()))
+    taken = ~again & (counts[group] >= 2) if len(rows) else again
+    return rows[taken], starts_of_counts(counts[counts >= 2])
+
+
+def add_tracks(
+    vi_map: VIMap, keypoints: I64, start: I64, p_G: F64, usable: Mask
+) -> tuple[VIMap, int]:
+    """Make a landmark at p_G (L, 3) of each usable group; return also their observations' number."""
+    groups = np.flatnonzero(usable)
+    if len(groups) == 0:
+        return vi_map, 0
+    taken = keypoints[ragged_rows(start, groups)]
+    store = vi_map.keypoint_vertex[keypoints[start[:-1][groups]]]
+    p_I = se3.transform(se3.inverse(vi_map.T_G_I[store]), p_G[groups])
+    number = np.repeat(np.arange(len(groups)), np.diff(start)[groups])
+    added = add_landmarks(
+        vi_map, vertex=store, p_I=p_I, keypoint_rows=taken, keypoint_landmark=number
+    )
+    return added, len(taken)

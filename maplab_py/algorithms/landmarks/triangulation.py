@@ -1,0 +1,88 @@
+"""Place landmarks anew from the rays of their observations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.landmarks.reports import RetriangulationReport
+from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
+from maplab_py.geometry import triangulation
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import with_p_G
+from maplab_py.vimap.queries import landmark_mask
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def retriangulate(
+    vi_map: VIMap,
+    options: LandmarkQualityOptions,
+    *,
+    missions: NDArray[np.int64] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, RetriangulationReport]:
+    """Triangulate every landmark stored in the missions, then evaluate its quality.
+
+    A landmark keeps its place when it has fewer than two observations, when its rays are parallel
+    or when the new point would lie behind one of its cameras; quality then tells that it is bad.
+    Each stays in its store vertex. Landmarks of 3-D (lidar) observations are left in place.
+
+    Args:
+        vi_map: The map.
+        options: Thresholds of the quality.
+        missions: Mission rows; None = all.
+        progress: Where to learn of cancellation.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
+    progress.check()
+    chosen = np.flatnonzero(landmark_mask(vi_map, missions))
+    rows = chosen[~is_lidar(vi_map, chosen)]
+    keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, rows)]
+    start = starts_of_counts(np.diff(vi_map.observation_start)[rows])
+    p_G, determined, in_front = triangulate_keypoints(vi_map, keypoints, start)
+    placed = determined & in_front
+    enough = np.diff(start) >= 2
+    shift = np.linalg.norm(p_G[placed] - vi_map.p_G[rows[placed]], axis=1)
+    progress.check()
+    moved = with_p_G(vi_map, rows[placed], p_G[placed])
+    judged, quality = evaluate_quality(moved, options, missions=missions, progress=progress)
+    report = RetriangulationReport(
+        landmarks=len(chosen),
+        triangulated=int(placed.sum()),
+        too_few_observations=int((~enough).sum()),
+        undetermined=int((enough & ~determined).sum()),
+        behind_camera=int((determined & ~in_front).sum()),
+        median_shift_m=float(np.median(shift)) if len(shift) else 0.0,
+        quality=quality,
+    )
+    return judged, report
+
+
+def triangulate_keypoints(vi_map: VIMap, keypoints: I64, start: I64) -> tuple[F64, Mask, Mask]:
+    """Triangulate groups of keypoints.
+
+    Args:
+        vi_map: The map.
+        keypoints: Keypoint rows (O,), grouped.
+        start: Offsets (L + 1) of the groups.
+
+    Returns:
+        Points in G (L, 3), whether they are determined (L,), and whether they lie in front of all
+        cameras of their group (L,). Keypoints without a ray do not take part.
+    """
+    origins, directions, valid = rays_in_G(vi_map, keypoints)
+    group = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    used = starts_of_counts(np.bincount(group[valid], minlength=len(start) - 1))
+    p_G, determined, _ = triangulation.triangulate(origins[valid], directions[valid], used)
+    distance = residuals(vi_map, keypoints, p_G[group]).signed_distance_m
+    behind = np.bincount(group[(distance <= 0.0) & valid], minlength=len(start) - 1) > 0
+    return p_G, determined, determined & ~behind
