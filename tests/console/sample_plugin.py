@@ -73,7 +73,7 @@ def solve(
     context: CommandContext,
     name: str = "",
     *,
-    options: SolverOptions = SolverOptions(),  # noqa: B008
+    options: SolverOptions = SolverOptions(),
     colour: Colour = Colour.RED,
     mode: Literal["fast", "exact"] = "fast",
     limit: float | None = None,

@@ -76,7 +76,7 @@ def _same_flag_twice(
     context: CommandContext,
     *,
     a: SolverOptions = SolverOptions(),  # noqa: B008
-    b: ClashingOptions = ClashingOptions(),  # noqa: B008
+    b: ClashingOptions = ClashingOptions(),
 ) -> None:
     """Do something."""
 

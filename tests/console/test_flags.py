@@ -103,8 +103,15 @@ def test_numbers_survive_formatting(value: float) -> None:
 
 @pytest.mark.parametrize(
     ("annotation", "value"),
-    [(bool, True), (int, -3), (str, "a b"), (Path, Path("a/b")), (int | None, None)]
-    + [(tuple[int, ...], (1, 2)), (Colour, Colour.DEEP_BLUE)],
+    [
+        (bool, True),
+        (int, -3),
+        (str, "a b"),
+        (Path, Path("a/b")),
+        (int | None, None),
+        (tuple[int, ...], (1, 2)),
+        (Colour, Colour.DEEP_BLUE),
+    ],
 )
 def test_every_type_reads_what_it_writes(annotation: Any, value: Any) -> None:
     assert flag_type(annotation).parse(format_value(value)) == value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 
 import pytest
@@ -48,5 +49,5 @@ def test_quoted_words_come_back(words: list[str]) -> None:
 @given(st.text())
 def test_scan_covers_every_word_once(text: str) -> None:
     words = [word for command in scan(text) for word in command]
-    assert all(a.end <= b.start for a, b in zip(words, words[1:], strict=False))
+    assert all(a.end <= b.start for a, b in itertools.pairwise(words))
     assert all(word.start < word.end <= len(text) for word in words)
