@@ -27,6 +27,14 @@ from maplab_py.vimap.tables import (
     TransformationEdges,
     Vertices,
 )
+from maplab_py.vimap.views import (
+    LandmarkView,
+    MissionView,
+    VertexView,
+    landmark_view,
+    mission_view,
+    vertex_view,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +158,20 @@ class VIMap:
     def landmark_index(self) -> IdIndex:
         """Look-up of landmark rows by id."""
         return IdIndex(self.landmarks.id)
+
+    # -- rows as objects ------------------------------------------------------------------------
+
+    def mission(self, row: int) -> MissionView:
+        """Return one mission as an object."""
+        return mission_view(self, row)
+
+    def vertex(self, row: int) -> VertexView:
+        """Return one vertex as an object."""
+        return vertex_view(self, row)
+
+    def landmark(self, row: int) -> LandmarkView:
+        """Return one landmark as an object."""
+        return landmark_view(self, row)
 
     def nbytes(self) -> int:
         """Return the memory of all tables in bytes (shared columns counted once each)."""

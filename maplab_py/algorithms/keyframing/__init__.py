@@ -1,0 +1,1 @@
+"""Keyframing: which vertices are worth keeping."""

@@ -1,0 +1,59 @@
+"""Options and report of heuristic keyframing; maplab's names and defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+from maplab_py.report import Report
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyframingOptions:
+    """When a vertex becomes a keyframe."""
+
+    flag_prefix: ClassVar[str] = "kf_"
+
+    distance_threshold_m: float = option(
+        0.75, help="Distance from the last keyframe that makes a new one.", unit="m"
+    )
+    rotation_threshold_deg: float = option(
+        20.0, help="Rotation from the last keyframe that makes a new one.", unit="deg"
+    )
+    every_nth_vertex: int = option(10, help="Make at least every n-th vertex a keyframe.")
+    min_shared_landmarks_obs: int = option(
+        20, help="Make a keyframe where fewer landmarks are shared with the last one."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.every_nth_vertex < 1:
+            raise FlagError("--kf_every_nth_vertex must be at least 1")
+        for name in ("distance_threshold_m", "rotation_threshold_deg", "min_shared_landmarks_obs"):
+            if getattr(self, name) < 0:
+                raise FlagError(f"--kf_{name} must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyframingReport(Report):
+    """Keyframes by the first reason that applied, and what goes with the other vertices."""
+
+    vertices_before: int
+    vertices_after: int
+    # keyframes by reason
+    mission_ends: int
+    every_nth: int
+    few_shared_landmarks: int
+    absolute_pose: int
+    loop_closure: int
+    distance: int
+    rotation: int
+    # what the removed vertices take along
+    observations_removed: int
+    landmarks_moved: int
+    imu_edges_dropped: int
+    transformation_edges_dropped: int
+    resources_removed: int
+    dry_run: bool = False

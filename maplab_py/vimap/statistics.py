@@ -1,0 +1,202 @@
+"""What is in a map, mission by mission."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.report import Report
+from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
+from maplab_py.vimap.queries import (
+    coobservation_counts,
+    mission_clusters,
+    mission_distances_m,
+    mission_time_spans_ns,
+)
+from maplab_py.vimap.tables import Backbone, LandmarkQuality, ResourceOwner, TransformationKind
+from maplab_py.vimap.vi_map import VIMap
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraStatistics:
+    """Landmarks and observations of one camera of a mission's rig."""
+
+    camera_index: int
+    frames: int
+    keypoints: int
+    observations: int
+    landmarks_good: int  # distinct landmarks that the camera sees
+    landmarks_bad: int
+    landmarks_unknown: int
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionStatistics:
+    """One mission."""
+
+    id: str
+    backbone: str
+    T_G_M_known: bool
+    vertices: int
+    edges: dict[str, int]  # by kind, and by sensor where the edges name one
+    loop_closure_edges: int  # with at least one end in the mission
+    absolute_poses: int
+    imu_samples: int
+    landmarks_good: int  # stored in the mission
+    landmarks_bad: int
+    landmarks_unknown: int
+    observations: int
+    cameras: tuple[CameraStatistics, ...]
+    distance_m: float
+    start_ns: int
+    end_ns: int
+    duration_s: float
+    resources: int
+
+
+@dataclasses.dataclass(frozen=True)
+class MapTotals:
+    """All missions together."""
+
+    missions: int
+    vertices: int
+    edges: int
+    loop_closure_edges: int
+    landmarks_good: int
+    landmarks_bad: int
+    landmarks_unknown: int
+    keypoints: int
+    observations: int
+    distance_m: float
+    duration_s: float
+    resources: int
+
+
+@dataclasses.dataclass(frozen=True)
+class MapStatistics(Report):
+    """Report of `map_stats`."""
+
+    missions: tuple[MissionStatistics, ...]
+    total: MapTotals | None  # with more than one mission
+    memory_megabytes: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CoobservabilityReport(Report):
+    """Which missions share landmarks."""
+
+    missions: tuple[str, ...]
+    clusters: tuple[tuple[str, ...], ...]
+    shared_landmarks: tuple[tuple[int, ...], ...]  # [i][j]: landmarks that missions i and j observe
+
+
+def map_statistics(vi_map: VIMap) -> MapStatistics:
+    """Count what a map holds."""
+    distances, spans = mission_distances_m(vi_map), mission_time_spans_ns(vi_map)
+    missions = tuple(
+        _mission(vi_map, row, float(distances[row]), spans[row, 0], spans[row, 1])
+        for row in range(len(vi_map.missions))
+    )
+    total = None
+    if len(missions) > 1:
+        quality = np.bincount(vi_map.landmarks.quality, minlength=3)
+        total = MapTotals(
+            missions=len(missions),
+            vertices=len(vi_map.vertices),
+            edges=len(vi_map.imu_edges) + len(vi_map.transformation_edges),
+            loop_closure_edges=len(vi_map.loop_closure_edges),
+            landmarks_good=int(quality[LandmarkQuality.GOOD]),
+            landmarks_bad=int(quality[LandmarkQuality.BAD]),
+            landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+            keypoints=len(vi_map.keypoints),
+            observations=len(vi_map.observations),
+            distance_m=float(distances.sum()),
+            duration_s=sum(mission.duration_s for mission in missions),
+            resources=len(vi_map.resources),
+        )
+    return MapStatistics(missions, total, vi_map.nbytes() / 2**20)
+
+
+def coobservability(vi_map: VIMap) -> CoobservabilityReport:
+    """Group missions that observe common landmarks."""
+    names = to_hex_list(vi_map.missions.id)
+    label = mission_clusters(vi_map, with_loop_closures=False)
+    clusters = tuple(
+        tuple(names[row] for row in np.flatnonzero(label == value)) for value in np.unique(label)
+    )
+    counts = coobservation_counts(vi_map).tolist()
+    return CoobservabilityReport(tuple(names), clusters, tuple(tuple(row) for row in counts))
+
+
+def _mission(
+    vi_map: VIMap, row: int, distance_m: float, start_ns: int, end_ns: int
+) -> MissionStatistics:
+    of_vertex = vi_map.vertices.mission == row
+    stored = of_vertex[vi_map.landmarks.vertex]
+    quality = np.bincount(vi_map.landmarks.quality[stored], minlength=3)
+    imu, loops = vi_map.imu_edges, vi_map.loop_closure_edges
+    of_imu = of_vertex[imu.from_vertex]
+    cameras = _cameras(vi_map, row)
+    resources = vi_map.resources
+    by_frame = resources.owner_kind == ResourceOwner.FRAME
+    frame_mission = vi_map.vertices.mission[vi_map.frames.vertex]
+    owned = np.where(by_frame, -1, resources.owner) == row
+    owned[by_frame] = frame_mission[resources.owner[by_frame]] == row
+    return MissionStatistics(
+        id=to_hex(vi_map.missions.id[row]),
+        backbone=Backbone(int(vi_map.missions.backbone[row])).name.lower(),
+        T_G_M_known=bool(vi_map.baseframes.is_known[vi_map.missions.baseframe[row]]),
+        vertices=int(of_vertex.sum()),
+        edges=_edge_counts(vi_map, row),
+        loop_closure_edges=int(
+            np.count_nonzero(of_vertex[loops.from_vertex] | of_vertex[loops.to_vertex])
+        ),
+        absolute_poses=int(np.count_nonzero(of_vertex[vi_map.absolute_poses.vertex])),
+        imu_samples=int(imu.sample_count[of_imu].sum()),
+        landmarks_good=int(quality[LandmarkQuality.GOOD]),
+        landmarks_bad=int(quality[LandmarkQuality.BAD]),
+        landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+        observations=sum(camera.observations for camera in cameras),
+        cameras=cameras,
+        distance_m=distance_m,
+        start_ns=int(start_ns),
+        end_ns=int(end_ns),
+        duration_s=float(end_ns - start_ns) * 1e-9,
+        resources=int(np.count_nonzero(owned)),
+    )
+
+
+def _edge_counts(vi_map: VIMap, row: int) -> dict[str, int]:
+    of_vertex = vi_map.vertices.mission == row
+    counts = {"imu": int(np.count_nonzero(of_vertex[vi_map.imu_edges.from_vertex]))}
+    edges = vi_map.transformation_edges.take(of_vertex[vi_map.transformation_edges.from_vertex])
+    for kind in TransformationKind:
+        of_kind = edges.take(edges.kind == kind)
+        for words in np.unique(of_kind.sensor_id, axis=0):
+            name = kind.name.lower() + (f" {to_hex(words)}" if is_valid(words) else "")
+            counts[name] = int(np.count_nonzero(np.all(of_kind.sensor_id == words, axis=1)))
+    return counts
+
+
+def _cameras(vi_map: VIMap, row: int) -> tuple[CameraStatistics, ...]:
+    of_mission = vi_map.vertices.mission[vi_map.frames.vertex] == row
+    index = vi_map.frames.camera_index
+    found = []
+    for camera in np.unique(index[of_mission]).tolist():
+        chosen = of_mission & (index == camera)
+        landmark = vi_map.keypoints.landmark[chosen[vi_map.keypoint_frame]]
+        observing = landmark[landmark >= 0]
+        quality = np.bincount(vi_map.landmarks.quality[np.unique(observing)], minlength=3)
+        found.append(
+            CameraStatistics(
+                camera_index=camera,
+                frames=int(np.count_nonzero(chosen)),
+                keypoints=len(landmark),
+                observations=len(observing),
+                landmarks_good=int(quality[LandmarkQuality.GOOD]),
+                landmarks_bad=int(quality[LandmarkQuality.BAD]),
+                landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+            )
+        )
+    return tuple(found)
