@@ -1,0 +1,113 @@
+"""The real program: as a child process, or in a pseudo-terminal with a screen."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pexpect
+import pyte
+
+PROGRAM = [sys.executable, "-m", "maplab_py"]
+ROWS, COLUMNS = 40, 120
+
+
+def environment(home: Path, **extra: str) -> dict[str, str]:
+    """Return the environment of a user whose files lie under `home`."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "MAPLAB_PLUGINS")}
+    return {
+        **kept,
+        "HOME": str(home),
+        "XDG_STATE_HOME": str(home / "state"),
+        "XDG_CONFIG_HOME": str(home / "config"),
+        "TERM": "xterm-256color",
+        **extra,
+    }
+
+
+def run_program(
+    home: Path, *arguments: str, text: str = "", extra: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run the program to its end with `text` on its standard input."""
+    return subprocess.run(
+        [*PROGRAM, *arguments],
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=home,
+        env=environment(home, **(extra or {})),
+        check=False,
+    )
+
+
+class Console:
+    """The program in a pseudo-terminal, with what a person would see of it."""
+
+    def __init__(self, home: Path, *arguments: str, **extra: str) -> None:
+        self.child = pexpect.spawn(
+            PROGRAM[0],
+            [*PROGRAM[1:], *arguments],
+            env=environment(home, **extra),
+            cwd=str(home),
+            dimensions=(ROWS, COLUMNS),
+            encoding="utf-8",
+            timeout=30,
+        )
+        self.screen = pyte.Screen(COLUMNS, ROWS)
+        self._stream = pyte.Stream(self.screen)
+
+    @property
+    def text(self) -> str:
+        """The screen's lines."""
+        return "\n".join(line.rstrip() for line in self.screen.display).rstrip()
+
+    @property
+    def last_line(self) -> str:
+        """The lowest line that is not empty."""
+        return self.text.splitlines()[-1] if self.text else ""
+
+    def type(self, text: str) -> None:
+        """Type at a person's pace."""
+        for character in text:
+            self.child.send(character)
+            self._read(0.01)
+
+    def enter(self, line: str) -> None:
+        """Type a line and press Enter."""
+        self.type(line + "\r")
+
+    def wait_for(self, condition: Callable[[str], bool], seconds: float = 20.0) -> str:
+        """Wait until the screen fulfils a condition, and return its text."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._read(0.05)
+            if condition(self.text):
+                return self.text
+        raise AssertionError(f"the screen never came; it shows:\n{self.text}")
+
+    def wait_for_text(self, text: str) -> str:
+        """Wait until a text is on the screen."""
+        return self.wait_for(lambda screen: text in screen)
+
+    def wait_for_prompt(self, prompt: str = "maplab <>:/$") -> str:
+        """Wait until the last line is an empty prompt."""
+        return self.wait_for(lambda _: self.last_line == prompt)
+
+    def status(self) -> int:
+        """Wait for the end and return the exit status."""
+        self.child.expect(pexpect.EOF)
+        self.child.close()
+        return int(self.child.exitstatus)
+
+    def _read(self, seconds: float) -> None:
+        try:
+            self._stream.feed(self.child.read_nonblocking(65536, timeout=seconds))
+        except pexpect.TIMEOUT:
+            return
+        except pexpect.EOF:
+            time.sleep(seconds)

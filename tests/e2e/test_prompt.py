@@ -1,0 +1,116 @@
+"""The interactive console, key by key, in a pseudo-terminal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.support import Console
+
+CTRL_C, CTRL_D, CTRL_R, UP, TAB = "\x03", "\x04", "\x12", "\x1b[A", "\t"
+
+
+@pytest.fixture
+def console(tmp_path: Path) -> Iterator[Console]:
+    console = Console(tmp_path)
+    console.wait_for_prompt()
+    yield console
+    console.child.close(force=True)
+
+
+def test_typing_runs_commands_and_prints_their_time(console: Console) -> None:
+    console.enter("create_new_map euroc")
+    console.wait_for_prompt("maplab <euroc>:/$")
+    assert re.search(r"create_new_map: \d+\.\d\d s", console.text)
+    console.enter("nosuch")
+    console.wait_for_text("error: unknown command 'nosuch'")
+    console.enter("quit")
+    assert console.status() == 0
+
+
+def test_tab_completes_commands_flags_and_values(console: Console, tmp_path: Path) -> None:
+    console.type("transc" + TAB)
+    console.wait_for(lambda _: console.last_line.endswith("$ transcript"))
+    (tmp_path / "folder_of_maps").mkdir()
+    console.type(" --fi" + TAB)
+    console.wait_for(lambda _: console.last_line.endswith("transcript --file="))
+    console.type("folder_" + TAB)
+    console.wait_for(lambda _: console.last_line.endswith("--file=folder_of_maps/"))
+
+
+def test_tab_shows_flags_with_type_and_default(console: Console) -> None:
+    console.type("watch --" + TAB)
+    screen = console.wait_for_text("--repetitions=")
+    assert "float = 2" in screen
+    assert "--map_folder" not in screen
+
+
+def test_an_unknown_command_is_red_while_it_is_typed(console: Console) -> None:
+    console.type("hel")
+    console.wait_for(lambda _: console.last_line.endswith("hel"))
+    row = max(r for r, line in enumerate(console.screen.display) if line.strip())
+    column = console.screen.display[row].index("hel")
+    console.wait_for(lambda _: console.screen.buffer[row][column].fg == "red")
+    console.type("p")
+    console.wait_for(lambda _: console.screen.buffer[row][column].fg == "cyan")
+
+
+def test_ctrl_c_at_the_prompt_clears_the_line(console: Console) -> None:
+    console.type("some words" + CTRL_C)
+    console.wait_for_prompt()
+    console.enter("enable_sheep")
+    console.wait_for_text("\N{SHEEP}")
+
+
+def test_ctrl_c_in_a_command_cancels_it_and_the_console_lives(console: Console) -> None:
+    console.enter("watch timing")
+    console.wait_for_text("no command has run yet")
+    console.type(CTRL_C)
+    console.wait_for_text("stopped after")
+    console.wait_for_prompt()
+
+
+def test_ctrl_d_leaves(console: Console) -> None:
+    console.type(CTRL_D)
+    assert console.status() == 0
+
+
+def test_history_is_kept_between_sessions(console: Console, tmp_path: Path) -> None:
+    console.enter("create_new_map remembered")
+    console.wait_for_prompt("maplab <remembered>:/$")
+    console.enter("exit")
+    assert console.status() == 0
+    assert (tmp_path / "state" / "maplab" / "history").is_file()
+    assert not [path for path in tmp_path.iterdir() if "history" in path.name]
+    again = Console(tmp_path)
+    again.wait_for_prompt()
+    again.type("crea")
+    again.wait_for_text("create_new_map remembered")  # the grey suggestion
+    again.type(CTRL_C)
+    again.wait_for_prompt()
+    again.type(CTRL_R + "remem")
+    again.wait_for_text("create_new_map remembered")
+    again.child.close(force=True)
+
+
+def test_a_broken_user_configuration_only_warns(tmp_path: Path) -> None:
+    folder = tmp_path / "config" / "maplab"
+    folder.mkdir(parents=True)
+    (folder / "flags").write_text("--nosuch_flag=1\n")
+    console = Console(tmp_path)
+    console.wait_for_text("warning:")
+    console.wait_for_prompt()
+    console.child.close(force=True)
+
+
+def test_no_color_is_respected(tmp_path: Path) -> None:
+    console = Console(tmp_path, NO_COLOR="1")
+    console.wait_for_prompt()
+    console.enter("help")
+    console.wait_for_text("help: 0.")
+    cells = [cell for row in console.screen.buffer.values() for cell in row.values()]
+    assert {cell.fg for cell in cells} == {"default"}
+    console.child.close(force=True)
