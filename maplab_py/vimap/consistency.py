@@ -152,7 +152,7 @@ def _check_numbers(vi_map: VIMap, findings: _Findings) -> None:
         columns = table.columns()
         ids = columns.get("id")
         for name in names:
-            values = columns[name].reshape(len(table), -1)
+            values = columns[name].reshape(len(table), int(np.prod(columns[name].shape[1:])))
             findings.check(
                 f"{noun} with a non-finite {name}", ~np.all(np.isfinite(values), axis=1), ids
             )
