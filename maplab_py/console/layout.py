@@ -21,6 +21,7 @@ _UNIT_SUFFIXES = {
     "_seconds": "s",
     "_ms": "ms",
     "_mb": "MB",
+    "_megabytes": "MB",
     "_percent": "%",
     "_mps": "m/s",
 }
@@ -112,9 +113,9 @@ def format_cell(value: Any) -> str:
         return _format_array(value)
     if isinstance(value, (list, tuple, set, frozenset)):
         return ", ".join(format_cell(item) for item in value) or "none"
-    if value is None:
-        return "-"
-    return str(value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {format_cell(item)}" for key, item in value.items()) or "none"
+    return "-" if value is None else str(value)
 
 
 def _format_float(value: float) -> str:
@@ -158,8 +159,8 @@ def _is_lines(value: Any) -> bool:
 
 
 def _is_absent(value: Any) -> bool:
-    """Tell what there is nothing to say about: no text, no rows."""
-    return isinstance(value, (str, list, tuple)) and len(value) == 0
+    """Tell what there is nothing to say about: no value, no text, no rows."""
+    return value is None or (isinstance(value, (str, list, tuple, dict)) and len(value) == 0)
 
 
 def _table(title: str, records: Sequence[Any]) -> Table:
@@ -181,4 +182,4 @@ def _cell(value: Any) -> str:
         return ", ".join(
             f"{heading(f)} {format_cell(getattr(value, f.name))}" for f in dataclasses.fields(value)
         )
-    return "" if _is_absent(value) else format_cell(value)
+    return "" if _is_absent(value) and value is not None else format_cell(value)

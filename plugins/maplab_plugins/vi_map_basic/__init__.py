@@ -30,6 +30,7 @@ from maplab_plugins.vi_map_basic.memory import (
 )
 from maplab_plugins.vi_map_basic.resources import (
     list_resource_folders,
+    resource_statistics,
     use_external_resource_folder,
     use_map_resource_folder,
 )
@@ -59,6 +60,7 @@ __all__ = [
     "print_camera_calibrations",
     "redo",
     "rename_map",
+    "resource_statistics",
     "restore",
     "save",
     "save_all",

@@ -62,9 +62,9 @@ def map_stats(context: CommandContext) -> Report:
 @command("mission_coobservability_stats", "mcs")
 def mission_coobservability_stats(context: CommandContext) -> Report:
     """Show which missions share landmarks."""
-    from maplab_py.vimap.statistics import coobservability_statistics
+    from maplab_py.vimap.statistics import coobservability
 
-    return coobservability_statistics(context.vi_map)
+    return coobservability(context.vi_map)
 
 
 @command("print_baseframes")

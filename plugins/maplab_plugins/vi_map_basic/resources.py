@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import ResourceOwner, VIMap
 
 MAP_FOLDER = -1
 """Index that stands for the map's own resource folder."""
@@ -31,6 +31,22 @@ class ResourceFolderList(Report):
     folders: tuple[ResourceFolderLine, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class ResourceCount:
+    """How many resources of one type belong to one kind of owner."""
+
+    resource_type: int
+    owner: str
+    resources: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ResourceStatistics(Report):
+    """How many resources of which type there are."""
+
+    types: tuple[ResourceCount, ...]
+
+
 @command("list_resource_folders")
 def list_resource_folders(context: CommandContext) -> ResourceFolderList:
     """List the selected map's resource folders and which one new resources go to."""
@@ -50,6 +66,22 @@ def list_resource_folders(context: CommandContext) -> ResourceFolderList:
                 index == metadata.resource_folder_in_use,
             )
             for index, folder, kind in folders
+        )
+    )
+
+
+@command("resource_statistics", "res_stats")
+def resource_statistics(context: CommandContext) -> Report:
+    """Count the selected map's resources by type and by what they belong to."""
+    resources = context.vi_map.resources
+    if not len(resources):
+        return Message(f"map '{context.map_key}' has no resources")
+    pairs = np.stack([resources.type, resources.owner_kind], axis=1)
+    kinds, counts = np.unique(pairs, axis=0, return_counts=True)
+    return ResourceStatistics(
+        tuple(
+            ResourceCount(int(kind), ResourceOwner(int(owner)).name.lower(), int(count))
+            for (kind, owner), count in zip(kinds, counts, strict=True)
         )
     )
 

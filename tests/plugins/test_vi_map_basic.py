@@ -1,0 +1,239 @@
+"""Maps in memory and their loading and saving, on a storage that keeps maps in a dictionary."""
+
+from __future__ import annotations
+
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maplab_py.console.session import Session
+from maplab_py.errors import MapError, UserError
+from maplab_py.report import Message
+from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap
+from tests.console.sample_plugin import map_of
+from tests.vimap.builders import walk_map
+
+
+@pytest.fixture
+def session() -> Session:
+    return Session()
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[Path, VIMap]:
+    """Exchange the native storage for a dictionary; damaged maps are those without missions."""
+    maps: dict[Path, VIMap] = {}
+
+    def load_map(folder: Path, **options: Any) -> tuple[VIMap, Message]:
+        if folder not in maps or not len(maps[folder].missions):
+            raise MapError(f"{folder}: metadata is missing")
+        return maps[folder], Message(f"loaded {folder.name}")
+
+    def save_map(vi_map: VIMap, folder: Path, **options: Any) -> Message:
+        maps[folder] = vi_map
+        return Message(f"saved {folder.name}")
+
+    def find_maps(folder: Path) -> list[Path]:
+        return sorted(path for path in maps if folder in path.parents or path == folder)
+
+    fake: Any = types.ModuleType("maplab_py.storage.native")
+    fake.load_map, fake.save_map, fake.find_maps = load_map, save_map, find_maps
+    fake.is_map_folder = maps.__contains__
+    monkeypatch.setitem(sys.modules, "maplab_py.storage.native", fake)
+    for number in range(3):
+        maps[tmp_path / f"walk_{number}"] = walk_map(seed=number)
+    return maps
+
+
+def test_load_selects_the_map_under_its_folders_name(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    session.run("load", map_folder=tmp_path / "walk_0")
+    assert session.maps.keys == ["walk_0"]
+    assert session.vi_map is disk[tmp_path / "walk_0"]
+    assert session.maps.selected.is_saved
+    with pytest.raises(UserError, match="'walk_0' is taken"):
+        session.run("load", map_folder=tmp_path / "walk_0")
+    session.run("load", map_folder=tmp_path / "walk_0", map_key="again", assign_new_ids=True)
+    assert not session.maps.selected.is_saved
+    assert not np.array_equal(session.vi_map.missions.id, disk[tmp_path / "walk_0"].missions.id)
+
+
+def test_load_all_takes_all_maps_or_none(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    disk[tmp_path / "walk_9"] = VIMap()
+    before = session.maps.state
+    for command in ("load_all", "load_merge_all_maps", "load_merge_all_submaps"):
+        with pytest.raises(MapError, match="walk_9"):
+            session.run(command, maps_folder=tmp_path)
+    assert session.maps.state is before
+    del disk[tmp_path / "walk_9"]
+    session.run("load_all", maps_folder=tmp_path)
+    assert session.maps.keys == ["walk_0", "walk_1", "walk_2"]
+    with pytest.raises(UserError, match="is taken"):
+        session.run("load_all", maps_folder=tmp_path)
+
+
+def test_load_merge_all_maps_goes_to_the_selected_map_or_a_new_one(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    session.run("load_merge_all_maps", maps_folder=tmp_path, target_map_key="merged")
+    assert len(session.vi_map.missions) == 3
+    assert not session.maps.selected.is_saved
+    with pytest.raises(MapError, match="--assign_new_ids"):
+        session.run("load_merge_map", map_folder=tmp_path / "walk_1")
+    session.run("load_merge_all_maps", maps_folder=tmp_path, assign_new_ids=True)
+    assert session.maps.keys == ["merged"]
+    assert len(session.vi_map.missions) == 6
+    session.run("undo")
+    assert len(session.vi_map.missions) == 3
+
+
+@pytest.mark.parametrize("command", ["load_all", "list_maps_on_file_system"])
+def test_a_folder_without_maps_is_named(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path, command: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no map in it"):
+        session.run(command, maps_folder=tmp_path / "empty")
+    with pytest.raises(UserError, match="no such folder"):
+        session.run(command, maps_folder=tmp_path / "missing")
+
+
+def test_save_needs_a_folder_and_overwrite(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    session.maps.add("new", map_of(2))
+    with pytest.raises(UserError, match="has no folder yet"):
+        session.run("save")
+    session.run("save", map_folder=tmp_path / "out")
+    assert disk[tmp_path / "out"] is session.vi_map
+    assert session.maps.selected.is_saved
+    with pytest.raises(UserError, match="give --overwrite"):
+        session.run("save")
+    session.run("save", overwrite=True)
+
+
+def test_save_all_writes_nothing_when_one_map_cannot_be_saved(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    session.maps.add("a", map_of(1))
+    session.maps.add("walk_0", map_of(2))
+    before = dict(disk)
+    with pytest.raises(UserError, match="'walk_0'"):
+        session.run("save_all", maps_folder=tmp_path)
+    assert disk == before
+    session.run("save_all", maps_folder=tmp_path / "out")
+    assert len(disk[tmp_path / "out" / "walk_0"].missions) == 2
+    assert session.maps.unsaved == []
+
+
+def test_map_folder_can_be_chosen(session: Session, tmp_path: Path) -> None:
+    session.maps.add("a", map_of(1), is_saved=True)
+    session.run("set_map_folder", map_folder=tmp_path)
+    assert session.run("get_map_folder") == Message(str(tmp_path))
+    assert not session.maps.selected.is_saved
+
+
+def test_maps_in_memory(session: Session) -> None:
+    session.run("create_new_map", map_key="a")
+    session.run("copy_map", target_map_key="b")
+    assert session.maps.selected_key == "a"
+    session.run("rename_map", map_key="c")
+    session.run("select", map_key="b")
+    with pytest.raises(UserError, match="--yes"):
+        session.run("delete_map")
+    session.run("delete_map", yes=True)
+    assert session.maps.keys == ["c"]
+    assert session.maps.selected_key == "c"
+    session.run("clear_storage", yes=True)
+    assert session.run("list") == Message("no maps in memory")
+
+
+def test_merge_and_join(session: Session) -> None:
+    for number in range(3):
+        session.maps.add(f"m{number}", walk_map(seed=number))
+    session.run("merge_map", map_key="m0")
+    assert len(session.vi_map.missions) == 2
+    assert len(session.maps.get("m0").vi_map.missions) == 1
+    with pytest.raises(UserError, match="selected map"):
+        session.run("merge_map", map_key="m2")
+    before = session.maps.state
+    with pytest.raises(MapError):
+        session.run("join_all_maps", target_map_key="all")
+    assert session.maps.state is before
+    session.run("undo")
+    session.run("join_all_maps", target_map_key="all")
+    assert session.maps.keys == ["all"]
+    assert len(session.vi_map.missions) == 3
+    with pytest.raises(UserError, match="two or more"):
+        session.run("join_all_maps", target_map_key="again")
+
+
+def test_undo_redo_snapshot_restore(session: Session) -> None:
+    session.maps.add("a", walk_map(seed=1))
+    first = session.vi_map
+    session.run("snapshot", name="start")
+    session.run("set_all_mission_baseframes_to_known")
+    changed = session.vi_map
+    session.run("undo")
+    assert session.vi_map is first
+    with pytest.raises(UserError, match="nothing to undo"):
+        session.run("undo")
+    session.run("redo")
+    assert session.vi_map is changed
+    with pytest.raises(UserError, match="nothing to redo"):
+        session.run("redo")
+    session.run("restore", name="start")
+    assert session.vi_map is first
+    with pytest.raises(UserError, match="there are: start"):
+        session.run("restore", name="strat")
+
+
+def test_information(session: Session) -> None:
+    session.maps.add("empty", VIMap())
+    for command in ("print_baseframes", "print_camera_calibrations"):
+        with pytest.raises(UserError, match="map 'empty' has no"):
+            session.run(command)
+    session.maps.add("walk", walk_map(seed=1))
+    vi_map = session.vi_map
+    statistics: Any = session.run("map_stats")
+    assert statistics.missions[0].vertices == len(vi_map.vertices)
+    baseframes: Any = session.run("print_baseframes")
+    np.testing.assert_array_equal(baseframes.baseframes[0].p_G_M, vi_map.T_G_M[0, 4:])
+    cameras: Any = session.run("print_camera_calibrations")
+    assert cameras.cameras[0].size_px == "640 x 480"
+    shared: Any = session.run("mission_coobservability_stats")
+    assert len(shared.missions) == 1
+    assert session.run("check_map_consistency").failure == ""
+
+
+def test_an_inconsistent_map_fails(session: Session) -> None:
+    vi_map = walk_map(seed=1)
+    T_M_I = vi_map.vertices.T_M_I.copy()
+    T_M_I[2, 0] = np.nan
+    session.maps.add("bad", vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I)))
+    assert session.run("check_map_consistency").failure
+
+
+def test_resource_folders(session: Session, tmp_path: Path) -> None:
+    resources = Resources.filled(
+        3, type=[1, 1, 16], owner_kind=[ResourceOwner.FRAME] * 3, owner=[NO_ROW] * 3
+    )
+    session.maps.add("a", VIMap(resources=resources))
+    counted: Any = session.run("resource_statistics")
+    assert [(t.resource_type, t.resources) for t in counted.types] == [(1, 2), (16, 1)]
+    session.run("use_external_resource_folder", resource_folder=tmp_path)
+    session.run("use_external_resource_folder", resource_folder=tmp_path)
+    folders: Any = session.run("list_resource_folders")
+    assert [f.is_used_for_new for f in folders.folders] == [False, True]
+    assert folders.folders[0].resources == 3
+    session.run("use_map_resource_folder")
+    assert session.vi_map.metadata.resource_folder_in_use == -1
+    with pytest.raises(UserError, match="no such folder"):
+        session.run("use_external_resource_folder", resource_folder=tmp_path / "missing")
