@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 
-@compiled(inline="always")
+@compiled()
 def _multiply(a: F64, b: F64, out: F64) -> None:
     """Compute out = a b for 3x3 matrices."""
     for i in range(3):
@@ -32,7 +32,7 @@ def _multiply(a: F64, b: F64, out: F64) -> None:
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@compiled(inline="always")
+@compiled()
 def _rotation(phi: F64, E: F64, J: F64) -> None:
     """Compute E = Exp(phi) and the right Jacobian J of phi (Forster eq. (3) and (8))."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -57,7 +57,7 @@ def _rotation(phi: F64, E: F64, J: F64) -> None:
     _add_skew(J, x, y, z, -cosine)
 
 
-@compiled(inline="always")
+@compiled()
 def _add_skew(matrix: F64, x: float, y: float, z: float, factor: float) -> None:
     matrix[0, 1] -= factor * z
     matrix[0, 2] += factor * y
@@ -67,7 +67,7 @@ def _add_skew(matrix: F64, x: float, y: float, z: float, factor: float) -> None:
     matrix[2, 1] += factor * x
 
 
-@compiled(inline="always")
+@compiled()
 def _times_skew(a: F64, v: F64, out: F64) -> None:
     """Compute out = a skew(v)."""
     for i in range(3):
@@ -76,17 +76,23 @@ def _times_skew(a: F64, v: F64, out: F64) -> None:
         out[i, 2] = a[i, 0] * v[1] - a[i, 1] * v[0]
 
 
-@compiled(inline="always")
-def _correct(correction: F64, samples: F64, row: int, first: int, bias: F64, out: F64) -> None:
-    """Compute out = correction (measured - bias) for columns first .. first + 2 of a sample."""
-    x = samples[row, first] - bias[0]
-    y = samples[row, first + 1] - bias[1]
-    z = samples[row, first + 2] - bias[2]
+@compiled()
+def _correct(C_a: F64, samples: F64, row: int, bias: F64, force: F64) -> None:
+    """Compute the specific force of a sample, C_a (measured - bias)."""
     for i in range(3):
-        out[i] = correction[i, 0] * x + correction[i, 1] * y + correction[i, 2] * z
+        force[i] = 0.0
+        for j in range(3):
+            force[i] += C_a[i, j] * (samples[row, j] - bias[j])
 
 
-@compiled(inline="always")
+@compiled()
+def _transpose(matrix: F64) -> None:
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[i, j], matrix[j, i] = matrix[j, i], matrix[i, j]
+
+
+@compiled()
 def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: F64) -> None:
     """Compute the rotation vector phi of the mean angular velocity of two samples during dt."""
     for i in range(3):
@@ -96,7 +102,7 @@ def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: 
             phi[i] += dt * C_g[i, j] * (mean - bias[j])
 
 
-@compiled(inline="always")
+@compiled()
 def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) -> None:
     """Add the motion under the mean acceleration (R_0 f_0 + R_1 f_1) / 2 to p and v."""
     for i in range(3):
@@ -107,7 +113,7 @@ def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) 
         v[i] += dt * a
 
 
-@compiled(inline="always")
+@compiled()
 def _acceleration_derivatives(
     R_0: F64,
     R_1: F64,
@@ -136,7 +142,7 @@ def _acceleration_derivatives(
             by_accel[i, j] = 0.5 * (R_0[i, j] + R_1[i, j])
 
 
-@compiled(inline="always")
+@compiled()
 def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
     """Multiply the rows of state (9, n), ordered p, theta, v, by the error transition F.
 
@@ -152,7 +158,7 @@ def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
             state[3 + i, col] = E[0, i] * x + E[1, i] * y + E[2, i] * z
 
 
-@compiled(inline="always")
+@compiled()
 def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: F64) -> None:
     """Compute gain (9, 3): change of [p, theta, v] per unit of measured value during dt.
 
@@ -175,7 +181,7 @@ def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: 
             gain[6 + i, j] = dt * a
 
 
-@compiled(inline="always")
+@compiled()
 def _add_noise(covariance: F64, gain: F64, variance: float) -> None:
     """Compute covariance += variance gain gain^T."""
     for i in range(9):
@@ -183,6 +189,97 @@ def _add_noise(covariance: F64, gain: F64, variance: float) -> None:
             covariance[i, j] += variance * (
                 gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1] + gain[i, 2] * gain[j, 2]
             )
+
+
+@compiled()
+def _preintegrate_edge(
+    stamps: I64,
+    samples: F64,
+    gyro_bias: F64,
+    accel_bias: F64,
+    C_g: F64,
+    C_a: F64,
+    noise: F64,
+    R: F64,
+    v: F64,
+    p: F64,
+    P: F64,
+    D: F64,
+) -> None:
+    """Integrate one edge; see `preintegrate`. R, v, p, P, D are results, given as zeros."""
+    E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    by_theta, by_gyro, by_accel = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    zero = np.zeros((3, 3))
+    gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
+    phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        R[i, i] = 1.0
+    for row in range(len(stamps) - 1):
+        dt = (stamps[row + 1] - stamps[row]) * 1e-9
+        if dt <= 0.0:
+            continue
+        _mean_rotation(C_g, samples, row, gyro_bias, dt, phi)
+        _correct(C_a, samples, row, accel_bias, f_0)
+        _correct(C_a, samples, row + 1, accel_bias, f_1)
+        _rotation(phi, E, J)
+        _multiply(R, E, next_R)
+        _acceleration_derivatives(R, next_R, f_0, f_1, E, J, dt, by_theta, by_gyro, by_accel)
+        _noise_gain(by_gyro, J, C_g, dt, gyro_gain)
+        _noise_gain(by_accel, zero, C_a, dt, accel_gain)
+        _transition(P, E, by_theta, dt)  # F P
+        _transpose(P)
+        _transition(P, E, by_theta, dt)  # F (F P)^T
+        _add_noise(P, gyro_gain, noise[0] / dt)
+        _add_noise(P, accel_gain, noise[1] / dt)
+        _transition(D, E, by_theta, dt)
+        for i in range(9):
+            for j in range(3):
+                D[i, j] -= gyro_gain[i, j]
+                D[i, 3 + j] -= accel_gain[i, j]
+        _advance(R, next_R, f_0, f_1, dt, v, p)
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = next_R[i, j]
+    for i in range(9):
+        for j in range(i):
+            P[i, j] = 0.5 * (P[i, j] + P[j, i])
+            P[j, i] = P[i, j]
+
+
+@compiled()
+def _propagate_edge(
+    stamps: I64,
+    samples: F64,
+    gyro_bias: F64,
+    accel_bias: F64,
+    C_g: F64,
+    C_a: F64,
+    gravity: F64,
+    rotation: F64,
+    velocity: F64,
+    position: F64,
+) -> None:
+    """Predict the states at the samples of one edge from the first row; see `propagate`."""
+    E, J = np.empty((3, 3)), np.empty((3, 3))
+    phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
+    for row in range(len(stamps) - 1):
+        dt = (stamps[row + 1] - stamps[row]) * 1e-9
+        _mean_rotation(C_g, samples, row, gyro_bias, dt, phi)
+        _correct(C_a, samples, row, accel_bias, f_0)
+        _correct(C_a, samples, row + 1, accel_bias, f_1)
+        _rotation(phi, E, J)
+        _multiply(rotation[row], E, rotation[row + 1])
+        v, p = velocity[row + 1], position[row + 1]
+        for i in range(3):
+            v[i] = velocity[row, i]
+            p[i] = position[row, i]
+        _advance(rotation[row], rotation[row + 1], f_0, f_1, dt, v, p)
+        for i in range(3):
+            p[i] += 0.5 * dt * dt * gravity[i]
+            v[i] += dt * gravity[i]
+
+
+# -- all edges: each is summed in order by one thread, so the thread count changes no bit ----------
 
 
 @compiled(parallel=True)
@@ -202,7 +299,7 @@ def preintegrate(
     covariance: F64,
     bias_jacobian: F64,
 ) -> None:
-    """Integrate all edges; edges are shared among threads, each one is summed in order.
+    """Integrate all edges.
 
     Args:
         start: Offsets (E + 1,) of the edges' samples.
@@ -214,7 +311,7 @@ def preintegrate(
         gyro_corrections: T_g^-1 (K, 3, 3).
         accel_corrections: (T_a R_A_I)^-1 (K, 3, 3).
         noise: Squared densities (K, 2) of gyroscope and accelerometer.
-        rotation: Result (E, 3, 3), change of orientation.
+        rotation: Result (E, 3, 3), change of orientation; all results are given as zeros.
         velocity: Result (E, 3).
         position: Result (E, 3).
         covariance: Result (E, 9, 9), order p, theta, v.
@@ -222,42 +319,20 @@ def preintegrate(
     """
     for edge in numba.prange(len(start) - 1):
         imu = imu_of_edge[edge]
-        C_g, C_a = gyro_corrections[imu], accel_corrections[imu]
-        R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
-        P, D = np.zeros((9, 9)), np.zeros((9, 6))
-        E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        by_theta, by_gyro, by_accel = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        zero = np.zeros((3, 3))
-        gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
-        phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
-        for row in range(start[edge], start[edge + 1] - 1):
-            dt = (stamps[row + 1] - stamps[row]) * 1e-9
-            if dt <= 0.0:
-                continue
-            _mean_rotation(C_g, samples, row, gyro_bias[edge], dt, phi)
-            _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
-            _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
-            _rotation(phi, E, J)
-            _multiply(R, E, next_R)
-            _acceleration_derivatives(R, next_R, f_0, f_1, E, J, dt, by_theta, by_gyro, by_accel)
-            _noise_gain(by_gyro, J, C_g, dt, gyro_gain)
-            _noise_gain(by_accel, zero, C_a, dt, accel_gain)
-            _transition(P, E, by_theta, dt)  # F P
-            for i in range(9):
-                for j in range(i):
-                    P[i, j], P[j, i] = P[j, i], P[i, j]
-            _transition(P, E, by_theta, dt)  # F (F P)^T
-            _add_noise(P, gyro_gain, noise[imu, 0] / dt)
-            _add_noise(P, accel_gain, noise[imu, 1] / dt)
-            _transition(D, E, by_theta, dt)
-            for i in range(9):
-                for j in range(3):
-                    D[i, j] -= gyro_gain[i, j]
-                    D[i, 3 + j] -= accel_gain[i, j]
-            _advance(R, next_R, f_0, f_1, dt, v, p)
-            R[:] = next_R
-        rotation[edge], velocity[edge], position[edge] = R, v, p
-        covariance[edge], bias_jacobian[edge] = 0.5 * (P + P.T), D
+        _preintegrate_edge(
+            stamps[start[edge] : start[edge + 1]],
+            samples[start[edge] : start[edge + 1]],
+            gyro_bias[edge],
+            accel_bias[edge],
+            gyro_corrections[imu],
+            accel_corrections[imu],
+            noise[imu],
+            rotation[edge],
+            velocity[edge],
+            position[edge],
+            covariance[edge],
+            bias_jacobian[edge],
+        )
 
 
 @compiled(parallel=True)
@@ -285,20 +360,15 @@ def propagate(
     """
     for edge in numba.prange(len(start) - 1):
         imu = imu_of_edge[edge]
-        C_g, C_a = gyro_corrections[imu], accel_corrections[imu]
-        E, J = np.empty((3, 3)), np.empty((3, 3))
-        phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
-        for row in range(start[edge], start[edge + 1] - 1):
-            dt = (stamps[row + 1] - stamps[row]) * 1e-9
-            _mean_rotation(C_g, samples, row, gyro_bias[edge], dt, phi)
-            _correct(C_a, samples, row, 0, accel_bias[edge], f_0)
-            _correct(C_a, samples, row + 1, 0, accel_bias[edge], f_1)
-            _rotation(phi, E, J)
-            _multiply(rotation[row], E, rotation[row + 1])
-            velocity[row + 1] = velocity[row]
-            position[row + 1] = position[row]
-            v, p = velocity[row + 1], position[row + 1]
-            _advance(rotation[row], rotation[row + 1], f_0, f_1, dt, v, p)
-            for i in range(3):
-                p[i] += 0.5 * dt * dt * gravity[i]
-                v[i] += dt * gravity[i]
+        _propagate_edge(
+            stamps[start[edge] : start[edge + 1]],
+            samples[start[edge] : start[edge + 1]],
+            gyro_bias[edge],
+            accel_bias[edge],
+            gyro_corrections[imu],
+            accel_corrections[imu],
+            gravity,
+            rotation[start[edge] : start[edge + 1]],
+            velocity[start[edge] : start[edge + 1]],
+            position[start[edge] : start[edge + 1]],
+        )

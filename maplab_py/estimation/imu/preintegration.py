@@ -61,8 +61,8 @@ def integrate(data: InertialData, gyro_bias: F64, accel_bias: F64) -> Preintegra
     edges = len(data)
     b_g = np.array(np.broadcast_to(gyro_bias, (edges, 3)), dtype=np.float64)
     b_a = np.array(np.broadcast_to(accel_bias, (edges, 3)), dtype=np.float64)
-    rotation, dv, dp = np.empty((edges, 3, 3)), np.empty((edges, 3)), np.empty((edges, 3))
-    covariance, bias_jacobian = np.empty((edges, 9, 9)), np.empty((edges, 9, 6))
+    rotation, dv, dp = np.zeros((edges, 3, 3)), np.zeros((edges, 3)), np.zeros((edges, 3))
+    covariance, bias_jacobian = np.zeros((edges, 9, 9)), np.zeros((edges, 9, 6))
     kernels.preintegrate(
         data.sample_start,
         data.timestamp_ns,
