@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from maplab_py.errors import UserError
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.queries import coobservation_counts, find_mission, observer_counts
+from maplab_py.vimap.statistics import coobservability, map_statistics
+from tests.vimap.builders import walk_map
+
+
+def test_missions_are_found_by_prefix():
+    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    names = [to_hex(row) for row in m.missions.id]
+    assert [find_mission(m, name[:12].upper()) for name in names] == [0, 1]
+    for wrong in ("", "zz", names[0] + "0"):
+        with pytest.raises(UserError, match=names[1]):
+            find_mission(m, wrong)
+
+
+def test_an_ambiguous_prefix_lists_the_candidates():
+    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    ids = m.missions.id.copy()
+    ids[1, 0] = ids[0, 0]
+    m = m.replace(missions=m.missions.replace(id=ids))
+    with pytest.raises(UserError, match="ambiguous"):
+        find_mission(m, to_hex(ids[0])[:16])
+
+
+def test_a_map_without_missions_says_so():
+    with pytest.raises(UserError, match="no missions"):
+        find_mission(VIMap(), "0")
+    assert check_consistency(VIMap()).failure == ""
+    assert map_statistics(VIMap()).missions == ()
+
+
+def test_statistics_add_up():
+    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    report = map_statistics(m)
+    assert sum(s.observations for s in report.missions) == len(m.observations)
+    assert sum(s.landmarks_good for s in report.missions) == len(m.landmarks)
+    assert report.total is not None
+    assert report.total.vertices == len(m.vertices)
+    assert len(coobservability(m).clusters) == 2
+    seen = np.diff(m.observation_start) > 0
+    assert coobservation_counts(m).trace() == np.count_nonzero(seen)
+    np.testing.assert_array_equal(observer_counts(m), np.diff(m.observation_start))
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "rule"),
+    [
+        ("vertices", "T_M_I", np.nan, "non-finite"),
+        ("vertices", "T_M_I", 2.0, "unit length"),
+        ("landmarks", "p_I", np.inf, "non-finite"),
+        ("landmarks", "vertex", 99, "without store vertex"),
+        ("keypoints", "landmark", 99, "not there"),
+        ("vertices", "timestamp_ns", 10**12, "out of order"),
+        ("imu_samples", "timestamp_ns", 10**12, "do not increase"),
+        ("missions", "sensor_id", 5, "not in sensors.yaml"),
+        ("missions", "root_vertex", 3, "root"),
+        ("imu_edges", "to_vertex", 0, "itself"),
+        ("loop_closure_edges", "switch_variable", 1.5, "switch variable"),
+    ],
+)
+def test_what_is_wrong_is_named(table, column, value, rule):
+    m = walk_map()
+    rows = getattr(m, table)
+    values = rows.columns()[column].copy()
+    values[0] = value
+    report = check_consistency(m.replace(**{table: rows.replace(**{column: values})}))
+    assert any(rule in violation.rule for violation in report.errors), report.errors
+    assert report.failure
+
+
+def test_double_ids_and_gaps_are_found():
+    m = walk_map()
+    ids = m.landmarks.id.copy()
+    ids[4] = ids[3]
+    twice = check_consistency(m.replace(landmarks=m.landmarks.replace(id=ids)))
+    assert [v.rule for v in twice.errors] == ["landmark id that is there twice"]
+    cut = m.replace(transformation_edges=m.transformation_edges.take([0]))
+    keep = np.arange(len(m.imu_edges)) != 6
+    samples = np.repeat(keep, m.imu_edges.sample_count)
+    cut = cut.replace(imu_edges=m.imu_edges.take(keep), imu_samples=m.imu_samples.take(samples))
+    (violation,) = check_consistency(cut).errors
+    assert violation.where == (to_hex(m.vertices.id[6]),)
