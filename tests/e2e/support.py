@@ -30,7 +30,11 @@ def environment(home: Path, **extra: str) -> dict[str, str]:
 
 
 def run_program(
-    home: Path, *arguments: str, text: str = "", extra: Mapping[str, str] | None = None
+    home: Path,
+    *arguments: str,
+    text: str = "",
+    extra: Mapping[str, str] | None = None,
+    seconds: float = 120,
 ) -> subprocess.CompletedProcess[str]:
     """Run the program to its end with `text` on its standard input."""
     return subprocess.run(
@@ -38,7 +42,7 @@ def run_program(
         input=text,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=seconds,
         cwd=home,
         env=environment(home, **(extra or {})),
         check=False,
