@@ -1,0 +1,67 @@
+"""Leaving with unsaved changes, with a stranger's plugin that makes some."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.support import Console, run_program
+from tests.support.data import REPOSITORY
+
+
+@pytest.fixture
+def with_plugin(tmp_path: Path) -> dict[str, str]:
+    """Install the sample plugin for the child process: a distribution with an entry point."""
+    distribution = tmp_path / "site" / "sample_plugin-1.0.dist-info"
+    distribution.mkdir(parents=True)
+    (distribution / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: sample-plugin\nVersion: 1.0\n"
+    )
+    (distribution / "entry_points.txt").write_text(
+        "[maplab_py.plugins]\nsample = tests.console.sample_plugin\n"
+    )
+    return {"PYTHONPATH": f"{tmp_path / 'site'}:{REPOSITORY}"}
+
+
+def test_ctrl_d_with_unsaved_changes_asks(tmp_path: Path, with_plugin: dict[str, str]) -> None:
+    console = Console(tmp_path, **with_plugin)
+    console.wait_for_prompt()
+    console.enter("create_new_map a; add_mission")
+    console.wait_for_prompt("maplab <a>*:/$")
+    console.type("\x04")
+    console.wait_for_text("unsaved changes in a; leave without saving? [y/N]")
+    console.enter("n")
+    console.wait_for_prompt("maplab <a>*:/$")
+    console.enter("undo")
+    console.wait_for_prompt("maplab <a>:/$")
+    console.enter("redo")
+    console.wait_for_prompt("maplab <a>*:/$")
+    console.enter("quit")
+    console.wait_for(lambda _: console.last_line.endswith("leave without saving? [y/N]"))
+    console.enter("y")
+    assert console.status() == 0
+
+
+def test_a_script_fails_with_unsaved_changes(tmp_path: Path, with_plugin: dict[str, str]) -> None:
+    script = "create_new_map a; add_mission"
+    done = run_program(tmp_path, "-c", script, extra=with_plugin)
+    assert done.returncode == 2
+    assert "unsaved changes are lost: a (save them, or give --discard)" in done.stderr
+    assert run_program(tmp_path, "-c", script, "--discard", extra=with_plugin).returncode == 0
+
+
+def test_a_strangers_command_runs_from_the_shell(
+    tmp_path: Path, with_plugin: dict[str, str]
+) -> None:
+    done = run_program(tmp_path, "solve", "--ba-num-iterations", "3", extra=with_plugin)
+    assert (done.returncode, "num iterations  3" in done.stdout) == (0, True)
+    done = run_program(tmp_path, "find_nothing", extra=with_plugin)
+    assert done.returncode == 1
+    done = run_program(
+        tmp_path, "-c", "create_new_map a; fail_after_commit --how=program", extra=with_plugin
+    )
+    assert done.returncode == 1
+    assert len([line for line in done.stderr.splitlines() if "ZeroDivisionError" in line]) == 1
+    assert "maplab.log" in done.stderr
+    assert "Traceback" not in done.stderr
