@@ -1,0 +1,1 @@
+"""Anchoring: find how missions of unknown base frame lie among the known ones."""

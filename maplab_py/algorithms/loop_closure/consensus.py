@@ -1,0 +1,110 @@
+"""Which closures can be right together: neighbours along the way must agree in yaw and position.
+
+A closure i of a query in mission A with a place in mission B says how frame A lies in B. Two
+closures of the same pair of missions agree when both lay a query at the same spot, up to the drift
+on the way between the queries and between the places (Mangelson et al., ICRA 2018: pairwise
+consistency, here with neighbours only).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3, yaw
+from maplab_py.vimap import VIMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_WINDOW = 60
+"""Closures along the query's way that are compared with each one, before and after."""
+_REACH_M = 15.0
+"""Farther along the way closures say nothing about each other."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ConsensusRule:
+    """When two closures agree, and how many must."""
+
+    position_tolerance_m: float = 0.15
+    yaw_tolerance_rad: float = 0.04
+    drift_ratio: float = 0.02  # of the way between the queries plus that between the places
+    min_support: int = 2
+    lone_inliers: int = 50  # a closure without any neighbour needs as many inliers
+
+
+def path_lengths(vi_map: VIMap) -> F64:
+    """Return the way (V,) [m] along its mission from the first vertex to each."""
+    p, mission = vi_map.vertices.T_M_I[:, 4:], vi_map.vertices.mission
+    step = np.zeros(len(p))
+    step[1:] = np.linalg.norm(np.diff(p, axis=0), axis=1) * (mission[1:] == mission[:-1])
+    total = np.cumsum(step)
+    first = vi_map.vertex_start[:-1][mission] if len(p) else np.zeros(0, dtype=np.int64)
+    return np.asarray(total - total[first])
+
+
+def check_consensus(
+    vi_map: VIMap,
+    query_vertex: I64,
+    place_vertex: I64,
+    T_M_I: F64,
+    inliers: I64,
+    rule: ConsensusRule,
+) -> tuple[I64, Mask, Mask]:
+    """Return support (N,), and which closures are supported and which contradicted (N,)."""
+    count = len(query_vertex)
+    mission = vi_map.vertices.mission
+    pair = mission[query_vertex].astype(np.int64) * len(vi_map.missions) + mission[place_vertex]
+    way = path_lengths(vi_map)
+    order = np.lexsort((place_vertex, way[query_vertex], pair))
+    T_A_I = vi_map.vertices.T_M_I[query_vertex]
+    alive = np.ones(count, dtype=np.bool_)
+    # a wrong closure may speak against right ones: judge twice, the second time by survivors only
+    for _ in range(2):
+        support, for_, against = _votes(
+            order, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, inliers, alive, rule
+        )
+        contradicted = against > for_
+        alive = alive & ~contradicted & (support > 0)
+    lone = (support == 0) & (against == 0) & (inliers >= rule.lone_inliers)
+    supported = (support >= rule.min_support) | lone
+    return support, supported, contradicted
+
+
+def _votes(
+    order: I64,
+    pair: I64,
+    way: F64,
+    query: I64,
+    place: I64,
+    T_A_I: F64,
+    T_B_I: F64,
+    inliers: I64,
+    alive: Mask,
+    rule: ConsensusRule,
+) -> tuple[I64, F64, F64]:
+    """Return support by distinct query vertices, and the inliers that speak for and against."""
+    count = len(query)
+    support = np.zeros(count, dtype=np.int64)
+    for_, against = inliers.astype(np.float64), np.zeros(count)
+    E = yaw.from_pose(se3.compose(T_B_I, se3.inverse(T_A_I)))  # frame A in frame B
+    for step in range(1, min(_WINDOW, count - 1) + 1):
+        for i, j in ((order[:-step], order[step:]), (order[step:], order[:-step])):
+            between = np.abs(way[query[i]] - way[query[j]])
+            near = (pair[i] == pair[j]) & (between < _REACH_M) & alive[j]
+            between_places = np.abs(way[place[i]] - way[place[j]])
+            # where closure j would put query i
+            p = yaw.transform(E[j], T_A_I[i, 4:])
+            drift = rule.drift_ratio * (between + np.minimum(between_places, between + _REACH_M))
+            agrees = (
+                np.linalg.norm(p - T_B_I[i, 4:], axis=1) < rule.position_tolerance_m + drift
+            ) & (np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.yaw_tolerance_rad + 0.1 * drift)
+            other = query[i] != query[j]
+            support[i] += near & agrees & other
+            for_[i] += np.where(near & agrees, inliers[j], 0)
+            against[i] += np.where(near & ~agrees & (between < 3.0), inliers[j], 0)
+    return support, for_, against

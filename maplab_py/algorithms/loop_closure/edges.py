@@ -1,0 +1,56 @@
+"""Loop closure edges of verified closures, with the covariance that verification gives."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.geometry import se3, so3
+from maplab_py.vimap import LoopClosureEdges, VIMap
+from maplab_py.vimap.edits import content_rng
+from maplab_py.vimap.ids import random_ids
+
+F64 = NDArray[np.float64]
+
+_FLOOR_STD = np.array([0.01, 0.01, 0.01, 0.002, 0.002, 0.002])
+"""[m, rad] What points of a map err in common, which their matches do not show."""
+
+
+def closure_edges(
+    vi_map: VIMap, closures: Closures, options: LoopClosureOptions
+) -> LoopClosureEdges:
+    """Return one edge per accepted closure, from the query vertex (A) to the place's vertex (B).
+
+    Closures that correct less than `edge_min_distance_meters` get none.
+    """
+    enough = closures.correction_m >= options.edge_min_distance_meters
+    rows = np.flatnonzero(closures.accepted & enough)
+    T_M_A = closures.T_M_I[rows]
+    T_A_B = se3.relative(T_M_A, vi_map.vertices.T_M_I[closures.place_vertex[rows]])
+    covariance = _of_relative_pose(closures.covariance[rows], T_M_A, T_A_B)
+    covariance += np.diag(_FLOOR_STD**2)
+    return LoopClosureEdges.filled(
+        len(rows),
+        id=random_ids(len(rows), content_rng(vi_map, "loop closure edges")),
+        from_vertex=closures.query_vertex[rows],
+        to_vertex=closures.place_vertex[rows],
+        T_A_B=T_A_B,
+        covariance=options.edge_covariance_scaler * covariance,
+        switch_variable_variance=np.full(len(rows), options.switch_variable_variance),
+    )
+
+
+def _of_relative_pose(covariance: F64, T_M_A: F64, T_A_B: F64) -> F64:
+    """Turn the covariance of T_M_A into that of T_A_B = T_M_A^-1 T_M_B, T_M_B being fixed.
+
+    With t <- t + dp, R <- R exp(d): p_A_B changes by -R^T dp + [p_A_B]x d, the attitude by -R_B_A d.
+    """
+    J = np.zeros((len(T_M_A), 6, 6))
+    J[:, :3, :3] = -so3.to_matrix(so3.inverse(T_M_A[:, :4]))
+    J[:, :3, 3:] = so3.skew(T_A_B[:, 4:])
+    J[:, 3:, 3:] = -so3.to_matrix(so3.inverse(T_A_B[:, :4]))
+    # matches err together, as neighbours share landmarks: count each closure as a few of them
+    turned = J @ covariance @ np.swapaxes(J, 1, 2)
+    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))

@@ -1,0 +1,126 @@
+"""Which landmarks of verified closures are one point, and uniting them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.geometry import se3
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import merge_landmarks
+from maplab_py.vision.track_union import unite_tracks
+
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
+
+FEW_OBSERVATIONS = "too few verified observations agree"
+TOO_FAR = "too far apart once the closure is applied"
+SAME_IMAGE = "both seen in one image"
+GAP = "the closure corrects too much: relax first"
+UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
+
+
+@dataclasses.dataclass(frozen=True)
+class MergeResult:
+    """What merging did."""
+
+    landmarks_merged: int = 0
+    observations_moved: int = 0
+    keypoints_attached: int = 0
+    refused: dict[str, int] = dataclasses.field(default_factory=dict)  # landmark pairs by reason
+
+
+def merge_verified_landmarks(
+    vi_map: VIMap, closures: Closures, options: LoopClosureOptions
+) -> tuple[VIMap, MergeResult]:
+    """Unite the landmarks of query keypoints with the database landmarks that they were matched to."""
+    refused: dict[str, int] = {}
+    closure = np.repeat(np.arange(len(closures)), np.diff(closures.start))
+    source = vi_map.keypoints.landmark[closures.keypoint].astype(np.int64)
+    open_ = closures.accepted[closure] & (source >= 0) & (source != closures.landmark)
+
+    def refuse(reason: str, mask: NDArray[np.bool_]) -> None:
+        if mask.any():
+            pairs = np.stack([source[mask], closures.landmark[mask]], axis=1)
+            refused[reason] = len(np.unique(pairs, axis=0))
+
+    unknown = open_ & ~_mergeable(vi_map, closures)[closure]
+    refuse(UNKNOWN_BASE_FRAME, unknown)
+    open_ &= ~unknown
+    gap = open_ & (closures.correction_m[closure] > options.max_merge_gap_m)
+    refuse(GAP, gap)
+    open_ &= ~gap
+    rows = np.flatnonzero(open_)
+    far = _distances(vi_map, closures, closure[rows], rows, source[rows])
+    far_rows = rows[far > options.max_merge_distance_m]
+    mask = np.zeros(len(source), dtype=np.bool_)
+    mask[far_rows] = True
+    refuse(TOO_FAR, mask)
+    rows = rows[far <= options.max_merge_distance_m]
+
+    first, second, votes, bits = _pairs(
+        source[rows], closures.landmark[rows], closures.query_vertex[closure[rows]],
+        closures.bits[rows], len(vi_map.landmarks),
+    )  # fmt: skip
+    enough = votes >= options.min_merge_observations
+    if not enough.all():
+        refused[FEW_OBSERVATIONS] = int(np.count_nonzero(~enough))
+    order = np.lexsort((second, first, bits, -votes))
+    order = order[enough[order]]
+    first, second = first[order], second[order]
+    image = vi_map.keypoint_frame[vi_map.observations].astype(np.int64)
+    fits = unite_tracks(first, second, vi_map.observation_start, image, len(vi_map.frames))
+    if not fits.all():
+        refused[SAME_IMAGE] = int(np.count_nonzero(~fits))
+    merged = merge_landmarks(vi_map, first[fits], second[fits])
+    moved = np.isin(vi_map.keypoints.landmark, first[fits])
+    return merged, MergeResult(
+        landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
+        observations_moved=int(np.count_nonzero(moved)),
+        refused=refused,
+    )
+
+
+def _mergeable(vi_map: VIMap, closures: Closures) -> NDArray[np.bool_]:
+    """Tell which closures lie in one mission, or join two with known base frames."""
+    query = vi_map.vertices.mission[closures.query_vertex]
+    place = vi_map.vertices.mission[closures.place_vertex]
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    return np.asarray((query == place) | (known[query] & known[place]))
+
+
+def _distances(vi_map: VIMap, closures: Closures, closure: I64, rows: I64, source: I64) -> F64:
+    """Return how far apart (N,) the landmarks are once the query is where verification put it."""
+    query = closures.query_vertex[closure]
+    p_I = se3.transform(se3.inverse(vi_map.T_G_I[query]), vi_map.p_G[source])
+    mission = vi_map.vertices.mission[closures.place_vertex[closure]]
+    p_M = se3.transform(closures.T_M_I[closure], p_I)
+    target_M = se3.transform(
+        se3.inverse(vi_map.T_G_M)[mission], vi_map.p_G[closures.landmark[rows]]
+    )
+    return np.asarray(np.linalg.norm(p_M - target_M, axis=1))
+
+
+def _pairs(
+    source: I64, target: I64, query: I64, bits: NDArray[np.int32], size: int
+) -> tuple[I64, I64, I64, F64]:
+    """Return pairs of landmarks, how many query vertices say so, and their mean bits.
+
+    A pair is the same in both directions; the row that is larger merges into the smaller one.
+    """
+    first, second = np.maximum(source, target), np.minimum(source, target)
+    key = first * size + second
+    (
+        key,
+        inverse,
+    ) = np.unique(key, return_inverse=True)
+    seen = np.unique(inverse.astype(np.int64) * (query.max(initial=0) + 1) + query)
+    votes = np.bincount(seen // (query.max(initial=0) + 1), minlength=len(key))
+    mean = np.bincount(inverse, weights=bits, minlength=len(key)) / np.maximum(
+        np.bincount(inverse, minlength=len(key)), 1
+    )
+    return key // size, key % size, votes.astype(np.int64), mean

@@ -1,0 +1,124 @@
+"""Absolute pose of a camera rig from matches of keypoints with points, many queries at once.
+
+Two matches and the direction of gravity give yaw and position (a quadratic), so that few random
+samples suffice even among many wrong matches; every better hypothesis is refined with all six
+degrees of freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3, so3
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseProblems:
+    """Matches of many queries: those of query p are rows start[p] .. start[p + 1] - 1.
+
+    Within a query, rows are sorted by keypoint; several points may compete for one keypoint.
+    """
+
+    start: I64  # (P + 1,)
+    key: I64  # (P,) names a problem: with the seed it decides its random numbers
+    q_M_I: F64  # (P, 4) attitude of the query in a gravity-aligned frame; its yaw does not matter
+    origin_I: F64  # (N, 3) camera centres in the query's body frame [m]
+    ray_I: F64  # (N, 3) unit rays of the keypoints in the body frame
+    point_M: F64  # (N, 3) matched points in the gravity-aligned frame of the points [m]
+    keypoint: I64  # (N,)
+    tolerance: F64  # (N,) tangent of the largest angle between an inlier's ray and its point
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseSolutions:
+    """Poses found; a query without solution has no inliers."""
+
+    T_M_I: F64  # (P, 7)
+    inlier_count: I64  # (P,) keypoints that agree with the pose
+    keypoint_count: I64  # (P,) keypoints that had a match
+    is_inlier: NDArray[np.bool_]  # (N,) one match at most per keypoint
+    rms: F64  # (P,) error of the inliers in units of the tolerance
+    covariance: F64  # (P, 6, 6) of [dp, dtheta] in the convention of `se3`, NaN where undetermined
+    tilt_rad: F64  # (P,) angle between gravity as given and as found
+
+
+def solve_poses(
+    problems: PoseProblems,
+    *,
+    seed: int = 0,
+    max_iterations: int = 200,
+    tilt_sigma_rad: float = 0.02,
+) -> PoseSolutions:
+    """Find the pose of every query. Deterministic in the seed, for any thread count.
+
+    Args:
+        problems: The matches.
+        seed: Seed of the random samples.
+        max_iterations: Most samples per query; fewer are drawn when inliers abound.
+        tilt_sigma_rad: Standard deviation of the given roll and pitch.
+    """
+    from maplab_py.vision.pose_kernels import search_poses
+
+    count, matches = len(problems.key), len(problems.keypoint)
+    of_match = np.repeat(np.arange(count), np.diff(problems.start))
+    q_W_I = problems.q_M_I  # W: the frame of the attitude, with its origin at the body
+    origin_W = so3.rotate(q_W_I[of_match], problems.origin_I)
+    ray_W = so3.rotate(q_W_I[of_match], problems.ray_I)
+    R, t, H = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 6, 6))
+    cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
+    is_inlier = np.zeros(matches, dtype=np.bool_)
+    search_poses(
+        problems.start, _mixed_seeds(problems.key, seed), origin_W, ray_W,
+        np.ascontiguousarray(problems.point_M), problems.keypoint, 1.0 / problems.tolerance,
+        max_iterations, 1.0 / tilt_sigma_rad, R, t, H, cost, inliers,
+        np.empty(count, dtype=np.int64), is_inlier,
+    )  # fmt: skip
+    is_first = np.ones(matches, dtype=np.bool_)
+    is_first[1:] = (of_match[1:] != of_match[:-1]) | (
+        problems.keypoint[1:] != problems.keypoint[:-1]
+    )
+    keypoints = np.bincount(of_match[is_first], minlength=count)
+    inlier_cost = np.maximum(cost - (keypoints - inliers), 0.0)
+    T_M_W = se3.make(so3.from_matrix(R), t)
+    T_W_I = se3.make(q_W_I, np.zeros((count, 3)))
+    return PoseSolutions(
+        T_M_I=se3.compose(T_M_W, T_W_I),
+        inlier_count=inliers,
+        keypoint_count=keypoints,
+        is_inlier=is_inlier,
+        rms=np.sqrt(inlier_cost / np.maximum(inliers, 1)),
+        covariance=_covariances(H, q_W_I),
+        tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)),
+    )
+
+
+def _covariances(H: F64, q_W_I: F64) -> F64:
+    """Invert the information (P, 6, 6) of [dp, dtheta_W] and turn dtheta to I."""
+    H = 0.5 * (H + np.swapaxes(H, 1, 2))
+    scale = np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
+    scaled = H / (scale[:, :, None] * scale[:, None, :])
+    determined = np.all(np.isfinite(scaled), axis=(1, 2))
+    determined &= np.linalg.eigvalsh(np.where(determined[:, None, None], scaled, 0.0))[:, 0] > 1e-10
+    scaled = np.where(determined[:, None, None], scaled, np.eye(6))
+    covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    turn = np.zeros_like(H)
+    turn[:, :3, :3] = np.eye(3)
+    turn[:, 3:, 3:] = so3.to_matrix(so3.inverse(q_W_I))
+    covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
+    covariance[~determined] = np.nan
+    return np.asarray(covariance)
+
+
+def _mixed_seeds(key: I64, seed: int) -> NDArray[np.uint64]:
+    """Return one well-mixed random state per problem (splitmix64's finaliser)."""
+    with np.errstate(over="ignore"):
+        z = key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed % 2**63)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return np.asarray(z ^ (z >> np.uint64(31)))

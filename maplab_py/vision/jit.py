@@ -1,0 +1,34 @@
+"""The decorator that compiles this package's kernels with numba and keeps them on disk.
+
+The cache entry of a kernel is valid as long as its source FILE keeps its time stamp; edits of
+jitted functions in other files go unseen. So compiled functions that call each other live in one
+file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that compiles a function at its first call and caches it on disk.
+
+    Where no folder can be written the function is compiled anew in every process.
+
+    Args:
+        settings: Further settings of `numba.njit`, e.g. `parallel=True`.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return numba.njit(cache=True, **settings)(function)  # type: ignore[no-any-return]
+        except RuntimeError:  # numba: "cannot cache function: no locator available"
+            return numba.njit(**settings)(function)  # type: ignore[no-any-return]
+
+    return decorate
+
+
+prange: Any = numba.prange

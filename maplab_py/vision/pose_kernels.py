@@ -1,0 +1,256 @@
+"""Compiled kernels of the absolute pose search: two-point hypotheses, scoring, refinement.
+
+W is the query's body frame turned so that its z axis points up; M is the gravity-aligned frame of
+the points. Hypotheses are yaw and position of T_M_W; the refinement frees roll and pitch, held by
+a prior.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.vision.jit import compiled, prange
+
+_MIN_DEPTH_M = 0.05
+_CONFIDENCE = 0.999
+
+
+@compiled(inline="always")
+def _next_random(state):  # type: ignore[no-untyped-def]
+    """Advance a splitmix64 generator (Steele et al., OOPSLA 2014) and return its next word."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = state[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled()
+def _two_point(o1, f1, X1, o2, f2, X2, yaw, position):  # type: ignore[no-untyped-def]
+    """Fill in up to two solutions of Rz(yaw) (o_i + depth_i f_i) + position = X_i; return how many.
+
+    The z components make the depths a line, depth(s) = base + s u; the horizontal distance of
+    the two points then is a quadratic in s.
+    """
+    n = np.sqrt(f1[2] * f1[2] + f2[2] * f2[2])
+    if n < 1e-3:
+        return 0
+    c = (X1[2] - X2[2] - o1[2] + o2[2]) / (n * n)
+    base1, base2 = c * f1[2], -c * f2[2]
+    u1, u2 = f2[2] / n, f1[2] / n
+    ax = o1[0] - o2[0] + base1 * f1[0] - base2 * f2[0]
+    ay = o1[1] - o2[1] + base1 * f1[1] - base2 * f2[1]
+    bx, by = u1 * f1[0] - u2 * f2[0], u1 * f1[1] - u2 * f2[1]
+    dx, dy = X1[0] - X2[0], X1[1] - X2[1]
+    qa = bx * bx + by * by
+    qb = ax * bx + ay * by
+    qc = ax * ax + ay * ay - dx * dx - dy * dy
+    discriminant = qb * qb - qa * qc
+    if qa < 1e-12 or discriminant < 0.0:
+        return 0
+    root = np.sqrt(discriminant)
+    count = 0
+    for sign in (-1.0, 1.0):
+        s = (-qb + sign * root) / qa
+        depth1, depth2 = base1 + s * u1, base2 + s * u2
+        if depth1 < _MIN_DEPTH_M or depth2 < _MIN_DEPTH_M:
+            continue
+        vx, vy = ax + s * bx, ay + s * by
+        phi = np.arctan2(dy, dx) - np.arctan2(vy, vx)
+        cos, sin = np.cos(phi), np.sin(phi)
+        px, py = o1[0] + depth1 * f1[0], o1[1] + depth1 * f1[1]
+        yaw[count] = phi
+        position[count, 0] = X1[0] - (cos * px - sin * py)
+        position[count, 1] = X1[1] - (sin * px + cos * py)
+        position[count, 2] = X1[2] - (o1[2] + depth1 * f1[2])
+        count += 1
+    return count
+
+
+@compiled()
+def _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, best_match):  # type: ignore[no-untyped-def]
+    """Return the MSAC cost of a pose and the number of inlying keypoints.
+
+    Of a keypoint's candidate points only the best counts; `best_match` (one per match row) marks
+    it where it is an inlier. Errors are in units of the threshold.
+    """
+    cost, inliers = 0.0, 0
+    i = begin
+    while i < end:
+        best, best_row = 1.0, -1
+        j = i
+        while j < end and keypoint[j] == keypoint[i]:
+            best_match[j] = False
+            x, y, z = point[j, 0] - t[0], point[j, 1] - t[1], point[j, 2] - t[2]
+            cx = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z - origin[j, 0]
+            cy = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z - origin[j, 1]
+            cz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z - origin[j, 2]
+            along = cx * ray[j, 0] + cy * ray[j, 1] + cz * ray[j, 2]
+            if along > _MIN_DEPTH_M:
+                # tan^2 of the angle to the ray
+                square = (cx * cx + cy * cy + cz * cz - along * along) / (along * along)
+                error = square * inverse_sigma[j] * inverse_sigma[j]
+                if error < best:
+                    best, best_row = error, j
+            j += 1
+        cost += best
+        if best_row >= 0:
+            inliers += 1
+            best_match[best_row] = True
+        i = j
+    return cost, inliers
+
+
+@compiled()
+def _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g):  # type: ignore[no-untyped-def]
+    """Fill in the normal equations of the bearing errors in [dp (M), dtheta (W)]."""
+    H[:] = 0.0
+    g[:] = 0.0
+    J = np.empty((3, 6))
+    for j in range(begin, end):
+        if not used[j]:
+            continue
+        q = R.T @ (point[j] - t)
+        c = q - origin[j]
+        length = np.sqrt(c @ c)
+        d = c / length
+        w = inverse_sigma[j]
+        # error: component of d across the ray; projecting out the ray keeps two dimensions
+        P = np.eye(3) - np.outer(ray[j], ray[j])
+        D = P @ (np.eye(3) - np.outer(d, d)) * (w / length)
+        K = np.array([[0.0, -q[2], q[1]], [q[2], 0.0, -q[0]], [-q[1], q[0], 0.0]])
+        J[:, :3] = -(D @ R.T)
+        J[:, 3:] = D @ K
+        e = P @ d * w
+        H += J.T @ J
+        g += J.T @ e
+    # prior: the z axis of W stays up in M
+    for i in range(2):
+        row = np.zeros(6)
+        # d(R e_z)/dtheta = -R [e_z]x
+        row[3] = -R[i, 1] * inverse_tilt
+        row[4] = R[i, 0] * inverse_tilt
+        e = R[i, 2] * inverse_tilt
+        H += np.outer(row, row)
+        g += row * e
+
+
+@compiled()
+def _retract(R, t, step):  # type: ignore[no-untyped-def]
+    """Apply [dp, dtheta] in place: t <- t + dp, R <- R exp(dtheta)."""
+    t += step[:3]
+    x, y, z = step[3], step[4], step[5]
+    angle = np.sqrt(x * x + y * y + z * z)
+    a = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    b = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    R[:] = R @ (np.eye(3) + a * K + b * (K @ K))
+
+
+@compiled()
+def _refine(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, iterations, H):  # type: ignore[no-untyped-def]
+    """Gauss-Newton on the used matches, in place; return False when it is not determined."""
+    g = np.empty(6)
+    for _ in range(iterations):
+        _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g)
+        scale = np.sqrt(np.diag(H))
+        if scale.min() <= 0.0:
+            return False
+        scaled = H / np.outer(scale, scale)
+        for i in range(6):
+            scaled[i, i] += 1e-9
+        step = -np.linalg.solve(scaled, g / scale) / scale
+        if not np.all(np.isfinite(step)) or np.abs(step[3:]).max() > 0.5:
+            return False
+        _retract(R, t, step)
+        if np.abs(step).max() < 1e-9:
+            break
+    return True
+
+
+@compiled()
+def _polish(  # type: ignore[no-untyped-def]
+    R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, used, inverse_tilt, rounds
+):
+    """Alternate refinement and choice of inliers while the cost falls; return cost and inliers."""
+    cost, inliers = _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, used)
+    H = np.empty((6, 6))
+    trial = np.zeros_like(used)
+    for _ in range(rounds):
+        if inliers < 3:
+            break
+        R_new, t_new = R.copy(), t.copy()
+        if not _refine(
+            R_new, t_new, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, 3, H
+        ):
+            break
+        new_cost, new_inliers = _score(
+            R_new, t_new, begin, end, origin, ray, point, keypoint, inverse_sigma, trial
+        )
+        if new_cost >= cost:
+            break
+        cost, inliers = new_cost, new_inliers
+        R[:], t[:] = R_new, t_new
+        used[begin:end] = trial[begin:end]
+    return cost, inliers
+
+
+@compiled(parallel=True)
+def search_poses(  # type: ignore[no-untyped-def]
+    start, seeds, origin, ray, point, keypoint, inverse_sigma, max_iterations, inverse_tilt,
+    R_out, t_out, H_out, cost_out, inliers_out, iterations_out, is_inlier,
+):  # fmt: skip
+    """Search the pose of every problem; matches of one problem are consecutive, sorted by keypoint."""
+    for problem in prange(len(start) - 1):
+        begin, end = start[problem], start[problem + 1]
+        count = end - begin
+        keypoints = 0
+        for i in range(begin, end):
+            if i == begin or keypoint[i] != keypoint[i - 1]:
+                keypoints += 1
+        state = np.array([seeds[problem]], dtype=np.uint64)
+        o, f, X = origin[begin:end], ray[begin:end], point[begin:end]
+        k, w = keypoint[begin:end], inverse_sigma[begin:end]
+        used = np.zeros(count, dtype=np.bool_)
+        best_used = np.zeros(count, dtype=np.bool_)
+        best_R, best_t = np.eye(3), np.zeros(3)
+        best_cost, best_inliers = float(keypoints), 0
+        yaw, position = np.empty(2), np.empty((2, 3))
+        R, t = np.empty((3, 3)), np.empty(3)
+        needed = max_iterations
+        done = 0
+        while done < needed and keypoints >= 3:
+            done += 1
+            a = np.int64(_next_random(state) % np.uint64(count))
+            b = np.int64(_next_random(state) % np.uint64(count))
+            if k[a] == k[b]:
+                continue
+            for s in range(_two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, position)):
+                cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
+                R[:] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+                t[:] = position[s]
+                cost, inliers = _score(R, t, 0, count, o, f, X, k, w, used)
+                if cost >= best_cost:
+                    continue
+                cost, inliers = _polish(R, t, 0, count, o, f, X, k, w, used, inverse_tilt, 2)
+                best_cost, best_inliers = cost, inliers
+                best_R[:], best_t[:] = R, t
+                best_used[:] = used
+                share = inliers / count
+                miss = 1.0 - share * share
+                if miss < 1e-9:
+                    needed = done
+                else:
+                    wanted = np.log(1.0 - _CONFIDENCE) / np.log(miss)
+                    needed = min(max_iterations, max(int(wanted) + 1, 10))
+        H = np.zeros((6, 6))
+        if best_inliers >= 3:
+            best_cost, best_inliers = _polish(
+                best_R, best_t, 0, count, o, f, X, k, w, best_used, inverse_tilt, 10
+            )
+            g = np.empty(6)
+            _accumulate(best_R, best_t, 0, count, o, f, X, w, best_used, inverse_tilt, H, g)
+        R_out[problem], t_out[problem], H_out[problem] = best_R, best_t, H
+        cost_out[problem], inliers_out[problem] = best_cost, best_inliers
+        iterations_out[problem] = done
+        is_inlier[begin:end] = best_used

@@ -1,0 +1,148 @@
+"""Projection of binary descriptors to few real dimensions, learned from tracks.
+
+Within a track descriptors vary by noise; between tracks they vary by content. The projection
+keeps the directions along which the two differ most, scaled so that the squared Euclidean
+distance is (up to a constant) the log likelihood ratio of "different" against "same".
+Source: Lynen et al., Get Out of My Lab, RSS 2015, section IV; Bosse and Zlot 2013.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import EstimationError
+from maplab_py.vision.jit import compiled, prange
+
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+DIMENSIONS = 10
+MIN_TRACK_LENGTH = 5
+MAX_TRAINING_SAMPLES = 50_000
+_MIN_TRAINING_TRACKS = 50
+_REGULARISATION = 1e-3
+"""Variance [bit^2] added to every direction, so that constant bits do not dominate."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DescriptorProjection:
+    """Linear map from the bits of a descriptor (most significant bit of byte 0 first)."""
+
+    matrix: F32  # (dimensions, 8 * bytes)
+
+    @property
+    def descriptor_size(self) -> int:
+        """Length [bytes] of the descriptors that this projection takes."""
+        return int(self.matrix.shape[1]) // 8
+
+    def project(self, descriptors: U8) -> F32:
+        """Return descriptors (N, bytes) as points (N, dimensions).
+
+        Raises:
+            EstimationError: The projection was made for descriptors of another length.
+        """
+        if descriptors.shape[1] != self.descriptor_size:
+            raise EstimationError(
+                f"the projection takes descriptors of {self.descriptor_size} bytes, not "
+                f"{descriptors.shape[1]}"
+            )
+        dimensions = len(self.matrix)
+        values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
+        by_byte = self.matrix.T.reshape(self.descriptor_size, 8, dimensions)
+        # sum over the 8 bits of a byte, tabulated for its 256 values
+        table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False).astype(np.float32)
+        projected = np.empty((len(descriptors), dimensions), dtype=np.float32)
+        _sum_table(np.ascontiguousarray(descriptors), table, projected)
+        return projected
+
+
+def learn_projection(
+    descriptors: U8,
+    track: I64,
+    *,
+    dimensions: int = DIMENSIONS,
+    min_track_length: int = MIN_TRACK_LENGTH,
+    max_samples: int = MAX_TRAINING_SAMPLES,
+) -> DescriptorProjection:
+    """Learn the projection from descriptors whose tracks are known. Deterministic.
+
+    Args:
+        descriptors: Descriptors (N, bytes).
+        track: Label (N,) of the track or landmark that each belongs to, negative for none.
+        dimensions: Dimensions to keep.
+        min_track_length: Shortest track to learn from; halved down to 2 while there are too few.
+        max_samples: Learn from about as many descriptors, taken as whole tracks spread evenly.
+
+    Raises:
+        EstimationError: Too few tracks.
+    """
+    rows = _training_rows(track, min_track_length, max_samples)
+    if len(rows) == 0:
+        raise EstimationError(
+            f"the descriptor projection cannot be learned: fewer than {_MIN_TRAINING_TRACKS} tracks "
+            "have two or more observations with descriptors"
+        )
+    bits = np.unpackbits(descriptors[rows], axis=1).astype(np.float64)
+    first = np.flatnonzero(np.diff(track[rows], prepend=-1))
+    length = np.diff(np.append(first, len(rows)))
+    sums = np.add.reduceat(bits, first, axis=0)
+    # sums of 0/1 products are exact in double precision, whatever the order of summation
+    second_moment = bits.T @ bits
+    weighted = sums / np.sqrt(length)[:, None]
+    within = (second_moment - weighted.T @ weighted) / (len(rows) - len(first))
+    mean = bits.mean(axis=0)
+    overall = second_moment / len(rows) - np.outer(mean, mean)
+    return DescriptorProjection(_likelihood_ratio_metric(within, overall, dimensions))
+
+
+def _likelihood_ratio_metric(within: F64, overall: F64, dimensions: int) -> F32:
+    """Return A (dimensions, bits) with |A d|^2 = d^T (within^-1 - overall^-1) d, truncated."""
+    from threadpoolctl import threadpool_limits
+
+    eye = np.eye(len(within)) * _REGULARISATION
+    with threadpool_limits(limits=1, user_api="blas"):
+        s, V = np.linalg.eigh(within + eye)
+        whiten = (V / np.sqrt(s)).T
+        D, U = np.linalg.eigh(whiten @ (overall + eye) @ whiten.T)
+        best = np.argsort(-D, kind="stable")[:dimensions]
+        ratio = np.sqrt(np.maximum(1.0 - 1.0 / D[best], 0.0))
+        A = ratio[:, None] * (U[:, best].T @ whiten)
+    # eigenvectors have no sign of their own
+    A *= np.sign(A[np.arange(len(A)), np.argmax(np.abs(A), axis=1)])[:, None]
+    return np.ascontiguousarray(A, dtype=np.float32)
+
+
+def _training_rows(track: I64, min_length: int, max_samples: int) -> I64:
+    """Return rows of long enough tracks, track by track; empty when there are too few tracks."""
+    order = np.argsort(track, kind="stable")
+    order = order[track[order] >= 0]
+    labels, index, length = np.unique(track[order], return_inverse=True, return_counts=True)
+    while min_length >= 2:
+        tracks = np.flatnonzero(length >= min_length)
+        if len(tracks) >= _MIN_TRAINING_TRACKS or min_length == 2:
+            break
+        min_length = max(min_length // 2, 2)
+    if len(tracks) < _MIN_TRAINING_TRACKS:
+        return np.zeros(0, dtype=np.int64)
+    step = max(int(np.ceil(length[tracks].sum() / max_samples)), 1)
+    taken = np.zeros(len(labels), dtype=np.bool_)
+    taken[tracks[::step]] = True
+    return np.asarray(order[taken[index]], dtype=np.int64)
+
+
+@compiled(parallel=True)
+def _sum_table(descriptors, table, projected):  # type: ignore[no-untyped-def]
+    count, size = descriptors.shape
+    dimensions = projected.shape[1]
+    for i in prange(count):
+        for d in range(dimensions):
+            projected[i, d] = 0.0
+        for p in range(size):
+            value = descriptors[i, p]
+            for d in range(dimensions):
+                projected[i, d] += table[p, value, d]

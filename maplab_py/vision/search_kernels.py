@@ -1,0 +1,149 @@
+"""Compiled kernels that compare descriptors: Hamming distances and the searches of the indices.
+
+Queries and database descriptors come with label, session and time: equal labels and, within a
+session, near times are no match. A search keeps the k nearest of distinct labels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.vision.jit import compiled, prange
+
+
+@compiled(inline="always")
+def _popcount(x):  # type: ignore[no-untyped-def]
+    """Return the number of set bits of a 64-bit word (SWAR, which LLVM turns into popcnt)."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@compiled(inline="always")
+def _different_bits(a, b):  # type: ignore[no-untyped-def]
+    bits = np.uint64(0)
+    for w in range(len(a)):
+        bits += _popcount(a[w] ^ b[w])
+    return bits
+
+
+@compiled(parallel=True)
+def bits_between(words_a, rows_a, words_b, rows_b, distance):  # type: ignore[no-untyped-def]
+    """Fill in the Hamming distances between rows of two tables."""
+    for i in prange(len(rows_a)):
+        distance[i] = _different_bits(words_a[rows_a[i]], words_b[rows_b[i]])
+
+
+@compiled()
+def _insert(row, distance, labels, candidate, label, value):  # type: ignore[no-untyped-def]
+    """Put a candidate into a sorted list of the nearest ones that holds every label once."""
+    place = len(row) - 1
+    for i in range(len(row)):
+        if row[i] >= 0 and labels[i] == label:
+            if value >= distance[i]:
+                return
+            place = i
+            break
+    while place > 0 and distance[place - 1] > value:
+        row[place], distance[place] = row[place - 1], distance[place - 1]
+        labels[place] = labels[place - 1]
+        place -= 1
+    row[place], distance[place], labels[place] = candidate, value, label
+
+
+@compiled(inline="always")
+def _allowed(q_label, q_session, q_time, d_label, d_session, d_time, min_time, others_only):  # type: ignore[no-untyped-def]
+    if d_label == q_label and q_label >= 0:
+        return False
+    return d_session != q_session or not (others_only or abs(d_time - q_time) < min_time)
+
+
+@compiled(parallel=True)
+def search_all(  # type: ignore[no-untyped-def]
+    q_words, q_label, q_session, q_time, d_words, d_label, d_session, d_time,
+    min_time, others_only, row, distance,
+):  # fmt: skip
+    """Compare every query with every database descriptor; distances are bits."""
+    k = row.shape[1]
+    for q in prange(len(q_words)):
+        labels = np.full(k, -1, dtype=np.int64)
+        for d in range(len(d_words)):
+            value = np.float32(_different_bits(q_words[q], d_words[d]))
+            if value < distance[q, k - 1] and _allowed(
+                q_label[q], q_session[q], q_time[q],
+                d_label[d], d_session[d], d_time[d], min_time, others_only,
+            ):  # fmt: skip
+                _insert(row[q], distance[q], labels, d, d_label[d], value)
+
+
+@compiled()
+def _word_distances(point, offset, centres, result):  # type: ignore[no-untyped-def]
+    """Fill in squared distances of one half (every other dimension) to the words."""
+    for w in range(len(centres)):
+        total = np.float32(0.0)
+        for d in range(centres.shape[1]):
+            difference = point[offset + 2 * d] - centres[w, d]
+            total += difference * difference
+        result[w] = total
+
+
+@compiled(inline="always")
+def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type: ignore[no-untyped-def]
+    """Return the rank of the next word of a in the multi-sequence walk, -1 at its end.
+
+    next_b[i] is the rank of the word of b that is to be paired with the i-th word of a.
+    """
+    best, best_value = -1, np.float32(np.inf)
+    for i in range(reach):
+        if next_b[i] < len(order_b):
+            value = distance_a[order_a[i]] + distance_b[order_b[next_b[i]]]
+            if value < best_value:
+                best, best_value = i, value
+    return best
+
+
+@compiled(inline="always")
+def _squared_distance(a, b):  # type: ignore[no-untyped-def]
+    total = np.float32(0.0)
+    for j in range(len(a)):
+        difference = a[j] - b[j]
+        total += difference * difference
+    return total
+
+
+@compiled(parallel=True)
+def search_cells(  # type: ignore[no-untyped-def]
+    q_points, q_words, q_label, q_session, q_time, centres_a, centres_b, start,
+    d_points, d_words, d_label, d_session, d_time,
+    cells_per_query, rank_by_bits, min_time, others_only, row, distance,
+):  # fmt: skip
+    """Walk the nearest cells of a multi-index; compare inside by bits or in projected space."""
+    words_a, words_b, k = len(centres_a), len(centres_b), row.shape[1]
+    for q in prange(len(q_points)):
+        distance_a = np.empty(words_a, dtype=np.float32)
+        distance_b = np.empty(words_b, dtype=np.float32)
+        _word_distances(q_points[q], 0, centres_a, distance_a)
+        _word_distances(q_points[q], 1, centres_b, distance_b)
+        order_a, order_b = np.argsort(distance_a), np.argsort(distance_b)
+        next_b = np.zeros(words_a, dtype=np.int32)
+        reach = 1
+        labels = np.full(k, -1, dtype=np.int64)
+        for _ in range(cells_per_query):
+            best = _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach)
+            if best < 0:
+                break
+            cell = order_a[best] * words_b + order_b[next_b[best]]
+            next_b[best] += 1
+            if best == reach - 1 and reach < words_a:
+                reach += 1
+            for d in range(start[cell], start[cell + 1]):
+                if rank_by_bits:
+                    value = np.float32(_different_bits(q_words[q], d_words[d]))
+                else:
+                    value = _squared_distance(q_points[q], d_points[d])
+                if value < distance[q, k - 1] and _allowed(
+                    q_label[q], q_session[q], q_time[q],
+                    d_label[d], d_session[d], d_time[d], min_time, others_only,
+                ):  # fmt: skip
+                    _insert(row[q], distance[q], labels, d, d_label[d], value)

@@ -1,0 +1,194 @@
+"""Commands on loops: find and close them, relax the trajectories over them, remove edges."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.report import LoopClosureReport
+from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
+from maplab_py.plugin import CommandContext, Message, Report, command
+
+_LOOPS = LoopClosureOptions()
+_RELAXATION = RelaxationOptions()
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxReport(Report):
+    """Loop closures that were found, what the relaxation made of them, and merged landmarks."""
+
+    loop_closures: LoopClosureReport
+    relaxation: RelaxationReport
+    merging: LoopClosureReport | None = None
+
+    @property
+    def failure(self) -> str:
+        """Say why nothing was relaxed."""
+        relaxed = self.relaxation.failure
+        found = self.loop_closures.failure
+        return f"{relaxed}; {found}" if relaxed and found else relaxed
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxMissionsReport(Report):
+    """One report per mission, by the beginning of its id."""
+
+    missions: dict[str, RelaxReport]
+
+    @property
+    def failure(self) -> str:
+        """Say why nothing was relaxed, when no mission was."""
+        failures = [f"{name}: {report.failure}" for name, report in self.missions.items()]
+        if any(not report.failure for report in self.missions.values()):
+            return ""
+        return "no mission was relaxed: " + "; ".join(failures)
+
+
+@command(
+    "loopclosure_all_missions",
+    "lc",
+    example="lc --lc_min_inlier_count=15",
+    see_also=("relax", "optimize_visual_inertial", "delete_loopclosure_edges"),
+)
+def loopclosure_all_missions(
+    context: CommandContext,
+    *,
+    options: LoopClosureOptions = _LOOPS,
+    lc_insert_lc_edge_instead_of_merging: bool = False,
+    map_mission_list: str = "",
+) -> LoopClosureReport:
+    """Find places that were seen more than once, in any mission, and merge their landmarks.
+
+    Args:
+        lc_insert_lc_edge_instead_of_merging: Add loop closure edges; leave the landmarks as they are.
+        map_mission_list: Missions to close loops in and between, separated by commas; empty = all.
+    """
+    missions = context.mission_rows("", map_mission_list)
+    return _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
+
+
+@command("loopclosure_one_mission", "lcom", example="lcom --map_mission=59f0")
+def loopclosure_one_mission(
+    context: CommandContext,
+    *,
+    options: LoopClosureOptions = _LOOPS,
+    lc_insert_lc_edge_instead_of_merging: bool = False,
+    map_mission: str = "",
+) -> LoopClosureReport:
+    """Find places that one mission saw more than once, and merge their landmarks.
+
+    Args:
+        lc_insert_lc_edge_instead_of_merging: Add loop closure edges; leave the landmarks as they are.
+        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
+    """
+    missions = np.array([context.mission_row(map_mission)])
+    return _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
+
+
+@command("delete_loopclosure_edges", "dlc", example="dlc")
+def delete_loopclosure_edges(context: CommandContext) -> Message:
+    """Remove all loop closure edges."""
+    from maplab_py.vimap.edits import remove_loop_closure_edges
+
+    count = len(context.vi_map.loop_closure_edges)
+    context.commit(remove_loop_closure_edges(context.vi_map, np.ones(count, dtype=np.bool_)))
+    return Message(f"removed {count} loop closure edges")
+
+
+@command(
+    "relax",
+    example="relax --relax_robustness=switchable",
+    see_also=("loopclosure_all_missions", "relax_missions_independently"),
+)
+def relax(
+    context: CommandContext,
+    *,
+    loop_options: LoopClosureOptions = _LOOPS,
+    options: RelaxationOptions = _RELAXATION,
+    lc_relax_merge_landmarks: bool = False,
+    map_mission_list: str = "",
+) -> RelaxReport:
+    """Find loop closures and bend the trajectories until they fit; edges of the map count too.
+
+    Args:
+        lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.
+        map_mission_list: Missions that may move, separated by commas; empty = all.
+    """
+    missions = context.mission_rows("", map_mission_list)
+    return _relax(context, loop_options, options, missions, merge=lc_relax_merge_landmarks)
+
+
+@command("relax_missions_independently", "srelax", example="srelax")
+def relax_missions_independently(
+    context: CommandContext,
+    *,
+    loop_options: LoopClosureOptions = _LOOPS,
+    options: RelaxationOptions = _RELAXATION,
+    lc_relax_merge_landmarks: bool = False,
+    map_mission_list: str = "",
+) -> RelaxMissionsReport:
+    """Relax every mission over its own loop closures only.
+
+    Args:
+        lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.
+        map_mission_list: Missions to relax, separated by commas; empty = all.
+    """
+    from maplab_py.vimap.ids import to_hex
+
+    rows = context.mission_rows("", map_mission_list)
+    rows = np.arange(len(context.vi_map.missions)) if rows is None else rows
+    reports = {}
+    for row in rows:
+        name = to_hex(context.vi_map.missions.id[row])[:8]
+        reports[name] = _relax(
+            context, loop_options, options, np.array([row]), merge=lc_relax_merge_landmarks
+        )
+    return RelaxMissionsReport(reports)
+
+
+def _close(
+    context: CommandContext,
+    options: LoopClosureOptions,
+    missions: NDArray[np.int64] | None,
+    *,
+    as_edges: bool,
+) -> LoopClosureReport:
+    from maplab_py.algorithms.loop_closure.closing import close_loops, insert_edges
+
+    run = insert_edges if as_edges else close_loops
+    result, report = run(context.vi_map, options, missions=missions, progress=context.progress)
+    context.commit(result)
+    return report
+
+
+def _relax(
+    context: CommandContext,
+    loop_options: LoopClosureOptions,
+    options: RelaxationOptions,
+    missions: NDArray[np.int64] | None,
+    *,
+    merge: bool,
+) -> RelaxReport:
+    from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
+    from maplab_py.algorithms.relaxation import relaxation
+
+    edges, found = find_loop_closures(
+        context.vi_map, loop_options, missions=missions, progress=context.progress
+    )
+    result, relaxed = relaxation.relax(
+        context.vi_map,
+        options,
+        loop_closures=edges,
+        missions=missions,
+        progress=context.progress,
+    )
+    merging = None
+    if merge and not relaxed.failure:
+        result, merging = close_loops(
+            result, loop_options, missions=missions, progress=context.progress
+        )
+    context.commit(result)
+    return RelaxReport(found, relaxed, merging)
