@@ -1,0 +1,1 @@
+"""Visual-inertial sessions with known truth: motion, world, sensors, appearance, drift."""

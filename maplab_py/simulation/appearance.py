@@ -1,0 +1,100 @@
+"""Binary descriptors: signs of activations that are correlated, move with the viewpoint and age.
+
+A point has a latent vector z. Seen from another direction or distance, and in another session, z
+moves a little; bit i is the sign of w_i . z + noise. So bits with an activation near zero flip
+first, near views look alike, and bits that compare similar image regions flip together, as in
+BRISK or FREAK.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.simulation.detection import Detections
+from maplab_py.simulation.scenario import AppearanceOptions
+
+F32 = NDArray[np.float32]
+
+_REFERENCE_DISTANCE_M = 3.0
+_DETECTIONS_AT_ONCE = 1 << 14
+"""Descriptors that are made in one go: bounds the memory to some 100 MB."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Appearance:
+    """How all points of a world look. Activations have unit variance over points."""
+
+    options: AppearanceOptions
+    weights: F32  # (latent, bits)
+    latent: F32  # (L, latent)
+    gradient: F32  # (L, 4, latent) by view direction (3) and doubling of the distance
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SessionAppearance:
+    """How points look, and whether they are there, in one session."""
+
+    world: Appearance
+    change: F32  # (L, latent)
+    is_there: NDArray[np.bool_]  # (L,)
+
+
+def make_appearance(
+    options: AppearanceOptions, points: int, rng: np.random.Generator
+) -> Appearance:
+    """Draw how the points look."""
+    bits, size = 8 * options.descriptor_bytes, options.latent_dimensions
+    weights = rng.standard_normal((size, bits), dtype=np.float32)
+    weights /= np.linalg.norm(weights, axis=0)
+    latent = rng.standard_normal((points, size), dtype=np.float32)
+    gradient = rng.standard_normal((points, 4, size), dtype=np.float32)
+    gradient[:, :3] *= options.viewpoint_change
+    gradient[:, 3] *= options.scale_change
+    return Appearance(options, weights, latent, gradient)
+
+
+def make_session_appearance(world: Appearance, rng: np.random.Generator) -> SessionAppearance:
+    """Draw what has changed in a session, and what has vanished."""
+    change = rng.standard_normal(world.latent.shape, dtype=np.float32)
+    change *= world.options.session_change
+    is_there = rng.uniform(size=len(world.latent)) >= world.options.vanish_share
+    return SessionAppearance(world, change, is_there)
+
+
+def describe(
+    session: SessionAppearance, found: Detections, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return the descriptors (N, bytes) of detections."""
+    size = session.world.options.descriptor_bytes
+    descriptors = np.empty((len(found.frame), size), dtype=np.uint8)
+    for first in range(0, len(found.frame), _DETECTIONS_AT_ONCE):
+        rows = slice(first, first + _DETECTIONS_AT_ONCE)
+        descriptors[rows] = _describe(session, found, rows, rng)
+    return descriptors
+
+
+def _describe(
+    session: SessionAppearance, found: Detections, rows: slice, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    world = session.world
+    point = found.point[rows]
+    view = np.concatenate(
+        [
+            found.view_G[rows],
+            np.log2(found.distance_m[rows, None] / _REFERENCE_DISTANCE_M),
+        ],
+        axis=1,
+    ).astype(np.float32)
+    # clutter has point -1: its latent vector is drawn anew
+    latent = rng.standard_normal((len(point), world.latent.shape[1]), dtype=np.float32)
+    of_point = point >= 0
+    known = point[of_point]
+    latent[of_point] = world.latent[known] + session.change[known]
+    latent[of_point] += np.einsum("nk,nkj->nj", view[of_point], world.gradient[known])
+    activation = latent @ world.weights
+    noise = rng.standard_normal(activation.shape, dtype=np.float32)
+    activation += np.float32(world.options.bit_noise) * noise
+    return np.packbits(activation > 0.0, axis=1)

@@ -1,0 +1,56 @@
+"""Projection for the simulator, written apart from the estimator's so that each checks the other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.sensors import Camera, Distortion, Projection
+
+F64 = NDArray[np.float64]
+
+_LARGEST_RADIUS = 6.0
+"""Normalised radius up to which a distortion is searched for its turning point."""
+
+
+def pixels_of(camera: Camera, p_C: F64) -> F64:
+    """Return pixels (N, 2) of points (N, 3) that lie in front of the camera."""
+    values = camera.intrinsics
+    depth = p_C[:, 2]
+    if camera.projection is Projection.UNIFIED:
+        depth = depth + values[0] * np.sqrt(np.einsum("ij,ij->i", p_C, p_C))
+        values = values[1:]
+    x = _distorted(camera, p_C[:, 0] / depth, p_C[:, 1] / depth)
+    return np.stack([values[0] * x[0] + values[2], values[1] * x[1] + values[3]], axis=1)
+
+
+def field_of_view_radius(camera: Camera) -> float:
+    """Return the normalised radius |x| / z inside which the image moves outwards with the point."""
+    radius = np.linspace(1e-3, _LARGEST_RADIUS, 4000)
+    image = np.hypot(*_distorted(camera, radius, np.zeros_like(radius)))
+    backwards = np.flatnonzero(np.diff(image) <= 0.0)
+    return float(radius[backwards[0]]) if len(backwards) else _LARGEST_RADIUS
+
+
+def _distorted(camera: Camera, x: F64, y: F64) -> tuple[F64, F64]:
+    k = camera.distortion_parameters
+    r2 = x * x + y * y
+    if camera.distortion is Distortion.RADTAN:
+        # Brown (1966): radial and decentring terms
+        radial = 1.0 + r2 * (k[0] + r2 * k[1])
+        return (
+            x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
+            y * radial + 2.0 * k[3] * x * y + k[2] * (r2 + 2.0 * y * y),
+        )
+    if camera.distortion is Distortion.NONE:
+        return x, y
+    r = np.maximum(np.sqrt(r2), 1e-12)
+    if camera.distortion is Distortion.FOV:
+        # Devernay and Faugeras (2001), eq. (13)
+        image = np.arctan(2.0 * r * np.tan(0.5 * k[0])) / k[0]
+    else:
+        # Kannala and Brandt (2006), eq. (6)
+        angle = np.arctan(r)
+        a2 = angle * angle
+        image = angle * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
+    return x * image / r, y * image / r

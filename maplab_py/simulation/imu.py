@@ -1,0 +1,79 @@
+"""What an IMU measures along a motion: the thesis' model, with biases that walk."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import so3
+from maplab_py.sensors import ImuIntrinsics
+from maplab_py.simulation.scenario import ImuOptions
+from maplab_py.simulation.spline import MotionState
+
+F64 = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImuRecording:
+    """Samples and the biases that are in them."""
+
+    accel_gyro: F64  # (N, 6) [ax ay az gx gy gz]
+    accel_bias: F64  # (N, 3)
+    gyro_bias: F64  # (N, 3)
+
+
+def intrinsics_of(options: ImuOptions) -> ImuIntrinsics | None:
+    """Return scale and misalignment; None when all are ideal."""
+    ideal = ImuOptions()
+    names = (
+        "gyro_scale",
+        "accel_scale",
+        "gyro_misalignment",
+        "accel_misalignment",
+        "accel_rotation_rad",
+    )
+    if all(getattr(options, name) == getattr(ideal, name) for name in names):
+        return None
+    return ImuIntrinsics(
+        T_g=_upper_triangular(options.gyro_scale, options.gyro_misalignment),
+        T_a=_upper_triangular(options.accel_scale, options.accel_misalignment),
+        R_A_I=so3.to_matrix(so3.exp(options.accel_rotation_rad)),
+    )
+
+
+def _upper_triangular(diagonal: tuple[float, ...], above: tuple[float, ...]) -> F64:
+    matrix = np.diag(diagonal).astype(np.float64)
+    matrix[[0, 0, 1], [1, 2, 2]] = above
+    return matrix
+
+
+def measure(options: ImuOptions, motion: MotionState, rng: np.random.Generator) -> ImuRecording:
+    """Return what the IMU reports at the times of a motion, 1 / rate_hz apart.
+
+    Thesis eq. (7.7)-(7.10): w~ = T_g w + b_g + n_g, a~ = T_a R_A_I R_I_G (a_G - g_G) + b_a + n_a.
+    """
+    count = len(motion.v_G)
+    rate = options.rate_hz
+    gravity_G = np.array([0.0, 0.0, -options.gravity_mps2])
+    force_I = so3.rotate(so3.inverse(motion.T_G_I[:, :4]), motion.a_G - gravity_G)
+    intrinsics = intrinsics_of(options) or ImuIntrinsics()
+    gyro = np.einsum("ij,nj->ni", intrinsics.T_g, motion.w_I)
+    accel = np.einsum("ij,jk,nk->ni", intrinsics.T_a, intrinsics.R_A_I, force_I)
+    accel_bias = _bias(count, options.accel_bias_sigma, options.accel_bias_walk, rate, rng)
+    gyro_bias = _bias(count, options.gyro_bias_sigma, options.gyro_bias_walk, rate, rng)
+    # a density in 1 / sqrt(Hz) sampled at `rate` has the standard deviation density * sqrt(rate)
+    accel_noise = options.accel_noise_density * np.sqrt(rate) * rng.standard_normal((count, 3))
+    gyro_noise = options.gyro_noise_density * np.sqrt(rate) * rng.standard_normal((count, 3))
+    samples = np.concatenate(
+        [accel + accel_bias + accel_noise, gyro + gyro_bias + gyro_noise], axis=1
+    )
+    return ImuRecording(samples, accel_bias, gyro_bias)
+
+
+def _bias(count: int, sigma: float, walk: float, rate: float, rng: np.random.Generator) -> F64:
+    """Return a bias (count, 3) that starts at random and walks."""
+    steps = walk / np.sqrt(rate) * rng.standard_normal((count, 3))
+    steps[0] = sigma * rng.standard_normal(3)
+    return np.asarray(np.cumsum(steps, axis=0))

@@ -1,0 +1,110 @@
+"""Reading scenarios from YAML: every mistake is one line that names file and key."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from maplab_py.errors import UserError
+from maplab_py.simulation.limits import check_scenario
+from maplab_py.simulation.scenario import Scenario
+
+_FOLDER = Path(__file__).parent / "scenarios"
+_KINDS: dict[type, str] = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios that come with the program."""
+    return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Read a scenario by name, or from a YAML file.
+
+    Raises:
+        UserError: There is no such scenario, or it has a mistake; names file and key.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in scenario_names():
+        path = _FOLDER / f"{name_or_path}.yaml"
+    elif not path.is_file():
+        known = ", ".join(scenario_names())
+        raise UserError(
+            f"there is no scenario '{name_or_path}': give a YAML file or one of {known}"
+        )
+    return parse_scenario(path.read_text(encoding="utf-8"), path.name)
+
+
+def parse_scenario(text: str, source: str) -> Scenario:
+    """Read a scenario from YAML text.
+
+    Args:
+        text: The YAML document.
+        source: Name of its origin for messages.
+
+    Raises:
+        UserError: The text has a mistake; names source and key.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise UserError(f"{source}{where}: this is not YAML") from None
+    try:
+        scenario: Scenario = _read(Scenario, content, "")
+        check_scenario(scenario)
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from None
+    return scenario
+
+
+def _read(kind: Any, value: Any, key: str) -> Any:
+    """Turn a YAML value into a dataclass, a tuple or a scalar."""
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return _read_group(kind, value, key)
+    if typing.get_origin(kind) is tuple:
+        return _read_list(typing.get_args(kind), value, key)
+    if isinstance(kind, types.UnionType):
+        raise TypeError(f"{key}: unions are not supported")
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if kind is float and is_number:
+        return float(value)
+    if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
+        return value
+    raise UserError(f"{key}: {_KINDS.get(kind, 'a text')} is wanted, not {value!r}")
+
+
+def _read_group(kind: type, value: Any, key: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{key or 'the file'}: a mapping of keys is wanted, not {value!r}")
+    hints = typing.get_type_hints(kind)
+    fields: dict[str, Any] = {}
+    for name, item in value.items():
+        inner = f"{key}.{name}" if key else str(name)
+        if name not in hints:
+            near = difflib.get_close_matches(str(name), hints, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(hints)}"
+            raise UserError(f"{inner}: unknown key{hint}")
+        fields[name] = _read(hints[name], item, inner)
+    return kind(**fields)
+
+
+def _read_list(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise UserError(f"{key}: a list is wanted, not {value!r}")
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = (kinds[0],) * len(value)
+    if len(kinds) != len(value):
+        raise UserError(f"{key}: {len(kinds)} values are wanted, not {len(value)}")
+    return tuple(
+        _read(kind, item, f"{key}[{row}]")
+        for row, (kind, item) in enumerate(zip(kinds, value, strict=True))
+    )

@@ -1,0 +1,63 @@
+"""The whole of it: a scenario becomes maps and their truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.progress import SILENT, Progress
+from maplab_py.simulation.appearance import make_appearance, make_session_appearance
+from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.sensors import make_sensors
+from maplab_py.simulation.session import SessionSeeds, simulate_session
+from maplab_py.simulation.truth import Truth
+from maplab_py.simulation.world import make_world
+from maplab_py.vimap import VIMap
+
+_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS = range(5)
+"""Streams of random numbers; a session's number selects within a stream."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SimulatedData:
+    """One map per session, as an odometry would have left it, and the truth of all."""
+
+    maps: list[VIMap]
+    truth: Truth
+
+
+def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedData:
+    """Simulate all sessions of a scenario. The same scenario gives the same bytes.
+
+    Raises:
+        UserError: The scenario describes something that cannot be.
+        Cancelled: The user wants to stop.
+    """
+    seeds = scenario.seeds
+    world = make_world(scenario.world, _generator(seeds.world, _WORLD))
+    sensors = make_sensors(scenario)
+    appearance = make_appearance(
+        scenario.appearance, len(world.p_G), _generator(seeds.appearance, _APPEARANCE)
+    )
+    maps, truths = [], []
+    for number in range(len(scenario.sessions)):
+        progress.step(number, len(scenario.sessions), f"session {number + 1}")
+        of_session = SessionSeeds(
+            motion=_generator(seeds.motion, _MOTION, number),
+            measurement=_generator(seeds.measurement, _MEASUREMENT, number),
+            appearance=_generator(seeds.appearance, _APPEARANCE, number),
+            ids=np.random.default_rng(
+                [_IDS, number, *(int(seed) for seed in dataclasses.astuple(seeds))]
+            ),
+        )
+        look = make_session_appearance(appearance, of_session.appearance)
+        vi_map, truth = simulate_session(scenario, number, world, sensors, look, of_session)
+        maps.append(vi_map)
+        truths.append(truth)
+    return SimulatedData(maps, Truth.concatenate(truths))
+
+
+def _generator(seed: int, stream: int, *session: int) -> np.random.Generator:
+    """Return the generator of one stream; sessions count from one, zero is the whole world's."""
+    return np.random.default_rng([seed, stream, *(number + 1 for number in session)])
