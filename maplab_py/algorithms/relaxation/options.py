@@ -22,10 +22,10 @@ class RelaxationOptions:
     flag_prefix: ClassVar[str] = "relax_"
 
     robustness: str = option(
-        "switchable",
+        "dcs",
         help="How false loop closures are kept from doing harm: 'switchable' estimates a switch "
-        "variable for each one, 'dcs' is its closed form (dynamic covariance scaling), 'cauchy' a "
-        "Cauchy loss, 'none' trusts all of them.",
+        "variable for each one, 'dcs' (dynamic covariance scaling) lets them go in closed form but "
+        "trusts good ones fully, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
         choices=("switchable", "dcs", "cauchy", "none"),
     )
     switch_prior: float = option(
@@ -65,7 +65,7 @@ class RelaxationReport(Report):
     """What a relaxation did."""
 
     num_loop_closures: int  # used as constraints
-    num_switched_off: int  # of those, given less than half their weight
+    num_switched_off: int  # of those, given less than half their weight in the end
     num_ignored: int  # not used at all; `notes` says why
     num_vertices: int  # that could move
     num_clusters: int  # groups of missions held together by closures

@@ -36,12 +36,90 @@ class RelativePoses:
     def __len__(self) -> int:
         return len(self.from_vertex)
 
+    def take(self, rows: I64) -> RelativePoses:
+        """Return some of the edges."""
+        return RelativePoses(
+            self.from_vertex[rows],
+            self.to_vertex[rows],
+            self.T_A_B[rows],
+            self.sqrt_information[rows],
+        )
+
+    @classmethod
+    def concatenate(cls, first: RelativePoses, second: RelativePoses) -> RelativePoses:
+        """Return the edges of both."""
+        return cls(
+            np.concatenate([first.from_vertex, second.from_vertex]),
+            np.concatenate([first.to_vertex, second.to_vertex]),
+            np.concatenate([first.T_A_B, second.T_A_B]),
+            np.concatenate([first.sqrt_information, second.sqrt_information]),
+        )
+
     def errors(self, T_G_I: F64) -> F64:
         """Return the whitened residuals W e (E, 6) for vertex poses (V, 7)."""
+        return self._residuals(T_G_I)[0]
+
+    def squared_errors(self, T_G_I: F64) -> F64:
+        """Return |W e|^2 (E,) for vertex poses (V, 7)."""
+        return np.asarray(np.sum(self.errors(T_G_I) ** 2, axis=1))
+
+    def linearized(self, T_G_I: F64) -> tuple[F64, F64, F64]:
+        """Return W e (E, 6) and its derivatives (E, 6, 6) by [dp, dtheta] of A and of B.
+
+        Perturbations as everywhere: p <- p + dp, R <- R exp(dtheta).
+        """
+        error, T, angle = self._residuals(T_G_I)
+        R_A_G = so3.to_matrix(so3.inverse(T_G_I[self.from_vertex, :4]))
+        R_B_A = so3.to_matrix(so3.inverse(T[:, :4]))
+        J_angle = so3.right_jacobian_inverse(angle)
+        J_a, J_b = np.zeros((2, len(self), 6, 6))
+        J_a[:, :3, :3], J_a[:, :3, 3:] = -R_A_G, so3.skew(T[:, 4:])
+        J_a[:, 3:, 3:] = -J_angle @ R_B_A
+        J_b[:, :3, :3], J_b[:, 3:, 3:] = R_A_G, J_angle
+        return error, self.sqrt_information @ J_a, self.sqrt_information @ J_b
+
+    def _residuals(self, T_G_I: F64) -> tuple[F64, F64, F64]:
+        """Return W e, T_A_B and the angular part of e."""
         T = se3.relative(T_G_I[self.from_vertex], T_G_I[self.to_vertex])
         angle = so3.log(so3.multiply(so3.inverse(self.T_A_B[:, :4]), T[:, :4]))
         error = np.concatenate([T[:, 4:] - self.T_A_B[:, 4:], angle], axis=1)
-        return np.asarray(np.einsum("eij,ej->ei", self.sqrt_information, error))
+        return np.einsum("eij,ej->ei", self.sqrt_information, error), T, angle
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TiltPriors:
+    """Measured roll and pitch of vertices (N); nothing is said of heading and position.
+
+    Residual: (R_G_B d)_xy / sigma with d = Log(R_measured^T R), that is the part of the rotation
+    away from the measured attitude that is about horizontal axes.
+    """
+
+    vertex: I64  # (N,)
+    q_G_I: F64  # (N, 4) measured
+    sigma_rad: float
+
+    @classmethod
+    def of_vertices(cls, vertex: I64, T_G_I: F64, sigma_deg: float) -> TiltPriors:
+        """Take the present attitude of vertices as measured."""
+        return cls(vertex, T_G_I[vertex, :4], float(np.deg2rad(sigma_deg)))
+
+    def errors(self, T_G_I: F64) -> F64:
+        """Return the whitened residuals (N, 2) for vertex poses (V, 7)."""
+        return self._weighted(self._angle(T_G_I)[:, :, None])[:, :, 0]
+
+    def linearized(self, T_G_I: F64) -> tuple[F64, F64]:
+        """Return the residuals (N, 2) and their derivatives (N, 2, 6) by [dp, dtheta]."""
+        angle = self._angle(T_G_I)
+        J = np.zeros((len(self.vertex), 2, 6))
+        J[:, :, 3:] = self._weighted(so3.right_jacobian_inverse(angle))
+        return self._weighted(angle[:, :, None])[:, :, 0], J
+
+    def _angle(self, T_G_I: F64) -> F64:
+        return so3.log(so3.multiply(so3.inverse(self.q_G_I), T_G_I[self.vertex, :4]))
+
+    def _weighted(self, columns: F64) -> F64:
+        """Turn columns (N, 3, k) into G and keep their horizontal rows, divided by sigma."""
+        return np.asarray((so3.to_matrix(self.q_G_I) @ columns)[:, :2] / self.sigma_rad)
 
 
 def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses:
@@ -85,14 +163,6 @@ def loop_edges(edges: LoopClosureEdges, options: RelaxationOptions) -> RelativeP
     return RelativePoses(
         edges.from_vertex.astype(np.int64), edges.to_vertex.astype(np.int64), edges.T_A_B, W
     )
-
-
-def tilt_information(T_G_I: F64, sigma_deg: float) -> F64:
-    """Return W (N, 6, 6) of priors that hold roll and pitch of poses (N, 7), and nothing else."""
-    W = np.zeros((len(T_G_I), 6, 6))
-    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(sigma_deg)
-    W[:, 3:, 3:] = level @ so3.to_matrix(T_G_I[:, :4])
-    return W
 
 
 def usable_loop_closures(

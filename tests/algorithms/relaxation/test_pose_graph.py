@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from maplab_py.algorithms.relaxation.losses import LOSSES
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.pose_graph import (
+    TiltPriors,
     clusters,
     loop_edges,
-    tilt_information,
     trajectory_edges,
     usable_loop_closures,
 )
@@ -72,14 +74,53 @@ def test_loop_edges_take_covariances_and_replace_unusable_ones():
 
 def test_tilt_prior_feels_tilt_only():
     T = se3.make(so3.exp([[0.1, -0.2, 0.3]]), [[1.0, 2.0, 3.0]])
-    W = tilt_information(T, 0.5)[0]
-    turned = so3.multiply(so3.exp(YAW), T[0, :4])
-    yaw_error = so3.log(so3.multiply(so3.inverse(T[0, :4]), turned))
-    np.testing.assert_allclose(W[:, 3:] @ yaw_error, 0.0, atol=1e-10)
-    tilted = so3.multiply(so3.exp([0.01, 0.0, 0.0]), T[0, :4])
-    tilt_error = so3.log(so3.multiply(so3.inverse(T[0, :4]), tilted))
-    np.testing.assert_allclose(np.linalg.norm(W[:, 3:] @ tilt_error), 0.01 / np.deg2rad(0.5))
-    np.testing.assert_array_equal(W[:, :3], 0.0)
+    prior = TiltPriors.of_vertices(np.array([0]), T, 0.5)
+    turned = se3.compose(se3.make(so3.exp(YAW), [3.0, 2.0, 1.0]), T)
+    np.testing.assert_allclose(prior.errors(turned), 0.0, atol=1e-10)
+    tilted = se3.compose(se3.make(so3.exp([0.01, 0.0, 0.0]), np.zeros(3)), T)
+    np.testing.assert_allclose(prior.errors(tilted), [[0.01 / np.deg2rad(0.5), 0.0]], atol=1e-9)
+
+
+def _numeric(function, T, vertex):
+    """Return the derivatives of function(T) by [dp, dtheta] of one vertex, (..., 6)."""
+    columns = []
+    for axis in range(6):
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = T.copy()
+            moved[vertex] = se3.retract(T[vertex], sign * 1e-6 * np.eye(6)[axis])
+            sides.append(function(moved))
+        columns.append((sides[0] - sides[1]) / 2e-6)
+    return np.stack(columns, axis=-1)
+
+
+def test_derivatives_match_finite_differences():
+    loop = simulate(1)
+    T = loop.vi_map.T_G_I.copy()
+    edges = loop_edges(loop.closures.take(np.arange(3)), OPTIONS)
+    _, J_a, J_b = edges.linearized(T)
+    scale = np.abs(J_b).max()
+    for row in range(3):
+        numeric_a = _numeric(lambda T, r=row: edges.errors(T)[r], T, edges.from_vertex[row])
+        numeric_b = _numeric(lambda T, r=row: edges.errors(T)[r], T, edges.to_vertex[row])
+        np.testing.assert_allclose(J_a[row], numeric_a, atol=1e-6 * scale)
+        np.testing.assert_allclose(J_b[row], numeric_b, atol=1e-6 * scale)
+    prior = TiltPriors.of_vertices(np.array([5]), T, 0.5)
+    T[5] = se3.retract(T[5], [0, 0, 0, 0.1, -0.2, 0.4])
+    _, J = prior.linearized(T)
+    numeric = _numeric(prior.errors, T, 5)
+    np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(J).max())
+
+
+@pytest.mark.parametrize("name", list(LOSSES))
+def test_weights_are_the_derivatives_of_losses(name):
+    u = np.array([0.0, 0.1, 3.0, 19.0, 21.0, 100.0, 1e4])
+    rho, weight = LOSSES[name](u, 20.0)
+    above, below = LOSSES[name](u + 1e-5, 20.0)[0], LOSSES[name](u - 1e-5, 20.0)[0]
+    np.testing.assert_allclose(weight, (above - below) / 2e-5, atol=1e-6)
+    assert rho[0] == 0.0
+    assert weight[0] == 1.0
+    assert np.all(np.diff(rho) > 0)
 
 
 def test_unusable_closures_are_left_out_with_a_reason():
