@@ -13,6 +13,8 @@ from maplab_py.vision.jit import compiled, prange
 
 _MIN_DEPTH_M = 0.05
 _CONFIDENCE = 0.999
+_LOOSE = 3.0
+"""Hypotheses are scored with as many times the tolerance: their tilt is only as good as given."""
 
 
 @compiled(inline="always")
@@ -215,6 +217,9 @@ def search_poses(  # type: ignore[no-untyped-def]
         best_used = np.zeros(count, dtype=np.bool_)
         best_R, best_t = np.eye(3), np.zeros(3)
         best_cost, best_inliers = float(keypoints), 0
+        best_loose = best_cost
+        w_loose = w / _LOOSE
+        H = np.zeros((6, 6))
         yaw, position = np.empty(2), np.empty((2, 3))
         R, t = np.empty((3, 3)), np.empty(3)
         needed = max_iterations
@@ -229,10 +234,15 @@ def search_poses(  # type: ignore[no-untyped-def]
                 cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
                 R[:] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
                 t[:] = position[s]
-                cost, inliers = _score(R, t, 0, count, o, f, X, k, w, used)
-                if cost >= best_cost:
+                cost, inliers = _score(R, t, 0, count, o, f, X, k, w_loose, used)
+                if cost >= best_loose or inliers < 3:
+                    continue
+                best_loose = cost
+                if not _refine(R, t, 0, count, o, f, X, w_loose, used, inverse_tilt, 3, H):
                     continue
                 cost, inliers = _polish(R, t, 0, count, o, f, X, k, w, used, inverse_tilt, 2)
+                if cost >= best_cost:
+                    continue
                 best_cost, best_inliers = cost, inliers
                 best_R[:], best_t[:] = R, t
                 best_used[:] = used
@@ -243,7 +253,7 @@ def search_poses(  # type: ignore[no-untyped-def]
                 else:
                     wanted = np.log(1.0 - _CONFIDENCE) / np.log(miss)
                     needed = min(max_iterations, max(int(wanted) + 1, 10))
-        H = np.zeros((6, 6))
+        H[:] = 0.0
         if best_inliers >= 3:
             best_cost, best_inliers = _polish(
                 best_R, best_t, 0, count, o, f, X, k, w, best_used, inverse_tilt, 10

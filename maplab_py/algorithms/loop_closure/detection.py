@@ -34,8 +34,6 @@ I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 _NEIGHBOURS = 3
-_EXHAUSTIVE_PAIRS = 4_000_000_000
-"""Pairs of descriptors that the exact index compares in about 3 s on two cores."""
 _DRIFT_OFFSET_M = 0.5
 
 
@@ -120,13 +118,9 @@ def _match(
     if landmarks == 0:
         empty = np.zeros(0, dtype=np.int64)
         return Matches(empty, empty, empty.astype(np.int32)), 0
-    engine = options.detector_engine
-    if engine == "auto":
-        database = _thinned(features, database, _EXHAUSTIVE_PAIRS // max(len(query), 1))
-        engine = "hamming"
     d = features.descriptors
     index = make_index(
-        engine,
+        options.detector_engine,
         d.take(database),
         seed=options.seed,
         words_per_query=options.num_words_for_nn_search,
@@ -138,19 +132,6 @@ def _match(
     bits = hamming(d.words, query, d.words, found)
     matches = Matches(query, found, bits)
     return matches.take(bits <= options.max_bit_fraction * features.descriptor_bits), landmarks
-
-
-def _thinned(features: MapFeatures, database: I64, limit: int) -> I64:
-    """Keep at most about `limit` database features: every n-th of each landmark, but the first."""
-    if len(database) <= limit:
-        return database
-    label = features.descriptors.label[database]
-    order = np.argsort(label, kind="stable")
-    first = np.flatnonzero(np.diff(label[order], prepend=-1))
-    length = np.diff(np.append(first, len(order)))
-    rank = np.arange(len(order)) - np.repeat(first, length)
-    step = max(int(np.ceil(len(database) / max(limit, 1))), 2)
-    return np.asarray(np.sort(database[order[rank % step == 0]]), dtype=np.int64)
 
 
 def _judged(

@@ -15,13 +15,13 @@ class LoopClosureOptions:
     flag_prefix: ClassVar[str] = "lc_"
 
     detector_engine: str = option(
-        "auto",
-        help="Descriptor index: hamming (exact), imi (inverted multi-index), or auto (by map size)",
-        choices=("auto", "hamming", "imi"),
+        "imi",
+        help="Descriptor index: imi (inverted multi-index) or hamming (exhaustive, slow)",
+        choices=("imi", "hamming"),
     )
     num_neighbors: int = option(-1, help="Landmarks to retrieve per keypoint; -1 = 3")
     num_words_for_nn_search: int = option(
-        64, help="Cells of the multi-index that are searched per keypoint"
+        32, help="Cells of the multi-index that are searched per keypoint"
     )
     max_bit_fraction: float = option(
         0.26, help="Largest part of a descriptor's bits in which a match may differ"

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from maplab_py.vision.descriptors import hamming, pack_words
+from maplab_py.vision.hamming_index import HammingIndex
+from maplab_py.vision.index import INDEX_ENGINES, MatchRule, make_index
+from maplab_py.vision.multi_index import InvertedMultiIndex
+from tests.vision.synthetic import descriptor_set, tracks
+
+
+@pytest.fixture(scope="module")
+def features():
+    descriptors, label = tracks(1500, 6, flips=0.08, seed=7)
+    return descriptors, descriptor_set(descriptors, label)
+
+
+def exact_bits(descriptors, a, b):
+    bits = np.unpackbits(descriptors, axis=1)
+    return np.count_nonzero(bits[a] != bits[b], axis=1)
+
+
+@pytest.mark.parametrize("size", [5, 8, 48, 64])
+def test_hamming_counts_different_bits(size):
+    rng = np.random.default_rng(size)
+    descriptors = rng.integers(0, 256, size=(50, size), dtype=np.uint8)
+    a, b = rng.integers(0, 50, size=(2, 200))
+    words = pack_words(descriptors)
+    np.testing.assert_array_equal(hamming(words, a, words, b), exact_bits(descriptors, a, b))
+
+
+def test_descriptors_of_different_lengths_are_not_compared():
+    rows = np.zeros(1, dtype=np.int64)
+    with pytest.raises(ValueError, match="cannot be compared"):
+        hamming(np.zeros((1, 6), np.uint64), rows, np.zeros((1, 8), np.uint64), rows)
+
+
+def test_exhaustive_index_finds_the_nearest(features):
+    descriptors, database = features
+    queries = np.arange(0, len(database), 97)
+    found = HammingIndex(database).nearest(database.take(queries), 1, MatchRule())
+    for query, row, distance in zip(queries, found.row[:, 0], found.distance[:, 0], strict=True):
+        others = np.flatnonzero(database.label != database.label[query])
+        best = exact_bits(descriptors, np.full(len(others), query), others).min()
+        assert distance == best
+        assert exact_bits(descriptors, [query], [row])[0] == best
+
+
+def test_multi_index_recall_in_projected_space(features):
+    _, database = features
+    index = InvertedMultiIndex(database, cells_per_query=32, rank_by_bits=False)
+    queries = np.arange(0, len(database), 11)
+    found = index.nearest(database.take(queries), 1, MatchRule())
+    points = database.projected
+    exact = np.empty(len(queries))
+    for i, query in enumerate(queries):
+        distance = np.sum((points - points[query]) ** 2, axis=1)
+        distance[database.label == database.label[query]] = np.inf
+        exact[i] = distance.min()
+    assert np.mean(found.distance[:, 0] <= exact * 1.0001 + 1e-6) >= 0.9
+
+
+@pytest.mark.parametrize("engine", INDEX_ENGINES)
+def test_each_label_once_nearest_first(features, engine):
+    _, database = features
+    index = make_index(engine, database, seed=0, words_per_query=32)
+    found = index.nearest(database.take(np.arange(300)), 4, MatchRule())
+    assert np.all(np.diff(found.distance, axis=1) >= 0)
+    for query, rows in enumerate(found.row):
+        labels = database.label[rows[rows >= 0]]
+        assert len(set(labels.tolist())) == len(labels)
+        assert database.label[query] not in labels
+
+
+@pytest.mark.parametrize("engine", INDEX_ENGINES)
+def test_rule_keeps_near_times_and_own_session_out(engine):
+    descriptors, label = tracks(200, 6, flips=0.08, seed=8)
+    time_ns = np.tile(np.arange(6) * 10**9, 200)
+    database = descriptor_set(descriptors, label, time_ns=time_ns)
+    index = make_index(engine, database, seed=0, words_per_query=256)
+    unlabelled = database.take(np.arange(len(label)))
+    object.__setattr__(unlabelled, "label", np.full(len(label), -1))
+    found = index.nearest(unlabelled, 3, MatchRule(min_time_ns=2 * 10**9))
+    query, k = np.nonzero(found.row >= 0)
+    assert np.all(np.abs(time_ns[query] - time_ns[found.row[query, k]]) >= 2 * 10**9)
+    own = index.nearest(unlabelled, 3, MatchRule(other_sessions_only=True))
+    assert np.all(own.row == -1)
+
+
+def test_multi_index_is_the_same_on_any_number_of_threads(features):
+    _, database = features
+    answers = []
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, before):
+            numba.set_num_threads(threads)
+            index = InvertedMultiIndex(database, seed=3)
+            answers.append(index.nearest(database, 3, MatchRule()).row.tobytes())
+    finally:
+        numba.set_num_threads(before)
+    assert answers[0] == answers[1]
+
+
+def test_empty_database_has_no_neighbours(features):
+    _, database = features
+    nothing = database.take(np.zeros(0, dtype=np.int64))
+    found = HammingIndex(nothing).nearest(database.take(np.arange(5)), 2, MatchRule())
+    assert np.all(found.row == -1)
