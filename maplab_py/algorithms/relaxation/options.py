@@ -34,20 +34,16 @@ class RelaxationOptions:
         "degrees of freedom) is above it lose their weight.",
     )
     position_drift: float = option(
-        0.05, help="Position random walk of the trajectories.", unit="m/sqrt(m)"
+        0.03, help="Position random walk of the trajectories.", unit="m/sqrt(m)"
     )
     yaw_drift_deg: float = option(
-        0.5, help="Heading random walk of the trajectories.", unit="deg/sqrt(s)"
+        0.4, help="Heading random walk of the trajectories.", unit="deg/sqrt(s)"
     )
     tilt_drift_deg: float = option(
-        0.02,
-        help="Roll and pitch random walk of the trajectories; small, because gravity shows them.",
-        unit="deg/sqrt(s)",
+        0.1, help="Roll and pitch random walk of the trajectories.", unit="deg/sqrt(s)"
     )
     tilt_sigma_deg: float = option(
-        0.5,
-        help="Uncertainty of the roll and pitch of each mission's first vertex.",
-        unit="deg",
+        0.5, help="Uncertainty of roll and pitch: gravity shows them at every vertex.", unit="deg"
     )
     loop_sigma_m: float = option(
         0.05, help="Position uncertainty of loop closures that come without a covariance.", unit="m"

@@ -21,7 +21,7 @@ I64 = NDArray[np.int64]
 
 _FLOOR_M_PER_SQRT_S = 0.005  # a standing device drifts too
 _SHORTEST_S = 1e-3  # vertices without times, or with equal ones
-_LOOP_FLOOR = np.repeat([0.01, np.deg2rad(0.2)], 3) ** 2
+_LOOP_FLOOR = np.repeat([0.03, np.deg2rad(0.5)], 3) ** 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses
     """Return the edges between consecutive vertices: their present relative poses.
 
     The covariance has the shape of visual-inertial drift. Position errs by a random walk over the
-    distance, heading by one over time; roll and pitch hardly, since gravity shows them. So the
+    distance, heading by one over time; roll and pitch less, since gravity shows them. So the
     angular error is weighted in G's axes: W = diag(1/s_tilt, 1/s_tilt, 1/s_yaw) R_G_B.
     """
     vertices = vi_map.vertices
@@ -149,8 +149,8 @@ def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses
 def loop_edges(edges: LoopClosureEdges, options: RelaxationOptions) -> RelativePoses:
     """Return loop closures as edges; those without a usable covariance get the options' one.
 
-    Every covariance is widened by 1 cm and 0.2 deg: what a registration claims of itself leaves
-    out calibration and the landmarks' own drift, and maplab writes 1e-7 I.
+    Every covariance is widened by 3 cm and 0.5 deg: a registration knows nothing of the drift and
+    the depth errors of the landmarks that it stands on (and maplab writes 1e-7 I).
     """
     fallback = np.repeat([options.loop_sigma_m, np.deg2rad(options.loop_sigma_deg)], 3) ** 2
     covariance = np.array(edges.covariance)

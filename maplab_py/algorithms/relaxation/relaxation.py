@@ -84,10 +84,10 @@ def relax(
     label = clusters(len(vi_map.vertices), [graph, loops])
     is_active = np.isin(label, label[loops.from_vertex])
     graph = graph.take(np.flatnonzero(is_active[graph.from_vertex]))
-    anchors, first_of_missions = _anchors(vi_map, label, is_active)
+    anchors = _anchors(label, is_active)
     is_free = is_active.copy()
     is_free[anchors] = False
-    tilt = TiltPriors.of_vertices(first_of_missions, vi_map.T_G_I, options.tilt_sigma_deg)
+    tilt = TiltPriors.of_vertices(np.flatnonzero(is_free), vi_map.T_G_I, options.tilt_sigma_deg)
     solution = optimize_robustly(vi_map.T_G_I, is_free, graph, loops, tilt, options, progress)
     moved = move_vertices(vi_map, np.flatnonzero(is_free), solution.T_G_I)
     report = _report(vi_map, moved, is_active, len(anchors), loops, solution, num_ignored, notes)
@@ -109,13 +109,10 @@ def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
     return vi_map.replace(vertices=vertices.replace(T_M_I=poses, v_M=velocities))
 
 
-def _anchors(vi_map: VIMap, label: I64, is_active: NDArray[np.bool_]) -> tuple[I64, I64]:
-    """Return the first active vertex of every cluster, and those of its other missions."""
+def _anchors(label: I64, is_active: NDArray[np.bool_]) -> I64:
+    """Return the first active vertex of every cluster."""
     active = np.flatnonzero(is_active)
-    first_of_cluster = active[np.unique(label[active], return_index=True)[1]]
-    mission = vi_map.vertices.mission[active]
-    first_of_mission = active[np.unique(mission, return_index=True)[1]]
-    return np.sort(first_of_cluster), np.setdiff1d(first_of_mission, first_of_cluster)
+    return np.sort(active[np.unique(label[active], return_index=True)[1]])
 
 
 def _report(
