@@ -1,0 +1,75 @@
+"""Descriptors: near views of a point look alike, far ones less, other points not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.simulation.appearance import describe, make_appearance, make_session_appearance
+from maplab_py.simulation.detection import Detections
+from maplab_py.simulation.scenario import AppearanceOptions
+
+COUNT = 400
+
+
+def _detections(view: list[float], distance: float) -> Detections:
+    rows = np.arange(COUNT)
+    direction = np.array(view) / np.linalg.norm(view)
+    return Detections(
+        frame=np.zeros(COUNT, dtype=np.int64),
+        point=rows,
+        track=rows,
+        uv_true_px=np.zeros((COUNT, 2)),
+        uv_px=np.zeros((COUNT, 2)),
+        view_G=np.tile(direction, (COUNT, 1)),
+        distance_m=np.full(COUNT, distance),
+    )
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.median(np.bitwise_count(a ^ b).sum(axis=1)))
+
+
+def test_distances_grow_with_view_scale_and_session() -> None:
+    world = make_appearance(AppearanceOptions(), COUNT, np.random.default_rng(0))
+    session = make_session_appearance(world, np.random.default_rng(1))
+    other = make_session_appearance(world, np.random.default_rng(2))
+    rng = np.random.default_rng(3)
+    here = describe(session, _detections([0, 0, 1], 3.0), rng)
+    again = describe(session, _detections([0, 0, 1], 3.0), rng)
+    tilted = describe(session, _detections([1, 0, 1], 3.0), rng)
+    far = describe(session, _detections([0, 0, 1], 9.0), rng)
+    later = describe(other, _detections([0, 0, 1], 3.0), rng)
+    bits = 8 * here.shape[1]
+    assert here.shape == (COUNT, 48)
+    same = _distance(here, again)
+    assert 0.02 * bits < same < 0.15 * bits
+    assert same < _distance(here, tilted) < 0.3 * bits
+    assert same < _distance(here, far) < 0.3 * bits
+    assert same < _distance(here, later) < 0.3 * bits
+    assert 0.45 * bits < _distance(here, here[::-1]) < 0.55 * bits
+
+
+def test_bits_are_correlated() -> None:
+    world = make_appearance(AppearanceOptions(), COUNT, np.random.default_rng(0))
+    session = make_session_appearance(world, np.random.default_rng(1))
+    found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
+    bits = np.unpackbits(found, axis=1).astype(np.float64)
+    correlation = np.corrcoef(bits.T)
+    np.fill_diagonal(correlation, 0.0)
+    # independent bits of 400 points would stay below 0.25
+    assert np.abs(correlation).max() > 0.3
+
+
+def test_share_that_vanishes() -> None:
+    world = make_appearance(AppearanceOptions(vanish_share=0.3), 5000, np.random.default_rng(0))
+    session = make_session_appearance(world, np.random.default_rng(1))
+    assert abs(np.mean(session.is_there) - 0.7) < 0.03
+
+
+def test_length_of_the_descriptor() -> None:
+    options = AppearanceOptions(descriptor_bytes=64)
+    world = make_appearance(options, COUNT, np.random.default_rng(0))
+    session = make_session_appearance(world, np.random.default_rng(1))
+    found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
+    assert found.shape == (COUNT, 64)
+    assert found.dtype == np.uint8

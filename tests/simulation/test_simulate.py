@@ -1,0 +1,201 @@
+"""Whole sessions: consistent maps, exact at truth without noise, honest noise with it, repeatable."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+
+from maplab_py.geometry import se3
+from maplab_py.sensors.projection import project
+from maplab_py.simulation.scenario import CameraOptions, MotionOptions, Scenario, Seeds
+from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.simulate import SimulatedData, simulate
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.merge import merge_maps
+from tests.simulation.small import PERFECT, SMALL, simulated
+
+
+def _tables(vi_map: VIMap) -> dict[str, bytes]:
+    tables = {}
+    for field in dataclasses.fields(vi_map):
+        table = getattr(vi_map, field.name)
+        if hasattr(table, "columns"):
+            for name, column in table.columns().items():
+                data = (
+                    repr(column.tolist()).encode() if column.dtype == object else column.tobytes()
+                )
+                tables[f"{field.name}.{name}"] = data
+    return tables
+
+
+def _true_residuals(data: SimulatedData) -> np.ndarray:
+    """Return measured minus true pixels (O, 2) of the first session's observations."""
+    vi_map, truth = data.maps[0], data.truth
+    keypoints = vi_map.observations
+    landmark = vi_map.keypoints.landmark[keypoints]
+    T_G_I = truth.T_G_I[vi_map.keypoint_vertex[keypoints]]
+    rig = next(s for s in vi_map.sensors.sensors.values() if hasattr(s, "cameras"))
+    camera = vi_map.frames.camera_index[vi_map.keypoint_frame[keypoints]]
+    T_G_C = se3.compose(T_G_I, rig.T_B_C[camera])
+    point = truth.point_G[truth.landmark_point[landmark]]
+    p_C = se3.transform(se3.inverse(T_G_C), point)
+    residuals = np.empty((len(keypoints), 2))
+    for row, one in enumerate(rig.cameras):
+        own = camera == row
+        uv, visible = project(one, p_C[own])
+        assert visible.all()
+        residuals[own] = vi_map.keypoints.uv_px[keypoints[own]] - uv
+    return residuals
+
+
+def test_maps_are_consistent_and_merge() -> None:
+    data = simulated()
+    merged, _ = merge_maps(*data.maps)
+    for vi_map in (*data.maps, merged):
+        report = check_consistency(vi_map)
+        assert report.errors == ()
+        assert report.warnings == ()
+    assert len(merged.missions) == 2
+    assert len(merged.sensors.sensors) == 2
+
+
+def test_without_noise_the_estimators_projection_meets_every_pixel() -> None:
+    data = simulated(PERFECT)
+    residuals = _true_residuals(data)
+    assert len(residuals) > 1000
+    assert np.abs(residuals).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("distortion", "parameters"),
+    [("equidistant", (-0.02, 0.01, -0.006, 0.001)), ("fisheye", (0.9,)), ("none", ())],
+)
+def test_without_noise_every_model_and_a_rig_of_two(
+    distortion: str, parameters: tuple[float, ...]
+) -> None:
+    second = CameraOptions(
+        distortion=distortion,
+        distortion_parameters=parameters,
+        turn_rad=(0.0, 0.1, 0.6),
+        position_m=(0.05, -0.1, 0.0),
+    )
+    scenario = dataclasses.replace(PERFECT, cameras=(CameraOptions(), second))
+    data = simulate(scenario)
+    assert len(data.maps[0].frames) == 2 * len(data.maps[0].vertices)
+    assert check_consistency(data.maps[0]).errors == ()
+    assert np.abs(_true_residuals(data)).max() < 1e-9
+
+
+def test_without_noise_initial_states_are_true() -> None:
+    data = simulated(PERFECT)
+    vi_map, truth = data.maps[0], data.truth
+    T_G_I = se3.compose(truth.T_G_M[0], vi_map.vertices.T_M_I)
+    np.testing.assert_allclose(se3.local(T_G_I, truth.T_G_I), 0.0, atol=1e-12)
+    p_G = se3.transform(T_G_I[vi_map.landmarks.vertex], vi_map.landmarks.p_I)
+    np.testing.assert_allclose(p_G, truth.point_G[truth.landmark_point], atol=1e-6)
+
+
+def test_pixel_noise_has_the_announced_size() -> None:
+    measurement = dataclasses.replace(SMALL.measurement, identity_swap_share=0.0)
+    data = simulate(dataclasses.replace(SMALL, measurement=measurement))
+    residuals = _true_residuals(data)
+    ratio = np.mean((residuals / 0.8) ** 2)
+    assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_swapped_identities_are_gross_errors() -> None:
+    measurement = dataclasses.replace(SMALL.measurement, identity_swap_share=0.2)
+    error = np.linalg.norm(
+        _true_residuals(simulate(dataclasses.replace(SMALL, measurement=measurement))), axis=1
+    )
+    assert 0.005 < np.mean(error > 6.0) < 0.2
+
+
+def test_same_seed_same_bytes() -> None:
+    again = simulate(SMALL)
+    for one, two in zip(simulated().maps, again.maps, strict=True):
+        assert _tables(one) == _tables(two)
+    for field in dataclasses.fields(again.truth):
+        one, two = getattr(simulated().truth, field.name), getattr(again.truth, field.name)
+        assert one.tobytes() == two.tobytes()
+
+
+def _with_seeds(**seeds: int) -> SimulatedData:
+    return simulate(dataclasses.replace(SMALL, seeds=dataclasses.replace(Seeds(), **seeds)))
+
+
+def test_seeds_are_independent() -> None:
+    base = simulated()
+    measurement = _with_seeds(measurement=9)
+    np.testing.assert_array_equal(measurement.truth.T_G_I, base.truth.T_G_I)
+    np.testing.assert_array_equal(measurement.truth.point_G, base.truth.point_G)
+    assert not np.array_equal(
+        measurement.maps[0].imu_samples.accel_gyro, base.maps[0].imu_samples.accel_gyro
+    )
+    motion = _with_seeds(motion=9)
+    np.testing.assert_array_equal(motion.truth.point_G, base.truth.point_G)
+    assert not np.array_equal(motion.truth.T_G_I, base.truth.T_G_I)
+    world = _with_seeds(world=9)
+    np.testing.assert_array_equal(world.truth.T_G_I, base.truth.T_G_I)
+    assert not np.array_equal(world.truth.point_G, base.truth.point_G)
+    look = _with_seeds(appearance=9)
+    np.testing.assert_array_equal(look.truth.T_G_I, base.truth.T_G_I)
+    np.testing.assert_array_equal(look.truth.point_G, base.truth.point_G)
+    assert not np.array_equal(look.maps[0].keypoints.descriptor, base.maps[0].keypoints.descriptor)
+
+
+def test_edges_begin_and_end_at_their_vertices() -> None:
+    vi_map = simulated().maps[0]
+    time_ns, edges = vi_map.vertices.timestamp_ns, vi_map.imu_edges
+    samples = vi_map.imu_samples.timestamp_ns
+    np.testing.assert_array_equal(samples[vi_map.sample_start[:-1]], time_ns[edges.from_vertex])
+    np.testing.assert_array_equal(samples[vi_map.sample_start[1:] - 1], time_ns[edges.to_vertex])
+    np.testing.assert_allclose(np.diff(time_ns), 2e8, atol=1.0)
+
+
+def test_sessions_drift_and_know_nothing_of_their_frames() -> None:
+    data = simulated()
+    for vi_map in data.maps:
+        assert not vi_map.baseframes.is_known.any()
+        assert np.all(vi_map.landmarks.quality == 0)
+        np.testing.assert_allclose(vi_map.vertices.T_M_I[0, 4:], 0.0, atol=1e-12)
+    drifted = se3.compose(data.truth.T_G_M[0], data.maps[0].vertices.T_M_I)
+    error = np.linalg.norm((drifted - data.truth.T_G_I[: len(drifted)])[:, 4:], axis=1)
+    assert 0.005 < error.max() < 1.0
+
+
+def test_clutter_and_broken_tracks() -> None:
+    vi_map = simulated().maps[0]
+    clutter = vi_map.keypoints.track_id < 0
+    assert np.mean(clutter) == pytest.approx(0.2, abs=0.03)
+    assert np.all(vi_map.keypoints.landmark[clutter] == -1)
+    points, counts = np.unique(simulated().truth.landmark_point, return_counts=True)
+    assert len(points) > 100
+    assert counts.max() > 1
+
+
+@pytest.mark.slow
+def test_long_session_takes_at_most_20_seconds() -> None:
+    scenario = load_scenario("single_session")
+    start = time.perf_counter()
+    data = simulate(scenario)
+    seconds = time.perf_counter() - start
+    vi_map = data.maps[0]
+    assert len(vi_map.vertices) == 1201
+    assert np.mean(vi_map.frames.keypoint_count) > 500
+    assert seconds <= 20.0
+
+
+def test_straight_turns_in_both_directions() -> None:
+    forward = MotionOptions(duration_s=4.0, turns=0.3)
+    scenario = Scenario(sessions=(forward, dataclasses.replace(forward, reverse=True)))
+    truth = simulate(dataclasses.replace(SMALL, sessions=scenario.sessions)).truth
+    angle = [
+        np.unwrap(np.arctan2(*truth.T_G_I[truth.vertex_mission == m, 5:3:-1].T)) for m in (0, 1)
+    ]
+    assert angle[0][-1] > angle[0][0]
+    assert angle[1][-1] < angle[1][0]
