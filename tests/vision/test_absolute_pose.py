@@ -41,9 +41,7 @@ def test_pose_among_wrong_matches_with_noise_and_tilted_gravity(outliers):
 
 def test_covariance_matches_the_scatter():
     sigma = 0.001
-    problems, truth, _ = pose_problems(
-        400, 60, outliers=0.0, noise_rad=sigma, tilt_rad=0.0, seed=3
-    )
+    problems, truth, _ = pose_problems(400, 60, outliers=0.0, noise_rad=sigma, tilt_rad=0.0, seed=3)
     found = solve_poses(problems, tilt_sigma_rad=10.0)
     delta = se3.local(truth, found.T_M_I)
     # the tolerance stands for one standard deviation in the covariance

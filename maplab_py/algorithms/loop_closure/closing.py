@@ -170,7 +170,8 @@ def _explanation(detection: Detection, options: LoopClosureOptions) -> str:
     if len(c) == 0:
         return (
             f"no loop closures: of {detection.descriptor_matches} descriptor matches no place got "
-            f"--lc_min_verify_matches_num={options.min_verify_matches_num} from one vertex"
+            f"--lc_min_verify_matches_num={options.min_verify_matches_num} from one vertex "
+            "(landmarks that are one already are not matched)"
         )
     best = int(np.argmax(c.inlier_count))
     ratio = c.inlier_count / np.maximum(c.match_count, 1)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
@@ -30,7 +31,6 @@ class MergeResult:
 
     landmarks_merged: int = 0
     observations_moved: int = 0
-    keypoints_attached: int = 0
     refused: dict[str, int] = dataclasses.field(default_factory=dict)  # landmark pairs by reason
 
 
@@ -55,12 +55,12 @@ def merge_verified_landmarks(
     refuse(GAP, gap)
     open_ &= ~gap
     rows = np.flatnonzero(open_)
-    far = _distances(vi_map, closures, closure[rows], rows, source[rows])
-    far_rows = rows[far > options.max_merge_distance_m]
-    mask = np.zeros(len(source), dtype=np.bool_)
-    mask[far_rows] = True
-    refuse(TOO_FAR, mask)
-    rows = rows[far <= options.max_merge_distance_m]
+    distance, depth = _distances(vi_map, closures, closure[rows], rows, source[rows])
+    allowed = np.maximum(options.max_merge_distance_m, options.max_merge_distance_ratio * depth)
+    far = np.zeros(len(source), dtype=np.bool_)
+    far[rows[distance > allowed]] = True
+    refuse(TOO_FAR, far)
+    rows = rows[distance <= allowed]
 
     first, second, votes, bits = _pairs(
         source[rows], closures.landmark[rows], closures.query_vertex[closure[rows]],
@@ -93,16 +93,20 @@ def _mergeable(vi_map: VIMap, closures: Closures) -> NDArray[np.bool_]:
     return np.asarray((query == place) | (known[query] & known[place]))
 
 
-def _distances(vi_map: VIMap, closures: Closures, closure: I64, rows: I64, source: I64) -> F64:
-    """Return how far apart (N,) the landmarks are once the query is where verification put it."""
+def _distances(
+    vi_map: VIMap, closures: Closures, closure: I64, rows: I64, source: I64
+) -> tuple[F64, F64]:
+    """Return how far apart (N,) the landmarks are once the query is where verification put it.
+
+    Also the distance (N,) of the database landmark from the query.
+    """
     query = closures.query_vertex[closure]
     p_I = se3.transform(se3.inverse(vi_map.T_G_I[query]), vi_map.p_G[source])
-    mission = vi_map.vertices.mission[closures.place_vertex[closure]]
-    p_M = se3.transform(closures.T_M_I[closure], p_I)
-    target_M = se3.transform(
-        se3.inverse(vi_map.T_G_M)[mission], vi_map.p_G[closures.landmark[rows]]
-    )
-    return np.asarray(np.linalg.norm(p_M - target_M, axis=1))
+    mission = vi_map.vertices.mission[closures.place_vertex[closure]].astype(np.int64)
+    T_M_I = closures.T_M_I[closure]
+    target_M = points_in_mission(vi_map, closures.landmark[rows], mission)
+    gap = np.linalg.norm(se3.transform(T_M_I, p_I) - target_M, axis=1)
+    return np.asarray(gap), np.asarray(np.linalg.norm(target_M - T_M_I[:, 4:], axis=1))
 
 
 def _pairs(

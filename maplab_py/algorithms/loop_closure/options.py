@@ -66,6 +66,11 @@ class LoopClosureOptions:
     max_merge_distance_m: float = option(
         0.3, help="Largest distance of merged landmarks once the closure is applied", unit="m"
     )
+    max_merge_distance_ratio: float = option(
+        0.1,
+        help="The distance may also be this part of the landmark's distance from the query: depth "
+        "is what landmarks err most in",
+    )
     max_merge_gap_m: float = option(
         0.5,
         help="Landmarks are not merged over a closure that corrects more: relax first",

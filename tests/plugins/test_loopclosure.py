@@ -1,0 +1,69 @@
+"""The loop closure and relaxation commands, through the session."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from tests.algorithms.loop_closure.rooms import Walk, make_map
+
+DRIFT = (0.2, -0.1, 0.05, 0.01)
+TWICE = [Walk(room=1), Walk(room=1, start_s=60.0, drift=DRIFT)]
+UNRELATED = [Walk(room=1), Walk(room=2, start_s=60.0)]
+
+
+def session_of(walks: list[Walk]) -> Session:
+    session = Session(load_registry())
+    session.maps.add("rooms", make_map(walks)[0])
+    return session
+
+
+@pytest.mark.parametrize("command", ["lc", "lcom", "loopclosure_all_missions"])
+def test_loops_are_closed_by_merging(command: str) -> None:
+    session = session_of(TWICE)
+    before = len(session.vi_map.landmarks)
+    report = session.run(command)
+    assert report.failure == ""
+    assert len(session.vi_map.landmarks) == before - report.landmarks_merged < before
+
+
+def test_edges_instead_of_merging_and_their_removal() -> None:
+    session = session_of(TWICE)
+    report = session.run("lc", lc_insert_lc_edge_instead_of_merging=True)
+    assert len(session.vi_map.loop_closure_edges) == report.edges_added > 0
+    assert report.landmarks_merged == 0
+    removed = session.run("dlc")
+    assert f"removed {report.edges_added}" in removed.text
+    assert len(session.vi_map.loop_closure_edges) == 0
+
+
+@pytest.mark.parametrize("command", ["relax", "srelax"])
+def test_relaxing_brings_the_two_walks_together(command: str) -> None:
+    session = session_of(TWICE)
+    truth = make_map(TWICE)[1]
+    before = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
+    report = session.run(command)
+    assert report.failure == ""
+    after = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
+    assert after < 0.4 * before
+    assert len(session.vi_map.loop_closure_edges) == 0
+
+
+def test_relaxing_may_merge_too() -> None:
+    session = session_of(TWICE)
+    report = session.run("relax", lc_relax_merge_landmarks=True)
+    assert report.merging.landmarks_merged > 100
+
+
+@pytest.mark.parametrize("command", ["lc", "relax", "srelax"])
+def test_nothing_found_fails_with_an_explanation(command: str) -> None:
+    session = session_of(UNRELATED)
+    assert "no loop closures" in session.run(command).failure
+
+
+def test_seed_and_gates_are_flags() -> None:
+    session = session_of(TWICE)
+    report = session.run("lc", lc_seed=7, lc_min_inlier_count=1000)
+    assert "wanted 1000" in report.failure
