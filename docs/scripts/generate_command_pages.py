@@ -1,6 +1,6 @@
 """Write docs/commands from the registry: an index, and one page per plugin.
 
-    python docs/scripts/generate_command_pages.py
+python docs/scripts/generate_command_pages.py
 """
 
 from __future__ import annotations

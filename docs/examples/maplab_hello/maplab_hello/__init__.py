@@ -36,7 +36,7 @@ class FarLandmarks(Report):
 def count_far_landmarks(
     context: CommandContext,
     *,
-    options: FarLandmarkOptions = FarLandmarkOptions(),  # noqa: B008
+    options: FarLandmarkOptions = FarLandmarkOptions(),
 ) -> FarLandmarks:
     """Count the landmarks that are far from the vertex that stores them."""
     distance = np.linalg.norm(context.vi_map.landmarks.p_I, axis=1)

@@ -1,0 +1,109 @@
+"""The documentation does what it says: commands run, links lead somewhere, pages are up to date."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from maplab_py.console.lines import split_commands
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from maplab_py.simulation.scenario_file import parse_scenario
+from tests.docs.markdown import blocks, links
+from tests.support.data import REPOSITORY
+
+DOCS = REPOSITORY / "docs"
+PAGES = sorted([*REPOSITORY.glob("*.md"), *DOCS.rglob("*.md")])
+
+
+def _script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / "scripts" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_command_pages_are_those_of_the_registry() -> None:
+    registry = load_registry()
+    assert registry.problems == []
+    expected = _script("generate_command_pages").pages(registry)
+    present = {path.name: path.read_text() for path in (DOCS / "commands").glob("*.md")}
+    assert sorted(present) == sorted(expected)
+    stale = [name for name, text in expected.items() if present[name] != text]
+    assert stale == [], "run docs/scripts/generate_command_pages.py"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_links_lead_somewhere(path: Path) -> None:
+    missing = [target for target in links(path) if not (path.parent / target).exists()]
+    assert missing == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_commands_on_pages_exist_with_their_flags(path: Path) -> None:
+    session = Session(load_registry())
+    for _, text in blocks(path, "maplab"):
+        for words in split_commands(text):
+            call = session.parse(words)
+            assert call.arguments() is not None
+
+
+def test_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    session = Session(load_registry())
+    errors = []
+    for language, text in blocks(DOCS / "tutorial.md", "maplab", "python"):
+        if language == "python":
+            exec(compile(text, "tutorial.md", "exec"), {})
+            continue
+        for words in split_commands(text):
+            report = session.execute(session.parse(words))
+            assert report.failure == ""
+            if words[0] == "evaluate_map":
+                errors.append(report)
+    before, after = errors
+    assert after.ate_m <= 0.25 * before.ate_each_m
+    assert (tmp_path / "merged" / "vi_map").is_dir()
+    assert (tmp_path / "trajectory.csv").is_file()
+
+
+def test_scenario_of_the_simulation_page_is_one() -> None:
+    ((_, text),) = blocks(DOCS / "simulation.md", "yaml")
+    scenario = parse_scenario(text, "simulation.md")
+    assert len(scenario.cameras) == 2
+    assert len(scenario.sessions) == 2
+
+
+def test_commands_of_the_readme_are_known() -> None:
+    names = load_registry().names
+    prompts = [
+        line.split("$", 1)[1].replace("*", "", 1).split("#")[0].split()
+        for _, text in blocks(REPOSITORY / "README.md", "")
+        for line in text.splitlines()
+        if line.startswith("maplab <")
+    ]
+    assert len(prompts) > 10
+    assert [words[0] for words in prompts if words[0] not in [*names, "quit"]] == []
+
+
+def test_python_blocks_compile() -> None:
+    compiled = 0
+    for path in PAGES:
+        for _, text in blocks(path, "python"):
+            compile(text, str(path), "exec")
+            compiled += 1
+    assert compiled >= 5
+
+
+def test_decisions_have_their_three_parts() -> None:
+    decisions = sorted((DOCS / "decisions").glob("*.md"))
+    assert [int(path.name[:4]) for path in decisions] == list(range(1, len(decisions) + 1))
+    for path in decisions:
+        text = path.read_text()
+        for part in ("**Context.**", "**Decision.**", "**Consequences.**"):
+            assert part in text, f"{path.name} lacks {part}"

@@ -1,0 +1,110 @@
+"""The commands simulate, list_scenarios, evaluate_map and demo, as they are typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from maplab_py.console.session import Session
+from maplab_py.errors import UserError
+from maplab_py.simulation.truth import Truth
+from maplab_py.storage.native import load_map
+from tests.e2e.support import run_program
+
+SCENARIO = """
+name: tiny
+world: {landmarks_per_room: 800}
+measurement: {frame_rate_hz: 4.0, max_keypoints: 80}
+sessions: [{duration_s: 4.0, turns: 0.2}, {duration_s: 3.0, turns: 0.2, start_turn: 0.1}]
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(SCENARIO)
+    return path
+
+
+def test_simulate_writes_maps_and_truth(tmp_path: Path, scenario: Path) -> None:
+    session = Session()
+    report = session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "out")
+    assert [line.folder.name for line in report.maps] == ["session_1", "session_2"]
+    vi_map, _ = load_map(tmp_path / "out" / "session_1")
+    assert len(vi_map.vertices) == report.maps[0].vertices == 17
+    truth = Truth.load(report.truth)
+    assert len(truth.vertex_id) == 17 + 13
+
+
+def test_simulated_maps_are_evaluated_against_their_truth(tmp_path: Path, scenario: Path) -> None:
+    session = Session()
+    report = session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "out")
+    session.run("load_merge_all_maps", maps_folder=tmp_path / "out")
+    assert session.run("check_map_consistency").failure == ""
+    errors = session.run("evaluate_map", truth=report.truth)
+    assert len(errors.missions) == 2
+    assert errors.ate_m > errors.ate_each_m > 0.0
+
+
+def test_seed_changes_the_data_and_repeats_it(tmp_path: Path, scenario: Path) -> None:
+    session = Session()
+    maps = []
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        folder = tmp_path / name
+        session.run("simulate", scenario=str(scenario), seed=seed, map_folder=folder)
+        maps.append(load_map(folder / "session_1")[0])
+    one, same, other = (vi_map.keypoints.uv_px.tobytes() for vi_map in maps)
+    assert one == same
+    assert one != other
+
+
+def test_simulate_refuses_a_folder_in_use(tmp_path: Path, scenario: Path) -> None:
+    session = Session()
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "thesis.txt").write_text("years of work")
+    with pytest.raises(UserError, match=r"used is not empty.*--overwrite"):
+        session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "used")
+    with pytest.raises(UserError, match="is a file"):
+        session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "used" / "thesis.txt")
+    with pytest.raises(UserError, match="--seed=-1"):
+        session.run("simulate", scenario=str(scenario), seed=-1, map_folder=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_scenarios_are_listed() -> None:
+    report = Session().run("list_scenarios")
+    lines = {line.scenario: line for line in report.scenarios}
+    assert lines["three_sessions"].sessions == 3
+    assert lines["three_sessions"].description
+
+
+def test_unknown_scenario_on_the_command_line(tmp_path: Path) -> None:
+    done = run_program(tmp_path, "simulate", "--scenario=nowhere", "--map_folder=out")
+    assert done.returncode == 2
+    assert "there is no scenario 'nowhere'" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_demo_refuses_a_folder_in_use(tmp_path: Path) -> None:
+    (tmp_path / "maplab_demo").mkdir()
+    (tmp_path / "maplab_demo" / "file").write_text("")
+    done = run_program(tmp_path, "demo")
+    assert done.returncode == 2
+    assert "maplab_demo is not empty" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_demo_keeps_its_promises(tmp_path: Path, seed: int) -> None:
+    done = run_program(tmp_path, "--json", "demo", f"--seed={seed}", seconds=300)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout.splitlines()[-1])["report"]
+    assert report["ate_after_m"] <= 0.25 * report["ate_before_m"]
+    assert len(report["missions"]) == 3
+    for mission in report["missions"]:
+        assert mission["anchoring_offset_m"] <= 0.05
+        assert mission["anchoring_yaw_deg"] <= 0.3
+    merged, _ = load_map(tmp_path / "maplab_demo")
+    assert len(merged.missions) == 3
