@@ -1,0 +1,67 @@
+"""Loop closure on recorded maps: what a brute-force search found there, and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax
+from maplab_py.geometry import se3
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.submaps import append_submaps
+from tests.support.data import shared_data
+
+pytestmark = pytest.mark.slow
+
+
+def load(relative: str) -> VIMap:
+    native = pytest.importorskip("maplab_py.storage.native")
+    return native.load_map(shared_data(f"maplab_maps/{relative}"))[0]
+
+
+def test_the_one_loop_of_the_handheld_walk_is_found_relaxed_and_merged():
+    vi_map = load("tango_handheld")
+    edges, report = find_loop_closures(vi_map)
+    assert report.accepted_vertices >= 100
+    seconds = (vi_map.vertices.timestamp_ns - vi_map.vertices.timestamp_ns[0]) * 1e-9
+    first = np.minimum(seconds[edges.from_vertex], seconds[edges.to_vertex])
+    last = np.maximum(seconds[edges.from_vertex], seconds[edges.to_vertex])
+    assert first.max() < 12.0
+    assert last.min() > 100.0
+
+    _, refused = close_loops(vi_map)
+    assert "run relax first" in refused.failure
+
+    relaxed, _ = relax(vi_map, RelaxationOptions(), loop_closures=edges)
+    merged, closed = close_loops(relaxed)
+    assert closed.median_correction_m < 0.05
+    assert closed.landmarks_merged > 200
+    kept = np.count_nonzero(merged.keypoints.landmark >= 0)
+    assert kept == np.count_nonzero(relaxed.keypoints.landmark >= 0)
+
+
+def test_closures_of_the_flight_agree_with_ground_truth():
+    submaps = [load(f"euroc_v1_01/euroc_v1_01_submap_{i}") for i in range(8)]
+    vi_map, _ = append_submaps(submaps)
+    edges, report = find_loop_closures(vi_map)
+    assert report.accepted_vertices >= 90
+    time_s, position, valid = ground_truth_positions(vi_map)
+    assert valid.sum() >= 148
+    distance = np.linalg.norm(position[edges.from_vertex] - position[edges.to_vertex], axis=1)
+    known = valid[edges.from_vertex] & valid[edges.to_vertex]
+    error = np.abs(np.linalg.norm(edges.T_A_B[:, 4:], axis=1) - distance)[known]
+    assert error.max() < 0.3
+    assert np.median(error) < 0.05
+    assert np.all(np.diff(time_s) > 0)
+
+
+def ground_truth_positions(vi_map: VIMap):
+    from maplab_py.geometry.interpolation import interpolate_poses
+
+    table = np.loadtxt(shared_data("euroc_imu/V101.gt.csv"), delimiter=",", comments="#")
+    poses = se3.make(table[:, [5, 6, 7, 4]], table[:, 1:4])
+    time_ns = vi_map.vertices.timestamp_ns
+    found, valid = interpolate_poses(table[:, 0].astype(np.int64), poses, time_ns)
+    return time_ns * 1e-9, found[:, 4:], valid
