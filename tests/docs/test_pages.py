@@ -82,7 +82,7 @@ def test_scenario_of_the_simulation_page_is_one() -> None:
 def test_commands_of_the_readme_are_known() -> None:
     names = load_registry().names
     prompts = [
-        line.split("$", 1)[1].replace("*", "", 1).split("#")[0].split()
+        line.split("$", 1)[1].split("#")[0].split()
         for _, text in blocks(REPOSITORY / "README.md", "")
         for line in text.splitlines()
         if line.startswith("maplab <")
