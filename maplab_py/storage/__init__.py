@@ -1,0 +1,1 @@
+"""Native map files: reading, writing, atomic saving, resources."""
