@@ -3,7 +3,9 @@
 A point has a latent vector z. Seen from another direction or distance, and in another session, z
 moves a little; bit i is the sign of w_i . z + noise. So bits with an activation near zero flip
 first, near views look alike, and bits that compare similar image regions flip together, as in
-BRISK or FREAK.
+BRISK or FREAK. Some observations are far noisier than others (blur, borders, a shifted keypoint).
+The defaults give distances between equal and between different points like those in maps that
+maplab has recorded with BRISK: medians of 51 and 178 bits out of 384.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ class Appearance:
 
     options: AppearanceOptions
     weights: F32  # (latent, bits)
+    threshold: F32  # (bits,) of the activations: some bits are mostly set, others mostly clear
     latent: F32  # (L, latent)
     gradient: F32  # (L, 4, latent) by view direction (3) and doubling of the distance
 
@@ -49,11 +52,12 @@ def make_appearance(
     bits, size = 8 * options.descriptor_bytes, options.latent_dimensions
     weights = rng.standard_normal((size, bits), dtype=np.float32)
     weights /= np.linalg.norm(weights, axis=0)
+    threshold = options.bit_bias * rng.standard_normal(bits, dtype=np.float32)
     latent = rng.standard_normal((points, size), dtype=np.float32)
     gradient = rng.standard_normal((points, 4, size), dtype=np.float32)
     gradient[:, :3] *= options.viewpoint_change
     gradient[:, 3] *= options.scale_change
-    return Appearance(options, weights, latent, gradient)
+    return Appearance(options, weights, threshold, latent, gradient)
 
 
 def make_session_appearance(world: Appearance, rng: np.random.Generator) -> SessionAppearance:
@@ -96,5 +100,6 @@ def _describe(
     latent[of_point] += np.einsum("nk,nkj->nj", view[of_point], world.gradient[known])
     activation = latent @ world.weights
     noise = rng.standard_normal(activation.shape, dtype=np.float32)
-    activation += np.float32(world.options.bit_noise) * noise
-    return np.packbits(activation > 0.0, axis=1)
+    spread = rng.standard_normal((len(point), 1), dtype=np.float32)
+    noise *= world.options.bit_noise * np.exp(world.options.bit_noise_spread * spread)
+    return np.packbits(activation + noise > world.threshold, axis=1)

@@ -83,8 +83,10 @@ class AppearanceOptions:
     """Binary descriptors: signs of correlated activations that move with the viewpoint."""
 
     descriptor_bytes: int = 48
-    latent_dimensions: int = 48
-    bit_noise: float = 0.25  # of an activation, per observation
+    latent_dimensions: int = 24
+    bit_bias: float = 0.45  # how unequal the bits' thresholds are
+    bit_noise: float = 0.3  # of an activation, per observation; the median
+    bit_noise_spread: float = 0.9  # of its logarithm over observations
     viewpoint_change: float = 0.45  # per unit of view direction
     scale_change: float = 0.25  # per doubling of the distance
     session_change: float = 0.25  # persistent, per session
