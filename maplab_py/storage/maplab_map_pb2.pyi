@@ -122,7 +122,7 @@ class VisualFrame(_message.Message):
     descriptor_types: _containers.RepeatedScalarFieldContainer[int]
     positions_3d: _containers.RepeatedScalarFieldContainer[float]
     time_offsets_ns: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, id: _Optional[_Union[Id, _Mapping]] = ..., timestamp_ns: _Optional[int] = ..., keypoints_px: _Optional[_Iterable[float]] = ..., sigmas_px: _Optional[_Iterable[float]] = ..., descriptors: _Optional[bytes] = ..., landmark_ids: _Optional[_Iterable[_Union[Id, _Mapping]]] = ..., scales: _Optional[_Iterable[float]] = ..., is_valid: _Optional[bool] = ..., track_ids: _Optional[_Iterable[int]] = ..., descriptor_types: _Optional[_Iterable[int]] = ..., positions_3d: _Optional[_Iterable[float]] = ..., time_offsets_ns: _Optional[_Iterable[int]] = ...) -> None: ...
+    def __init__(self, id: _Optional[_Union[Id, _Mapping]] = ..., timestamp_ns: _Optional[int] = ..., keypoints_px: _Optional[_Iterable[float]] = ..., sigmas_px: _Optional[_Iterable[float]] = ..., descriptors: _Optional[bytes] = ..., landmark_ids: _Optional[_Iterable[_Union[Id, _Mapping]]] = ..., scales: _Optional[_Iterable[float]] = ..., is_valid: bool = ..., track_ids: _Optional[_Iterable[int]] = ..., descriptor_types: _Optional[_Iterable[int]] = ..., positions_3d: _Optional[_Iterable[float]] = ..., time_offsets_ns: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class LandmarkStore(_message.Message):
     __slots__ = ("landmarks",)
@@ -286,7 +286,7 @@ class BaseFrame(_message.Message):
     T_G_M: _containers.RepeatedScalarFieldContainer[float]
     T_G_M_covariance: _containers.RepeatedScalarFieldContainer[float]
     is_T_G_M_known: bool
-    def __init__(self, T_G_M: _Optional[_Iterable[float]] = ..., T_G_M_covariance: _Optional[_Iterable[float]] = ..., is_T_G_M_known: _Optional[bool] = ...) -> None: ...
+    def __init__(self, T_G_M: _Optional[_Iterable[float]] = ..., T_G_M_covariance: _Optional[_Iterable[float]] = ..., is_T_G_M_known: bool = ...) -> None: ...
 
 class MetaData(_message.Message):
     __slots__ = ("map_folder", "map_description", "resource_folder_in_use", "map_resource_folder", "external_resource_folders")
