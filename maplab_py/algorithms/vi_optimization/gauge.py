@@ -1,0 +1,86 @@
+"""Gauge of a map's problem: which vertices hang together, and what is fixed of each cluster."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.estimation import gauge
+from maplab_py.estimation.inertial_terms import InertialTerm
+from maplab_py.estimation.pose_terms import AbsolutePoseTerm
+from maplab_py.estimation.problem import Problem
+from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
+
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def hold_unconstrained(problem: Problem, num_vertices: int) -> I64:
+    """Fix the nodes that no term touches; return the vertices whose pose is among them."""
+    touched = np.zeros(problem.num_nodes, dtype=np.bool_)
+    if problem.visual is not None:
+        data = problem.visual.observations
+        seeing = np.unique(data.vertex[data.inverse_sigma > 0.0]).astype(np.int64)
+        touched[NODES_PER_VERTEX * seeing + POSITION] = True
+        touched[NODES_PER_VERTEX * seeing + ORIENTATION] = True
+    for term in problem.factors:
+        touched[term.nodes.reshape(-1)] = True
+    problem.fix(np.flatnonzero(~touched))
+    return np.flatnonzero(~touched[NODES_PER_VERTEX * np.arange(num_vertices) + POSITION])
+
+
+def fix_gauge(problem: Problem, states: States, held: I64, *, has_inertial: bool) -> str:
+    """Fix what each cluster cannot observe; return one sentence about it."""
+    num_vertices = len(states.T_G_I)
+    labels = gauge.clusters(num_vertices, _links(problem))
+    is_held = np.zeros(num_vertices, dtype=np.bool_)
+    is_held[held] = True
+    anchored = _labels_of(labels, problem, AbsolutePoseTerm)
+    inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
+    relative = _labels_of(labels, problem, object)
+    counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}
+    for first in gauge.first_of_each(labels).tolist():
+        label = int(labels[first])
+        if is_held[first]:
+            continue
+        vertex = np.array([first], dtype=np.int64)
+        if label in anchored:
+            counts["nothing"] += 1
+        elif label in inertial:
+            gauge.fix_position_and_heading(problem, states, vertex)
+            counts["position and heading"] += 1
+        else:
+            gauge.fix_pose(problem, vertex)
+            members = np.flatnonzero(labels == label)
+            if label in relative or len(members) < 2:
+                counts["pose"] += 1
+                continue
+            offset = states.T_G_I[members, 4:] - states.T_G_I[first, 4:]
+            farthest = members[[int(np.argmax(np.linalg.norm(offset, axis=1)))]]
+            gauge.fix_distance(problem, states, vertex, farthest)
+            counts["pose and scale"] += 1
+    return ", ".join(f"{what} of {n} cluster(s)" for what, n in counts.items() if n) or "none"
+
+
+def _links(problem: Problem) -> list[tuple[I64, I64]]:
+    """Return pairs of vertices that a landmark or a factor joins."""
+    links = []
+    if problem.visual is not None:
+        data = problem.visual.observations
+        used = np.flatnonzero(data.inverse_sigma > 0.0)
+        landmark, vertex = data.landmark[used], data.vertex[used].astype(np.int64)
+        same = landmark[1:] == landmark[:-1]
+        links.append((vertex[:-1][same], vertex[1:][same]))
+    for term in problem.factors:
+        vertices = term.nodes // NODES_PER_VERTEX
+        links.append((vertices.min(axis=1), vertices.max(axis=1)))
+    return links
+
+
+def _labels_of(labels: I64, problem: Problem, kind: type) -> set[int]:
+    """Return the clusters that terms of a kind touch."""
+    found: set[int] = set()
+    for term in problem.factors:
+        if isinstance(term, kind):
+            found.update(np.unique(labels[term.nodes // NODES_PER_VERTEX]).tolist())
+    return found

@@ -1,0 +1,77 @@
+"""Flags of optvi and optv, with maplab's names."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class VIOptimizationOptions:
+    """What to optimise, how robustly, and for how long."""
+
+    flag_prefix: ClassVar[str] = "ba_"
+
+    num_iterations: int = option(30, help="Largest number of iterations.")
+    max_time_seconds: float = option(1e6, help="Stop after this time.", unit="s")
+    include_visual: bool = option(True, help="Use the reprojection errors of landmarks.")
+    include_inertial: bool = option(True, help="Use the IMU edges and the walk of their biases.")
+    include_6dof_odometry: bool = option(False, help="Use the odometry edges.")
+    include_wheel_odometry: bool = option(False, help="Use the wheel odometry edges.")
+    include_loop_closure_edges: bool = option(
+        False, help="Use the loop closure edges, robustly (dynamic covariance scaling)."
+    )
+    include_absolute_pose_constraints: bool = option(
+        False, help="Use the absolute pose measurements; they then fix position and heading."
+    )
+    fix_vertices: bool = option(False, help="Keep all poses.")
+    fix_velocity: bool = option(False, help="Keep all velocities.")
+    fix_gyro_bias: bool = option(False, help="Keep all gyroscope biases.")
+    fix_accel_bias: bool = option(False, help="Keep all accelerometer biases.")
+    fix_landmark_positions: bool = option(False, help="Keep all landmarks.")
+    loss: str = option(
+        "huber",
+        help="Robust loss of reprojection errors.",
+        choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"),
+    )
+    loss_scale: float = option(
+        3.0, help="Scale of the loss, in standard deviations, within a mission."
+    )
+    loss_scale_other_mission: float = option(
+        10.0, help="Scale of the loss for landmarks stored in another mission, in deviations."
+    )
+    min_landmarks_per_frame: int = option(
+        0, help="Leave out the observations of images that see fewer landmarks."
+    )
+    use_only_good_landmarks: bool = option(
+        False,
+        help="Leave out landmarks of bad quality; otherwise only their gross outliers are left out.",
+    )
+    use_visual_outlier_rejection_solver: bool = option(
+        True, help="Reject observations behind the camera or far off while solving."
+    )
+    outlier_rejection_reject_every_n_iters: int = option(
+        3, help="Look for outliers every this many iterations."
+    )
+    outlier_rejection_max_reprojection_error_px: float = option(
+        8.0, help="Observations off by more are outliers once solving has begun.", unit="px"
+    )
+    gate_reprojection_error_px: float = option(
+        50.0, help="Observations off by more at the beginning do not take part.", unit="px"
+    )
+    initial_trust_region_radius: float = option(1e5, help="Radius of the trust region at first.")
+    max_trust_region_radius: float = option(1e20, help="Largest radius of the trust region.")
+    min_trust_region_radius: float = option(1e-32, help="Give up below this radius.")
+    function_tolerance: float = option(
+        1e-6, help="Stop when an iteration lowers the cost by less than this part of it."
+    )
+    gradient_tolerance: float = option(1e-10, help="Stop when no gradient is larger.")
+    parameter_tolerance: float = option(
+        1e-8, help="Stop when a step is smaller than this part of the states."
+    )
+    gravity_magnitude_mps2: float = option(
+        0.0, help="Gravity; 0 = that of the map's IMU calibration.", unit="m/s^2"
+    )
+    hide_iterations_console_output: bool = option(False, help="Print no line per iteration.")

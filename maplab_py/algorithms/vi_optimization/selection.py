@@ -1,0 +1,128 @@
+"""What of a map takes part in an optimisation, as rows of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.estimation.codegen.kernels import CameraModel
+from maplab_py.estimation.states import F64, States
+from maplab_py.estimation.visual_terms import Cameras, Observations
+from maplab_py.geometry import so3
+from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap
+from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap.table import starts_of_counts
+
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Selection:
+    """Vertices and landmarks of the problem: problem row -> map row, and back (-1 = not in it)."""
+
+    vertices: I64
+    landmarks: I64
+    row_of_vertex: I64
+    keypoints: I64  # of the observations, in their order
+
+    def rows(self, map_vertices: NDArray[np.integer]) -> I64:
+        """Return the problem rows of map vertices."""
+        return self.row_of_vertex[map_vertices]
+
+
+def select(
+    vi_map: VIMap, options: VIOptimizationOptions, missions: NDArray[np.integer] | None
+) -> Selection:
+    """Choose the vertices of the missions, and the landmarks stored and observed there."""
+    chosen = np.zeros(len(vi_map.missions), dtype=np.bool_)
+    chosen[slice(None) if missions is None else missions] = True
+    is_in = chosen[vi_map.vertices.mission]
+    vertices = np.flatnonzero(is_in)
+    row_of_vertex = np.full(len(vi_map.vertices), -1, dtype=np.int64)
+    row_of_vertex[vertices] = np.arange(len(vertices))
+    wanted = is_in[vi_map.landmarks.vertex]
+    if options.use_only_good_landmarks:
+        wanted = wanted & (vi_map.landmarks.quality != LandmarkQuality.BAD)
+    keypoints = vi_map.observations if options.include_visual else np.zeros(0, dtype=np.int64)
+    keypoints = keypoints[wanted[vi_map.keypoints.landmark[keypoints]]]
+    keypoints = keypoints[is_in[vi_map.keypoint_vertex[keypoints]]]
+    frame = vi_map.keypoint_frame[keypoints]
+    per_frame = np.bincount(frame, minlength=len(vi_map.frames))
+    rich = (per_frame >= options.min_landmarks_per_frame) & vi_map.frames.is_valid
+    keypoints = keypoints[rich[frame]]
+    landmarks = np.unique(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
+    return Selection(vertices, landmarks, row_of_vertex, keypoints)
+
+
+def initial_states(vi_map: VIMap, selection: Selection) -> States:
+    """Return the states of the selected vertices and landmarks in G."""
+    rows = selection.vertices
+    q_G_M = vi_map.T_G_M[vi_map.vertices.mission[rows], :4]
+    return States(
+        T_G_I=np.ascontiguousarray(vi_map.T_G_I[rows]),
+        v_G=so3.rotate(q_G_M, vi_map.vertices.v_M[rows]),
+        gyro_bias=vi_map.vertices.gyro_bias[rows],
+        accel_bias=vi_map.vertices.accel_bias[rows],
+        p_G=np.ascontiguousarray(vi_map.p_G[selection.landmarks]),
+    )
+
+
+def observations(
+    vi_map: VIMap, selection: Selection, options: VIOptimizationOptions, first_camera: I64
+) -> tuple[Observations, F64]:
+    """Return the observations, all taking part, and their sigmas [px].
+
+    Args:
+        vi_map: Map.
+        selection: What takes part.
+        options: Scales of the loss.
+        first_camera: (M,) row of each mission's first camera.
+    """
+    keypoints = selection.keypoints
+    landmark = np.searchsorted(selection.landmarks, vi_map.keypoints.landmark[keypoints])
+    vertex = vi_map.keypoint_vertex[keypoints]
+    mission = vi_map.vertices.mission[vertex]
+    home = vi_map.vertices.mission[vi_map.landmarks.vertex[vi_map.keypoints.landmark[keypoints]]]
+    camera = first_camera[mission] + vi_map.frames.camera_index[vi_map.keypoint_frame[keypoints]]
+    sigma = np.maximum(vi_map.keypoints.sigma_px[keypoints], 1e-3)
+    scale = np.where(mission == home, options.loss_scale, options.loss_scale_other_mission)
+    data = Observations(
+        start=starts_of_counts(np.bincount(landmark, minlength=len(selection.landmarks))),
+        vertex=selection.rows(vertex).astype(np.int32),
+        camera=camera.astype(np.int32),
+        uv_px=np.ascontiguousarray(vi_map.keypoints.uv_px[keypoints]),
+        inverse_sigma=1.0 / sigma,
+        loss_scale=scale,
+    )
+    return data, sigma
+
+
+def cameras(vi_map: VIMap, missions: I64) -> tuple[Cameras, tuple[CameraModel, ...], I64]:
+    """Return the cameras of missions, their models, and each mission's first row (M,).
+
+    Raises:
+        MapError: A mission's rig or IMU is not in sensors.yaml.
+    """
+    first = np.full(len(vi_map.missions), -1, dtype=np.int64)
+    poses, rows = [], []
+    models: list[CameraModel] = []
+    for mission in missions.tolist():
+        rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+        imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+        first[mission] = len(rows)
+        poses.append(vi_map.sensors.T_I_C(imu_id, rig_id))
+        for camera in vi_map.sensors.camera_rig(rig_id).cameras:
+            model = (camera.projection, camera.distortion)
+            if model not in models:
+                models.append(model)
+            rows.append((model, [*camera.intrinsics, *camera.distortion_parameters]))
+    ordered = tuple(sorted(models, key=lambda model: (model[0].value, model[1].value)))
+    parameters = np.zeros((len(rows), 1 + max((len(p) for _, p in rows), default=0)))
+    for row, (model, values) in enumerate(rows):
+        parameters[row, 0] = ordered.index(model)
+        parameters[row, 1 : 1 + len(values)] = values
+    T_I_C = np.concatenate(poses) if poses else np.zeros((0, 7))
+    return Cameras(np.ascontiguousarray(T_I_C), parameters), ordered, first

@@ -1,0 +1,1 @@
+"""From symbolic residual to compiled kernel: lowering, generated modules, the cache of both."""

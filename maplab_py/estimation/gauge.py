@@ -1,0 +1,61 @@
+"""Gauge: what a problem cannot observe is fixed, and nothing else.
+
+With inertial terms gravity shows roll and pitch and the accelerometer shows scale: position and
+heading of one vertex per cluster are free to choose (4 dimensions). With images alone orientation
+and scale are too (7). Clusters are sets of vertices that terms join.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.estimation.problem import Problem
+from maplab_py.estimation.solver import null_projector
+from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
+from maplab_py.geometry import so3
+
+I64 = NDArray[np.int64]
+
+
+def clusters(num_vertices: int, links: list[tuple[I64, I64]]) -> I64:
+    """Label vertices (V,) that links (pairs of rows) join; labels count from 0 in row order."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a = np.concatenate([link[0] for link in links]) if links else np.zeros(0, dtype=np.int64)
+    b = np.concatenate([link[1] for link in links]) if links else np.zeros(0, dtype=np.int64)
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(num_vertices, num_vertices))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def first_of_each(labels: I64) -> I64:
+    """Return the first row of every label."""
+    return np.unique(labels, return_index=True)[1].astype(np.int64)
+
+
+def fix_position_and_heading(problem: Problem, states: States, vertices: I64) -> None:
+    """Fix position, and rotation about gravity, of vertices (k,).
+
+    Rotations exp(d) act on the right, so heading is the part of d along gravity seen in the body;
+    it is projected out. Over a step the heading then changes in second order only, which removes
+    the singularity without constraining anything that terms could observe.
+    """
+    problem.fix(NODES_PER_VERTEX * vertices + POSITION)
+    up_I = so3.rotate(so3.inverse(states.T_G_I[vertices, :4]), np.array([0.0, 0.0, 1.0]))
+    problem.restrict(NODES_PER_VERTEX * vertices + ORIENTATION, null_projector(up_I))
+
+
+def fix_pose(problem: Problem, vertices: I64) -> None:
+    """Fix position and orientation of vertices (k,)."""
+    problem.fix(NODES_PER_VERTEX * vertices + POSITION)
+    problem.fix(NODES_PER_VERTEX * vertices + ORIENTATION)
+
+
+def fix_distance(problem: Problem, states: States, first: I64, second: I64) -> None:
+    """Fix the distance of vertices `second` (k,) from `first` (k,): the scale of a visual problem."""
+    offset = states.T_G_I[second, 4:] - states.T_G_I[first, 4:]
+    length = np.linalg.norm(offset, axis=1, keepdims=True)
+    apart = length[:, 0] > 0.0
+    direction = offset[apart] / length[apart]
+    problem.restrict(NODES_PER_VERTEX * second[apart] + POSITION, null_projector(direction))

@@ -1,0 +1,127 @@
+"""Inertial edges and the random walk of their biases, as factor terms."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.states import (
+    ACCEL_BIAS,
+    F64,
+    GYRO_BIAS,
+    NODES_PER_VERTEX,
+    ORIENTATION,
+    POSITION,
+    VELOCITY,
+    States,
+)
+
+I64 = NDArray[np.int64]
+
+_FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
+"""Added to covariances: edges of a few microseconds stay finite (1 um, 0.1 urad, 1 um/s)."""
+
+_GYRO_MOVED_RADPS = 1e-3
+_ACCEL_MOVED_MPS2 = 1e-2
+"""Beyond these the first-order bias correction is replaced by a new integration."""
+
+
+class InertialTerm:
+    """Preintegrated edges between vertices; re-integrated when a bias has moved far."""
+
+    name = "inertial"
+    loss = (Loss.NONE, 1.0)
+
+    def __init__(
+        self, kernel: ModuleType, data: InertialData, first: I64, second: I64, g_G: F64
+    ) -> None:
+        """Join vertices first (E,) and second (E,) by the edges of `data`; gravity g_G (3,)."""
+        self._kernel, self._data, self._g = kernel, data, g_G
+        self._a, self._b = first, second
+        self._measured: Preintegrated | None = None
+        base_a, base_b = NODES_PER_VERTEX * first, NODES_PER_VERTEX * second
+        order = (POSITION, ORIENTATION, VELOCITY, GYRO_BIAS, ACCEL_BIAS)
+        columns = [base_a + kind for kind in order]
+        columns += [base_b + kind for kind in (POSITION, ORIENTATION, VELOCITY)]
+        self.nodes = np.stack(columns, axis=1)
+
+    def integrate(self, states: States) -> bool:
+        """Integrate anew if the biases are far from where they were; tell whether it was done."""
+        b_g, b_a = states.gyro_bias[self._a], states.accel_bias[self._a]
+        old = self._measured
+        if old is not None:
+            moved_g = np.abs(b_g - old.gyro_bias).max(initial=0.0) > _GYRO_MOVED_RADPS
+            moved_a = np.abs(b_a - old.accel_bias).max(initial=0.0) > _ACCEL_MOVED_MPS2
+            if not moved_g and not moved_a:
+                return False
+        self._measured = new = integrate(self._data, b_g, b_a)
+        self._whitening = np.linalg.inv(np.linalg.cholesky(new.covariance + _FLOOR))
+        self._fixed_arguments = np.concatenate(
+            [
+                new.q_A_B,
+                new.dp,
+                new.dv,
+                _column_major(new.jacobian_gyro_bias),
+                _column_major(new.jacobian_accel_bias),
+                new.gyro_bias,
+                new.accel_bias,
+                new.duration_s[:, None],
+                np.broadcast_to(self._g, (len(new.dp), 3)),
+            ],
+            axis=1,
+        )
+        return True
+
+    def evaluate(self, states: States) -> tuple[F64, F64]:
+        """Return whitened residuals (E, 9) and Jacobians (E, 9, 24)."""
+        if self._measured is None:
+            self.integrate(states)
+        a, b = self._a, self._b
+        arguments = np.concatenate(
+            [
+                states.T_G_I[a],
+                states.v_G[a],
+                states.gyro_bias[a],
+                states.accel_bias[a],
+                states.T_G_I[b],
+                states.v_G[b],
+                self._fixed_arguments,
+            ],
+            axis=1,
+        )
+        residual, jacobian = np.empty((len(a), 9)), np.empty((len(a), 9, 24))
+        self._kernel.evaluate(arguments, self._whitening, residual, jacobian)
+        return residual, jacobian
+
+
+class BiasWalkTerm:
+    """The change of both biases along an edge: white noise integrated over its duration."""
+
+    name = "bias walk"
+    loss = (Loss.NONE, 1.0)
+
+    def __init__(self, first: I64, second: I64, gyro_variance: F64, accel_variance: F64) -> None:
+        """Join vertices first (E,) and second (E,); variances (E,) of each component's change."""
+        self._a, self._b = first, second
+        sigma = np.sqrt(np.stack([gyro_variance, accel_variance], axis=1))
+        weight = np.repeat(1.0 / np.maximum(sigma, 1e-9), 3, axis=1)
+        self._weight = weight
+        kinds = ((first, GYRO_BIAS), (first, ACCEL_BIAS), (second, GYRO_BIAS), (second, ACCEL_BIAS))
+        self.nodes = np.stack([NODES_PER_VERTEX * v + kind for v, kind in kinds], axis=1)
+        diagonal = weight[:, :, None] * np.eye(6)
+        self._jacobian = np.concatenate([-diagonal, diagonal], axis=2)
+
+    def evaluate(self, states: States) -> tuple[F64, F64]:
+        """Return whitened residuals (E, 6) and Jacobians (E, 6, 12)."""
+        biases = np.concatenate([states.gyro_bias, states.accel_bias], axis=1)
+        return (biases[self._b] - biases[self._a]) * self._weight, self._jacobian
+
+
+def _column_major(matrices: F64) -> F64:
+    """Flatten (E, 9, 3) matrices column by column, as casadi orders them."""
+    return matrices.transpose(0, 2, 1).reshape(len(matrices), -1)

@@ -1,0 +1,1 @@
+"""Residuals, each written once as a casadi expression on the manifold."""

@@ -1,0 +1,32 @@
+"""Residuals and Jacobians of many factors of one kind, whitened; see `codegen.factor_kernels`.
+
+`residual` is generated; `blocks` of the call are gathered rows, one factor a row.
+"""
+
+# ruff: noqa: F821
+# mypy: ignore-errors
+# --- kernels ---
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def evaluate(arguments, sqrt_information, whitened, jacobian):
+    """Evaluate N factors.
+
+    In: arguments (N, A) all inputs side by side, sqrt_information (N, m, m).
+    Out: whitened (N, m) and jacobian (N, m, D), both multiplied by the square-root information.
+    """
+    count, size = whitened.shape
+    columns = jacobian.shape[2]
+    for n in prange(count):
+        r, J = np.empty(size), np.empty(size * columns)
+        residual(arguments[n], r, J)
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                total += sqrt_information[n, i, j] * r[j]
+            whitened[n, i] = total
+            for c in range(columns):
+                total = 0.0
+                for j in range(size):
+                    total += sqrt_information[n, i, j] * J[c * size + j]
+                jacobian[n, i, c] = total
