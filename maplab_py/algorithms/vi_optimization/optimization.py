@@ -24,6 +24,7 @@ from maplab_py.algorithms.vi_optimization.selection import (
     cameras,
     initial_states,
     observations,
+    retriangulated,
     select,
 )
 from maplab_py.algorithms.vi_optimization.terms import factor_terms
@@ -70,7 +71,7 @@ def optimize(
     if not len(selection.vertices):
         raise EstimationError("nothing to optimise: the map has no vertices")
     states = initial_states(vi_map, selection)
-    visual, rejection = _visual(vi_map, selection, options, states, progress)
+    visual, rejection, states = _visual(vi_map, selection, options, states, progress)
     factors = factor_terms(vi_map, selection, options, progress)
     if visual is None and not factors:
         raise EstimationError("nothing to optimise: no landmark observed twice and no usable edge")
@@ -117,10 +118,13 @@ def _visual(
     options: VIOptimizationOptions,
     states: States,
     progress: Progress,
-) -> tuple[VisualTerms | None, OutlierRejection | None]:
-    """Set up the reprojection errors and reject those that are hopeless from the start."""
+) -> tuple[VisualTerms | None, OutlierRejection | None, States]:
+    """Set up the reprojection errors and reject those that are hopeless from the start.
+
+    Landmarks that would lose observations are triangulated anew before they are judged.
+    """
     if not len(selection.keypoints):
-        return None, None
+        return None, None, states
     used_missions = np.unique(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
     rig, models, first_camera = cameras(vi_map, used_missions)
     kernels = visual_kernels(models, progress)
@@ -135,9 +139,14 @@ def _visual(
     )
     rejection = OutlierRejection(visual, sigma_px, options)
     rejection.gate(states)
+    if options.retriangulate_doubtful and not options.fix_landmark_positions:
+        doubtful = rejection.doubtful_landmarks()
+        states = retriangulated(vi_map, selection, states, data.start, doubtful)
+        rejection.restart()
+        rejection.gate(states)
     if not rejection.is_used.any():
-        return None, None
-    return visual, rejection
+        return None, None, states
+    return visual, rejection, states
 
 
 def _fix_by_options(problem: Problem, options: VIOptimizationOptions, num_vertices: int) -> None:

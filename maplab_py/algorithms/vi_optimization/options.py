@@ -56,10 +56,13 @@ class VIOptimizationOptions:
         3, help="Look for outliers every this many iterations."
     )
     outlier_rejection_max_reprojection_error_px: float = option(
-        8.0, help="Observations off by more are outliers once solving has begun.", unit="px"
+        5.0, help="Observations off by more are outliers once solving has begun.", unit="px"
+    )
+    retriangulate_doubtful: bool = option(
+        True, help="Triangulate landmarks anew that the gate would take observations from."
     )
     gate_reprojection_error_px: float = option(
-        50.0, help="Observations off by more at the beginning do not take part.", unit="px"
+        20.0, help="Observations off by more at the beginning do not take part.", unit="px"
     )
     initial_trust_region_radius: float = option(1e5, help="Radius of the trust region at first.")
     max_trust_region_radius: float = option(1e20, help="Largest radius of the trust region.")

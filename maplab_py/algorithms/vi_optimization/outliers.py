@@ -30,6 +30,16 @@ class OutlierRejection:
         self._reject(states, self._options.gate_reprojection_error_px)
         self.gated = int(np.count_nonzero(~self.is_used))
 
+    def doubtful_landmarks(self) -> NDArray[np.int64]:
+        """Return the landmarks that lost observations to the gate."""
+        data = self._visual.observations
+        return np.unique(data.landmark[~self.is_used])
+
+    def restart(self) -> None:
+        """Let every observation take part again."""
+        self.is_used = np.ones(len(self._sigma_px), dtype=np.bool_)
+        self._visual.use(self._visual.observations.switched(self.is_used, self._sigma_px))
+
     def after_step(self, iteration: int, states: States) -> bool:
         """Reject outliers every n iterations; tell whether there were any."""
         options = self._options

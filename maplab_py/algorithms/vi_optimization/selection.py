@@ -7,14 +7,16 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.estimation.codegen.kernels import CameraModel
 from maplab_py.estimation.states import F64, States
 from maplab_py.estimation.visual_terms import Cameras, Observations
 from maplab_py.geometry import so3
+from maplab_py.geometry.triangulation import triangulate
 from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.table import starts_of_counts
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 I64 = NDArray[np.int64]
 
@@ -98,6 +100,25 @@ def observations(
         loss_scale=scale,
     )
     return data, sigma
+
+
+def retriangulated(
+    vi_map: VIMap, selection: Selection, states: States, start: I64, landmarks: I64
+) -> States:
+    """Return the states with some landmarks (problem rows) triangulated from the present poses.
+
+    Landmarks whose rays do not meet in front of all cameras stay where they are.
+    """
+    rows = ragged_rows(start, landmarks)
+    origins, directions, valid = rays_in_G(vi_map, selection.keypoints[rows])
+    own_start = starts_of_counts(np.diff(start)[landmarks])
+    points, ok, _ = triangulate(origins, directions, own_start)
+    owner = np.repeat(np.arange(len(landmarks)), np.diff(own_start))
+    ahead = np.einsum("oi,oi->o", points[owner] - origins, directions) > 0.0
+    ok = ok & (np.bincount(owner, ~(ahead & valid), minlength=len(landmarks)) == 0)
+    p_G = states.p_G.copy()
+    p_G[landmarks[ok]] = points[ok]
+    return dataclasses.replace(states, p_G=p_G)
 
 
 def cameras(vi_map: VIMap, missions: I64) -> tuple[Cameras, tuple[CameraModel, ...], I64]:

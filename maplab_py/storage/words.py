@@ -1,0 +1,47 @@
+"""Ids between messages and columns, and what a message holds that the schema does not know.
+
+The bytes of an id's words are stored in the order of its hexadecimal digits, so that words are
+byte-swapped between file and memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import Message
+from google.protobuf.unknown_fields import UnknownFieldSet
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+
+U64 = NDArray[np.uint64]
+
+
+def ids_of(messages: Iterable[Any], where: str) -> U64:
+    """Return ids (N, 2) of Id messages; one without words counts as zero.
+
+    Raises:
+        MapError: An id has neither two words nor none; `where` names the field.
+    """
+    lists = [message.words for message in messages]
+    flat = [word for words in lists for word in words]
+    if len(flat) != 2 * len(lists) or any(len(words) != 2 for words in lists):
+        flat = []
+        for words in lists:
+            if len(words) not in (0, 2):
+                raise MapError(f"{where}: an id has {len(words)} words instead of 2")
+            flat.extend(words if len(words) else (0, 0))
+    return np.array(flat, dtype=np.uint64).reshape(-1, 2).byteswap()
+
+
+def unknown_bytes(message: Message) -> bytes:
+    """Return the fields of a message (not of its parts) that the schema does not know."""
+    if not len(UnknownFieldSet(message)):
+        return b""
+    known = type(message)()
+    known.CopyFrom(message)
+    for field, _ in message.ListFields():
+        known.ClearField(field.name)
+    return known.SerializeToString(deterministic=True)
