@@ -32,15 +32,15 @@ class VIOptimizationOptions:
     fix_accel_bias: bool = option(False, help="Keep all accelerometer biases.")
     fix_landmark_positions: bool = option(False, help="Keep all landmarks.")
     loss: str = option(
-        "huber",
+        "cauchy",
         help="Robust loss of reprojection errors.",
         choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"),
     )
     loss_scale: float = option(
-        3.0, help="Scale of the loss, in standard deviations, within a mission."
+        2.0, help="Scale of the loss, in standard deviations, within a mission."
     )
     loss_scale_other_mission: float = option(
-        10.0, help="Scale of the loss for landmarks stored in another mission, in deviations."
+        4.0, help="Scale of the loss for landmarks stored in another mission, in deviations."
     )
     min_landmarks_per_frame: int = option(
         0, help="Leave out the observations of images that see fewer landmarks."
