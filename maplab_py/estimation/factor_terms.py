@@ -81,7 +81,7 @@ def linearize(term: FactorTerm, states: States) -> tuple[FactorSystem, F64, F64]
     rho, weight = robust(loss, scale, np.einsum("nm,nm->n", residual, residual))
     root = np.sqrt(weight)
     residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
-    count, size, _ = jacobian.shape
+    count = len(jacobian)
     num = term.nodes.shape[1]
     normal = np.matmul(jacobian.transpose(0, 2, 1), jacobian).reshape(count, num, 3, num, 3)
     b, a = np.tril_indices(num)

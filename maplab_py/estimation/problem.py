@@ -127,7 +127,7 @@ class Problem:
 
     def projected_gradient(self, linear: Linearization) -> F64:
         """Return the gradient (nodes, 3) along the directions that may move."""
-        return np.einsum("nij,nj->ni", self._projector, linear.gradient)
+        return np.asarray(np.einsum("nij,nj->ni", self._projector, linear.gradient))
 
 
 def _pose_part(by_node: F64) -> F64:

@@ -164,12 +164,12 @@ def _pairs(
     own = np.arange(num_vertices, dtype=np.int64)
     keys = np.concatenate([own * num_vertices + own, row * num_vertices + col])
     places, block = np.unique(keys, return_inverse=True)
-    block = block.reshape(-1).astype(np.int32)
+    block = np.asarray(block, dtype=np.int64).reshape(-1)
     return (
         places // num_vertices,
         places % num_vertices,
-        block[num_vertices:],
-        block[:num_vertices].astype(np.int64),
+        block[num_vertices:].astype(np.int32),
+        block[:num_vertices],
     )
 
 

@@ -57,6 +57,16 @@ def poses(fields: Sequence[Any], where: str) -> F64:
     values = rows_or(fields, 7, 0.0, where)
     absent = [index for index, field in enumerate(fields) if not len(field)]
     values[absent, 3] = 1.0
+    check_poses(values, where)
+    return values
+
+
+def check_poses(values: F64, where: str) -> None:
+    """Check poses (N, 7).
+
+    Raises:
+        MapError: One is not a number, or its quaternion is not of unit length.
+    """
     finite(values, where)
     length = np.linalg.norm(values[:, :4], axis=1)
     bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT_TOLERANCE)
@@ -64,7 +74,6 @@ def poses(fields: Sequence[Any], where: str) -> F64:
         raise MapError(
             f"{where} of entry {int(bad[0])}: the quaternion has length {length[bad[0]]:.6g}, not 1"
         )
-    return values
 
 
 def covariances(fields: Sequence[Any], size: int, where: str) -> F64:

@@ -129,7 +129,7 @@ def read_vertices(content: Content, order: I64, mission: I64, timestamp_ns: I64)
     """Return the vertices, rows in the given order of the file's entities."""
     vertices = [content.vertices[k] for k in order]
     T_M_I = numbers.rows([v.T_M_I for v in vertices], 7, "T_M_I of a vertex")
-    numbers.poses(T_M_I, "T_M_I of a vertex")
+    numbers.check_poses(T_M_I, "T_M_I of a vertex")
     return Vertices.filled(
         len(vertices),
         id=content.vertex_ids[order],

@@ -55,7 +55,7 @@ def _missions(vi_map: VIMap) -> pb.VIMap:
     message = pb.VIMap()
     table = vi_map.missions
     vertex_words, frame_words = _words(vi_map.vertices.id), _words(vi_map.baseframes.id)
-    sensor_words = _words(table.sensor_id)
+    sensor_words = [_words(own) for own in table.sensor_id]
     for row, words in enumerate(_words(table.id)):
         message.mission_ids.add().words.extend(words)
         mission = message.missions.add()

@@ -32,7 +32,7 @@ class Selection:
 
     def rows(self, map_vertices: NDArray[np.integer]) -> I64:
         """Return the problem rows of map vertices."""
-        return self.row_of_vertex[map_vertices]
+        return np.asarray(self.row_of_vertex[map_vertices])
 
 
 def select(
@@ -128,7 +128,8 @@ def cameras(vi_map: VIMap, missions: I64) -> tuple[Cameras, tuple[CameraModel, .
         MapError: A mission's rig or IMU is not in sensors.yaml.
     """
     first = np.full(len(vi_map.missions), -1, dtype=np.int64)
-    poses, rows = [], []
+    poses: list[F64] = []
+    rows: list[tuple[CameraModel, list[float]]] = []
     models: list[CameraModel] = []
     for mission in missions.tolist():
         rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)

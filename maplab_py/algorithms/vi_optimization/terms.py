@@ -90,7 +90,8 @@ def _odometry(
     T_I_S = _mounting(vi_map, table.from_vertex[edges], table.sensor_id[edges])
     W = whitening(table.covariance[edges])
     measured = table.T_A_B[edges]
-    return [RelativePoseTerm(kernel, name, *ends[:, edges], T_I_S, measured, W)]
+    first, second = ends[:, edges]
+    return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W)]
 
 
 def _loop_closures(vi_map: VIMap, selection: Selection, progress: Progress) -> list[FactorTerm]:
@@ -106,7 +107,8 @@ def _loop_closures(vi_map: VIMap, selection: Selection, progress: Progress) -> l
     T_I_S = np.broadcast_to(se3.identity(), (len(edges), 7))
     measured = table.T_A_B[edges]
     loss = (Loss.DCS, 3.0)
-    return [RelativePoseTerm(kernel, "loop closure", *ends[:, edges], T_I_S, measured, W, loss)]
+    first, second = ends[:, edges]
+    return [RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)]
 
 
 def _absolute_poses(vi_map: VIMap, selection: Selection, progress: Progress) -> list[FactorTerm]:

@@ -25,7 +25,7 @@ _ARGUMENTS = {"inertial": (100, 9, 24), "relative_pose": (28, 6, 12), "absolute_
 def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
     """Compile all kernels; return their names, the time it took [s], and the cache folder."""
     began = time.perf_counter()
-    names = []
+    names: list[str] = []
     models = [(p, d) for p in Projection for d in Distortion]
     total = len(models) + len(_FACTORS) + 2
     for projection, distortion in models:

@@ -12,7 +12,10 @@ from maplab_py.sensors.camera import Distortion, Projection
 
 CameraModel = tuple[Projection, Distortion]
 
-_HEADER = '"""Generated; do not edit."""\n\nimport math\n\nimport numpy as np\nfrom numba import njit, prange\n\n'
+_HEADER = (
+    '"""Generated; do not edit."""\n\n'
+    "import math\n\nimport numpy as np\nfrom numba import njit, prange\n\n"
+)
 _FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})\n'
 
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import casadi as ca
+import casadi
+
+ca: Any = casadi  # its stubs do not know mixed arguments
 
 _UNARY = {
     ca.OP_ASSIGN: "{}",

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import casadi as ca
+import casadi
 
 from maplab_py.sensors.camera import INTRINSICS_SIZE, Distortion, Projection
 
+ca: Any = casadi  # its stubs do not know mixed arguments
 SX = Any
 
 _EPSILON = 1e-20
@@ -44,10 +45,9 @@ def project(projection: Projection, distortion: Distortion, p_C: SX, parameters:
     """Return the pixel of a point; parameters are [intrinsics, distortion]."""
     count = INTRINSICS_SIZE[projection]
     intrinsics, k = parameters[:count], parameters[count:]
+    depth = p_C[2]
     if projection is Projection.UNIFIED:
-        depth = p_C[2] + intrinsics[0] * ca.sqrt(ca.dot(p_C, p_C))
-    else:
-        depth = p_C[2]
+        depth = depth + intrinsics[0] * ca.sqrt(ca.dot(p_C, p_C))
     x, y = distort(distortion, p_C[0] / depth, p_C[1] / depth, k)
     fu, fv, cu, cv = (intrinsics[count - 4 + i] for i in range(4))
     return ca.vertcat(fu * x + cu, fv * y + cv)

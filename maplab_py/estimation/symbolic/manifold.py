@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import casadi as ca
+import casadi
 
+ca: Any = casadi  # its stubs do not know mixed arguments
 SX = Any
 
 _EPSILON = 1e-14

@@ -7,7 +7,9 @@ whitened: weights belong to the term that uses the residual.
 
 from __future__ import annotations
 
-import casadi as ca
+from typing import Any
+
+import casadi
 
 from maplab_py.estimation.symbolic.cameras import project
 from maplab_py.estimation.symbolic.manifold import (
@@ -22,8 +24,10 @@ from maplab_py.estimation.symbolic.manifold import (
 )
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE, Distortion, Projection
 
+ca: Any = casadi  # its stubs do not know mixed arguments
 
-def reprojection(projection: Projection, distortion: Distortion) -> ca.Function:
+
+def reprojection(projection: Projection, distortion: Distortion) -> Any:
     """Return f(T_G_I, T_I_C, parameters, p_G, uv) -> r (2), depth (1), J (2 x 9: pose, landmark).
 
     r = projection of the landmark - measured pixel; depth is the camera-frame z coordinate.
@@ -42,7 +46,7 @@ def reprojection(projection: Projection, distortion: Distortion) -> ca.Function:
     return ca.Function("reprojection", arguments, ca.cse([value, depth, jacobian]))
 
 
-def inertial() -> ca.Function:
+def inertial() -> Any:
     """Return the residual (9: position, orientation, velocity) of a preintegrated edge A -> B.
 
     f(T_A, v_A, b_g, b_a, T_B, v_B, q_A_B, dp, dv, J_g, J_a, b_g0, b_a0, dt, g) with J_g, J_a (9 x 3,
@@ -61,7 +65,7 @@ def inertial() -> ca.Function:
     r_p = T_A.R.T @ (T_B.p - T_A.p - v_A.x * dt - 0.5 * g * dt * dt) - (dp + change[0:3])
     r_theta = log(multiply(conjugate(predicted), multiply(conjugate(T_A.q), T_B.q)))
     r_v = T_A.R.T @ (v_B.x - v_A.x - g * dt) - (dv + change[6:9])
-    variables = [T_A, v_A, b_g, b_a, T_B, v_B]
+    variables: list[Any] = [T_A, v_A, b_g, b_a, T_B, v_B]
     value, jacobian = with_jacobian(
         ca.vertcat(r_p, r_theta, r_v), [variable.tangent for variable in variables]
     )
@@ -70,7 +74,7 @@ def inertial() -> ca.Function:
     return ca.Function("inertial", arguments, ca.cse([value, jacobian]))
 
 
-def relative_pose() -> ca.Function:
+def relative_pose() -> Any:
     """Return the residual (6: position, orientation) of a measured T_SA_SB of a sensor S.
 
     f(T_A, T_B, T_I_S, T_SA_SB): e = [p - p_measured, Log(R_measured^T R)] of
@@ -89,7 +93,7 @@ def relative_pose() -> ca.Function:
     return ca.Function("relative_pose", arguments, ca.cse([value, jacobian]))
 
 
-def absolute_pose() -> ca.Function:
+def absolute_pose() -> Any:
     """Return the residual (6: position, orientation) of a measured T_G_S.
 
     f(T_G_I, T_I_S, T_G_S): e = [p - p_measured, Log(R_measured^T R)] of T_G_I T_I_S.

@@ -101,6 +101,87 @@ def add_landmark_sums(out, h, g):
     g[2] += a2 * out[0] + b2 * out[1]
 
 
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def add_observations(
+    first, last, landmark, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind, poses,
+    extrinsics, parameters, points, diagonal_block, S, grad, diag, Y, out, h, g,
+):  # fmt: skip
+    """Evaluate a landmark's observations; return the sum of rho.
+
+    Adds P'P and P'r of the poses to S, grad and diag, leaves H in h, Q'r in g and W in Y.
+    """
+    total = 0.0
+    h[:] = 0.0
+    g[:] = 0.0
+    for o in range(first, last):
+        W = Y[o - first]
+        if inverse_sigma[o] == 0.0:
+            W[:] = 0.0
+            continue
+        k = pose_of[o]
+        reproject(poses, k, extrinsics, camera_of[o], parameters, points, landmark, uv, o, out)
+        total += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+        add_landmark_sums(out, h, g)
+        block = S[diagonal_block[k]]
+        for c in range(6):
+            a, b = out[3 + 2 * c], out[4 + 2 * c]
+            W[0, c] = a * out[15] + b * out[16]
+            W[1, c] = a * out[17] + b * out[18]
+            W[2, c] = a * out[19] + b * out[20]
+            grad[k, c] += a * out[0] + b * out[1]
+            diag[k, c] += a * a + b * b
+            for e in range(6):
+                block[c, e] += a * out[3 + 2 * e] + b * out[4 + 2 * e]
+    return total
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def subtract_landmark(first, last, pose_of, pair_block, pair, S, grad, Y, f, g):
+    """Turn W into Y = L^-1 W and subtract Y_b' Y_a and Y_o' z from S and grad."""
+    z0 = g[0] * f[0]
+    z1 = (g[1] - f[1] * z0) * f[2]
+    z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
+    for o in range(first, last):
+        W = Y[o - first]
+        k = pose_of[o]
+        for c in range(6):
+            y0 = W[0, c] * f[0]
+            y1 = (W[1, c] - f[1] * y0) * f[2]
+            y2 = (W[2, c] - f[3] * y0 - f[4] * y1) * f[5]
+            W[0, c], W[1, c], W[2, c] = y0, y1, y2
+            grad[k, c] -= y0 * z0 + y1 * z1 + y2 * z2
+    for b in range(last - first):
+        Yb = Y[b]
+        for a in range(b + 1):
+            block, Ya = S[pair_block[pair]], Y[a]
+            pair += 1
+            same_pose = a != b and pose_of[first + a] == pose_of[first + b]  # two cameras of a rig
+            for c in range(6):
+                y0, y1, y2 = Yb[0, c], Yb[1, c], Yb[2, c]
+                for e in range(6):
+                    block[c, e] -= y0 * Ya[0, e] + y1 * Ya[1, e] + y2 * Ya[2, e]
+            if same_pose:
+                for c in range(6):
+                    y0, y1, y2 = Yb[0, c], Yb[1, c], Yb[2, c]
+                    for e in range(6):
+                        block[e, c] -= y0 * Ya[0, e] + y1 * Ya[1, e] + y2 * Ya[2, e]
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def reduce_chunks(blocks, gradient, diagonal, cost):
+    """Add the sums of all chunks into chunk 0, always in the same order."""
+    chunks = blocks.shape[0]
+    for block in prange(blocks.shape[1]):
+        for chunk in range(1, chunks):
+            blocks[0, block] += blocks[chunk, block]
+    for pose in prange(gradient.shape[1]):
+        for chunk in range(1, chunks):
+            gradient[0, pose] += gradient[chunk, pose]
+            diagonal[0, pose] += diagonal[chunk, pose]
+    for chunk in range(1, chunks):
+        cost[0] += cost[chunk]
+
+
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def eliminate(
     start, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind, poses, extrinsics, parameters,
@@ -113,82 +194,30 @@ def eliminate(
     and diagonal (chunks, P, 6), the latter that of the unreduced equations; cost (chunks,), the
     sum of rho. Chunk 0 holds the sum over all chunks at the end.
     """
-    chunks = blocks.shape[0]
     longest = 0
     for landmark in range(len(start) - 1):
         longest = max(longest, start[landmark + 1] - start[landmark])
-    for chunk in prange(chunks):
+    for chunk in prange(blocks.shape[0]):
         S, grad, diag = blocks[chunk], gradient[chunk], diagonal[chunk]
         S[:] = 0.0
         grad[:] = 0.0
         diag[:] = 0.0
         total = 0.0
         Y = np.empty((longest, 3, 6))
-        out, h, f, g, z = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3), np.empty(3)
+        out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
         for landmark in range(chunk_start[chunk], chunk_start[chunk + 1]):
             first, last = start[landmark], start[landmark + 1]
-            h[:] = 0.0
-            g[:] = 0.0
-            for o in range(first, last):
-                W = Y[o - first]
-                if inverse_sigma[o] == 0.0:
-                    W[:] = 0.0
-                    continue
-                k = pose_of[o]
-                reproject(poses, k, extrinsics, camera_of[o], parameters, points, landmark, uv, o, out)
-                total += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
-                add_landmark_sums(out, h, g)
-                block = S[diagonal_block[k]]
-                for c in range(6):
-                    a, b = out[3 + 2 * c], out[4 + 2 * c]
-                    W[0, c] = a * out[15] + b * out[16]
-                    W[1, c] = a * out[17] + b * out[18]
-                    W[2, c] = a * out[19] + b * out[20]
-                    grad[k, c] += a * out[0] + b * out[1]
-                    diag[k, c] += a * a + b * b
-                    for e in range(6):
-                        block[c, e] += a * out[3 + 2 * e] + b * out[4 + 2 * e]
-            if not move_points:
-                continue
-            factor_3x3(h, damping, f)
-            z[0] = g[0] * f[0]
-            z[1] = (g[1] - f[1] * z[0]) * f[2]
-            z[2] = (g[2] - f[3] * z[0] - f[4] * z[1]) * f[5]
-            for o in range(first, last):
-                W = Y[o - first]
-                k = pose_of[o]
-                for c in range(6):
-                    y0 = W[0, c] * f[0]
-                    y1 = (W[1, c] - f[1] * y0) * f[2]
-                    y2 = (W[2, c] - f[3] * y0 - f[4] * y1) * f[5]
-                    W[0, c], W[1, c], W[2, c] = y0, y1, y2
-                    grad[k, c] -= y0 * z[0] + y1 * z[1] + y2 * z[2]
-            pair = pair_start[landmark]
-            for b in range(last - first):
-                Yb = Y[b]
-                for a in range(b + 1):
-                    block, Ya = S[pair_block[pair]], Y[a]
-                    pair += 1
-                    for c in range(6):
-                        y0, y1, y2 = Yb[0, c], Yb[1, c], Yb[2, c]
-                        for e in range(6):
-                            block[c, e] -= y0 * Ya[0, e] + y1 * Ya[1, e] + y2 * Ya[2, e]
-                    if a != b and pose_of[first + a] == pose_of[first + b]:  # two cameras, one pose
-                        for c in range(6):
-                            for e in range(6):
-                                block[e, c] -= (
-                                    Yb[0, c] * Ya[0, e] + Yb[1, c] * Ya[1, e] + Yb[2, c] * Ya[2, e]
-                                )
+            total += add_observations(
+                first, last, landmark, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind,
+                poses, extrinsics, parameters, points, diagonal_block, S, grad, diag, Y, out, h, g,
+            )  # fmt: skip
+            if move_points:
+                factor_3x3(h, damping, f)
+                subtract_landmark(
+                    first, last, pose_of, pair_block, pair_start[landmark], S, grad, Y, f, g
+                )
         cost[chunk] = total
-    for block in prange(blocks.shape[1]):
-        for chunk in range(1, chunks):
-            blocks[0, block] += blocks[chunk, block]
-    for pose in prange(gradient.shape[1]):
-        for chunk in range(1, chunks):
-            gradient[0, pose] += gradient[chunk, pose]
-            diagonal[0, pose] += diagonal[chunk, pose]
-    for chunk in range(1, chunks):
-        cost[0] += cost[chunk]
+    reduce_chunks(blocks, gradient, diagonal, cost)
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -213,7 +242,9 @@ def substitute(
                 if inverse_sigma[o] == 0.0:
                     continue
                 k = pose_of[o]
-                reproject(poses, k, extrinsics, camera_of[o], parameters, points, landmark, uv, o, out)
+                reproject(
+                    poses, k, extrinsics, camera_of[o], parameters, points, landmark, uv, o, out
+                )
                 weighted(out, inverse_sigma[o], loss_kind, scale2[o])
                 decrease += out[0] * out[0] + out[1] * out[1]
                 for c in range(6):

@@ -81,7 +81,6 @@ def load(
         repair: Drop what refers to things that do not exist instead of refusing the map.
     """
     from maplab_py.storage.native import load_map
-
     from maplab_py.vimap.edits import with_new_ids
 
     key = context.maps.check_new_key(map_key or key_of_folder(map_folder))
@@ -284,7 +283,7 @@ def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> s
 def _load_each(context: CommandContext, folders: list[Path]) -> list[tuple[VIMap, Report]]:
     from maplab_py.storage.native import load_map
 
-    loaded = []
+    loaded: list[tuple[VIMap, Report]] = []
     for done, folder in enumerate(folders):
         context.progress.step(done, len(folders), f"load {folder.name}")
         loaded.append(load_map(folder))
