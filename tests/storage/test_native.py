@@ -1,0 +1,262 @@
+"""Real maps go through load and save without loss; damaged ones are refused in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.native import find_maps, load_map, save_map
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import check_consistency
+from tests.support.data import shared_data
+
+SUBMAP = "maplab_maps/euroc_v1_01/euroc_v1_01_submap_3"
+
+
+def differences(a: VIMap, b: VIMap) -> list[str]:
+    found = []
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        for name, column in x.columns().items() if hasattr(x, "columns") else ():
+            other = y.columns()[name]
+            if column.dtype == object:
+                same = len(column) == len(other) and all(map(lambda p, q: p == q, column, other))
+            else:
+                same = np.array_equal(column, other, equal_nan=column.dtype.kind == "f")
+            if not same:
+                found.append(f"{field.name}.{name}")
+    return found
+
+
+def damaged_copy(tmp_path: Path, damage: Callable[[Path], None]) -> Path:
+    folder = tmp_path / "map"
+    shutil.copytree(shared_data(SUBMAP), folder)
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o755)
+    damage(folder)
+    return folder
+
+
+def rewritten(folder: Path, name: str, change: Callable[[pb.VIMap], None]) -> None:
+    path = folder / "vi_map" / name
+    message = pb.VIMap.FromString(gzip.decompress(path.read_bytes()))
+    change(message)
+    path.write_bytes(gzip.compress(message.SerializeToString()))
+
+
+@pytest.mark.slow
+def test_every_real_map_survives_load_and_save(tmp_path: Path) -> None:
+    folders = find_maps(shared_data("maplab_maps"))
+    assert len(folders) == 9
+    for index, folder in enumerate(folders):
+        vi_map, report = load_map(folder)
+        assert report.notes == []
+        assert check_consistency(vi_map).failure == ""
+        save_map(vi_map, tmp_path / str(index))
+        assert differences(vi_map, load_map(tmp_path / str(index))[0]) == []
+
+
+def test_saved_messages_hold_what_the_original_files_hold(tmp_path: Path) -> None:
+    """Compare entity by entity with the original files, without this project's reader."""
+    source = shared_data(SUBMAP)
+    save_map(load_map(source)[0], tmp_path / "map")
+
+    def entities(folder: Path) -> dict[tuple[int, ...], object]:
+        found: dict[tuple[int, ...], object] = {}
+        for path in sorted((folder / "vi_map").iterdir()):
+            if path.name in ("sensors.yaml", "vi_map_metadata"):
+                continue
+            message = pb.VIMap.FromString(gzip.decompress(path.read_bytes()))
+            for name in ("vertex", "edge", "mission", "baseframe"):
+                plural = {"vertex": "vertices"}.get(name, name + "s")
+                for i, entity in zip(
+                    getattr(message, f"{name}_ids"), getattr(message, plural), strict=True
+                ):
+                    found[tuple(i.words)] = entity
+        return found
+
+    before, after = entities(source), entities(tmp_path / "map")
+    assert before.keys() == after.keys()
+    for key, entity in before.items():
+        other = after[key]
+        if isinstance(entity, pb.Vertex):
+            assert isinstance(other, pb.Vertex)
+            assert entity.nframe == other.nframe
+            assert list(entity.T_M_I) == list(other.T_M_I)
+            stored = {tuple(lm.id.words): lm for lm in entity.landmark_store.landmarks}
+            again = {tuple(lm.id.words): lm for lm in other.landmark_store.landmarks}
+            assert stored.keys() == again.keys()
+            for name, landmark in stored.items():
+                assert list(landmark.p_I) == list(again[name].p_I)
+                assert landmark.quality == again[name].quality
+        elif isinstance(entity, pb.Edge):
+            assert isinstance(other, pb.Edge)
+            assert list(entity.imu.accel_gyro) == list(other.imu.accel_gyro)
+            assert list(entity.imu.timestamps_ns) == list(other.imu.timestamps_ns)
+        else:
+            assert entity == other
+
+
+def test_unknown_fields_survive(tmp_path: Path) -> None:
+    extra = b"\xa2\x1f\x05hello"  # field 500, five bytes
+
+    def damage(folder: Path) -> None:
+        rewritten(folder, "missions", lambda m: m.missions[0].MergeFromString(extra))
+        rewritten(folder, "vertices0", lambda m: m.vertices[3].MergeFromString(extra))
+
+    vi_map, _ = load_map(damaged_copy(tmp_path, damage))
+    save_map(vi_map, tmp_path / "again")
+    again, _ = load_map(tmp_path / "again")
+    assert vi_map.missions.unknown[0] == extra
+    assert again.missions.unknown[0] == extra
+    assert sorted(again.vertices.unknown)[-1] == extra
+
+
+def _truncate(folder: Path) -> None:
+    path = folder / "vi_map/vertices0"
+    path.write_bytes(path.read_bytes()[:-5000])
+
+
+def _garbage(folder: Path) -> None:
+    (folder / "vi_map/edges0").write_bytes(gzip.compress(b"\xff" * 4000))
+
+
+def _bomb(folder: Path) -> None:
+    (folder / "vi_map/landmark_index").write_bytes(gzip.compress(bytes(60_000_000)))
+
+
+def _escape(folder: Path) -> None:
+    (folder / "vi_map/vi_map_metadata").write_text('files { file_type: 0 path: "../x" }')
+
+
+def _nan(folder: Path) -> None:
+    rewritten(folder, "vertices0", lambda m: m.vertices[0].T_M_I.__setitem__(4, float("nan")))
+
+
+def _long_quaternion(folder: Path) -> None:
+    rewritten(folder, "vertices0", lambda m: m.vertices[0].T_M_I.__setitem__(0, 3.0))
+
+
+def _sizes(folder: Path) -> None:
+    rewritten(folder, "vertices0", lambda m: m.vertices[0].nframe.frames[0].sigmas_px.append(1.0))
+
+
+def _dangling(folder: Path) -> None:
+    rewritten(folder, "edges0", lambda m: m.edges[0].imu.to_vertex_id.words.__setitem__(0, 12345))
+
+
+def _doubled(folder: Path) -> None:
+    rewritten(folder, "vertices0", lambda m: m.vertex_ids[1].CopyFrom(m.vertex_ids[0]))
+
+
+def _disagreement(folder: Path) -> None:
+    def change(message: pb.VIMap) -> None:
+        store = next(v.landmark_store for v in message.vertices if v.landmark_store.landmarks)
+        landmark = next(lm for lm in store.landmarks if lm.keypoint_indices)
+        landmark.keypoint_indices[0] += 1
+
+    rewritten(folder, "vertices0", change)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda f: (f / "vi_map/edges0").unlink(), "edges0"),
+        (_truncate, "vertices0"),
+        (_garbage, "edges0"),
+        (_bomb, "--proto_max_size_megabytes"),
+        (_escape, "leaves the map's folder"),
+        (_nan, "T_M_I"),
+        (_long_quaternion, "quaternion"),
+        (_sizes, "sigmas_px"),
+        (_dangling, "not in the map"),
+        (_doubled, "twice"),
+        (_disagreement, "--repair"),
+        (lambda f: (f / "vi_map/sensors.yaml").write_text("sensors: 3"), "sensors.yaml"),
+    ],
+)
+def test_damaged_maps_are_refused_in_one_line(
+    tmp_path: Path, damage: Callable[[Path], None], said: str
+) -> None:
+    folder = damaged_copy(tmp_path, damage)
+    with pytest.raises(MapError) as error:
+        load_map(folder, max_size_megabytes=50)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_repair_keeps_what_both_sides_say(tmp_path: Path) -> None:
+    folder = damaged_copy(tmp_path, _disagreement)
+    vi_map, report = load_map(folder, repair=True)
+    assert report.notes
+    assert check_consistency(vi_map).failure == ""
+
+
+def test_a_changed_byte_is_found_by_its_checksum(tmp_path: Path) -> None:
+    save_map(load_map(shared_data(SUBMAP))[0], tmp_path / "map")
+    path = tmp_path / "map/vi_map/sensors.yaml"
+    path.write_text(path.read_text() + "\n# touched\n")
+    with pytest.raises(MapError, match=r"sensors\.yaml"):
+        load_map(tmp_path / "map")
+
+
+def test_saving_refuses_what_it_must_not_replace(tmp_path: Path) -> None:
+    vi_map, _ = load_map(shared_data(SUBMAP))
+    save_map(vi_map, tmp_path / "map")
+    with pytest.raises(UserError, match="--overwrite"):
+        save_map(vi_map, tmp_path / "map")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").write_text("precious")
+    with pytest.raises(UserError, match="not a map"):
+        save_map(vi_map, tmp_path / "other", overwrite=True)
+    assert (tmp_path / "other/file").read_text() == "precious"
+
+
+def test_same_map_same_bytes_and_resources_stay(tmp_path: Path) -> None:
+    vi_map, _ = load_map(shared_data(SUBMAP))
+    save_map(vi_map, tmp_path / "map")
+    resource = tmp_path / "map/resources/raw_images/a.pgm"
+    resource.parent.mkdir(parents=True)
+    resource.write_bytes(b"P5")
+    before = {p.name: p.read_bytes() for p in (tmp_path / "map/vi_map").iterdir()}
+    save_map(vi_map, tmp_path / "map", overwrite=True)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "map/vi_map").iterdir()} == before
+    assert resource.read_bytes() == b"P5"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+@pytest.mark.slow
+def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path: Path) -> None:
+    source = shared_data(SUBMAP)
+    folder = tmp_path / "map"
+    vi_map, _ = load_map(source)
+    save_map(vi_map, folder)
+    program = (
+        "import sys; from pathlib import Path; from maplab_py.storage.native import *\n"
+        "m, _ = load_map(Path(sys.argv[1])); print('ready', flush=True)\n"
+        "while True: save_map(m, Path(sys.argv[2]), overwrite=True)"
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        child = subprocess.Popen(
+            [sys.executable, "-c", program, str(source), str(folder)], stdout=subprocess.PIPE
+        )
+        assert child.stdout is not None
+        child.stdout.readline()
+        time.sleep(float(rng.uniform(0.0, 0.3)))
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+        assert differences(vi_map, load_map(folder)[0]) == []
