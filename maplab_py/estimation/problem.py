@@ -68,8 +68,9 @@ class Problem:
         self._restricted = np.zeros(self.num_nodes, dtype=np.bool_)
 
     def restrict(self, nodes: I64, projectors: F64) -> None:
-        """Let nodes (k,) move only in the range of projectors (k, 3, 3)."""
-        self._projector[nodes] = projectors
+        """Let nodes (k,) move only in the range of projectors (k, 3, 3); fixed ones stay fixed."""
+        is_fixed = ~self._projector[nodes].any(axis=(1, 2), keepdims=True)
+        self._projector[nodes] = np.where(is_fixed, 0.0, projectors)
         self._restricted[nodes] = True
 
     def fix(self, nodes: I64) -> None:
