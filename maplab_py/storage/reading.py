@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from maplab_py.errors import MapError
 from maplab_py.storage import numbers
 from maplab_py.storage.words import ids_of, unknown_bytes
-from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
+from maplab_py.vimap.ids import IdIndex, as_keys, is_valid, to_hex
 from maplab_py.vimap.tables import (
     AbsolutePoses,
     BaseFrames,
@@ -65,9 +65,11 @@ def unique_index(ids: U64, what: str) -> IdIndex:
     """
     if len(ids) and not is_valid(ids).all():
         raise MapError(f"a {what} has no id")
-    unique, counts = np.unique(ids, axis=0, return_counts=True)
-    if len(unique) != len(ids):
-        raise MapError(f"{what} {to_hex(unique[counts > 1][0])} is there twice")
+    keys = as_keys(ids)
+    order = np.argsort(keys, kind="stable")
+    twice = np.flatnonzero(keys[order][1:] == keys[order][:-1])
+    if len(twice):
+        raise MapError(f"{what} {to_hex(ids[order[twice[0]]])} is there twice")
     return IdIndex(ids)
 
 

@@ -7,6 +7,7 @@ import gzip
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from google.protobuf import text_format
@@ -49,6 +50,7 @@ def save_map(
     *,
     overwrite: bool = False,
     compress: bool = True,
+    resource_files: Sequence[tuple[Path, Path]] = (),
     progress: Progress = SILENT,
 ) -> SaveReport:
     """Save a map; the folder holds the old map or the new one, whatever happens meanwhile.
@@ -60,6 +62,7 @@ def save_map(
         folder: Map folder; made with its parents when it does not exist.
         overwrite: Replace a map that is there.
         compress: Write gzip files, as maplab does.
+        resource_files: Files that come into the map's own resource folder, with their paths in it.
         progress: Shown while writing.
 
     Raises:
@@ -74,6 +77,7 @@ def save_map(
         with replaced_folder(folder) as temporary:
             files = _write(vi_map, temporary, compress, progress)
             _keep_resources(folder, temporary)
+            _add_resources(resource_files, temporary)
     except OSError as error:
         raise UserError(f"{folder}: cannot be saved ({error.strerror})") from error
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -129,6 +133,14 @@ def _keep_resources(old: Path, new: Path) -> None:
     source = old / RESOURCES
     if source.is_dir():
         shutil.copytree(source, new / RESOURCES, copy_function=_link_or_copy)
+
+
+def _add_resources(files: Sequence[tuple[Path, Path]], new: Path) -> None:
+    for source, relative in files:
+        target = new / RESOURCES / relative
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _link_or_copy(str(source), str(target))
 
 
 def _link_or_copy(source: str, target: str) -> str:

@@ -7,6 +7,8 @@ byte-swapped between file and memory.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ from maplab_py.errors import MapError
 
 U64 = NDArray[np.uint64]
 
+_WORDS = attrgetter("words")
+
 
 def ids_of(messages: Iterable[Any], where: str) -> U64:
     """Return ids (N, 2) of Id messages; one without words counts as zero.
@@ -25,15 +29,16 @@ def ids_of(messages: Iterable[Any], where: str) -> U64:
     Raises:
         MapError: An id has neither two words nor none; `where` names the field.
     """
-    lists = [message.words for message in messages]
-    flat = [word for words in lists for word in words]
-    if len(flat) != 2 * len(lists) or any(len(words) != 2 for words in lists):
-        flat = []
-        for words in lists:
-            if len(words) not in (0, 2):
-                raise MapError(f"{where}: an id has {len(words)} words instead of 2")
-            flat.extend(words if len(words) else (0, 0))
-    return np.array(flat, dtype=np.uint64).reshape(-1, 2).byteswap()
+    lists = list(map(_WORDS, messages))
+    if set(map(len, lists)) <= {2}:
+        flat = chain.from_iterable(lists)
+        return np.fromiter(flat, np.uint64, 2 * len(lists)).reshape(-1, 2).byteswap()
+    padded: list[int] = []
+    for words in lists:
+        if len(words) not in (0, 2):
+            raise MapError(f"{where}: an id has {len(words)} words instead of 2")
+        padded.extend(words if len(words) else (0, 0))
+    return np.array(padded, dtype=np.uint64).reshape(-1, 2).byteswap()
 
 
 def unknown_bytes(message: Message) -> bytes:

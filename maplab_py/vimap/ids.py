@@ -61,19 +61,41 @@ def as_keys(ids: IdArray) -> NDArray[np.void]:
 
 
 class IdIndex:
-    """Row look-up for a column of unique ids."""
+    """Row look-up for a column of unique ids.
+
+    Ids are mixed to 64 bits, which sort and search many times faster than pairs of words; a hit is
+    then compared in full. Should two different ids of the column mix to the same number (about one
+    chance in 10^10 for 50,000 ids), pairs of words are searched instead.
+    """
 
     def __init__(self, ids: IdArray) -> None:
         """Index ids (N, 2)."""
-        self._order = np.lexsort((ids[:, 1], ids[:, 0]))
-        self._sorted = ids[self._order]
+        self._ids = ids
+        mixed = _mixed(ids)
+        self._order = np.argsort(mixed, kind="stable")
+        self._sorted = mixed[self._order]
+        self._is_unique = bool((self._sorted[1:] != self._sorted[:-1]).all())
 
     def rows(self, ids: IdArray) -> NDArray[np.int64]:
         """Return the row of every id (N, 2), -1 where it is not in the column."""
         if len(self._sorted) == 0 or len(ids) == 0:
             return np.full(len(ids), -1, dtype=np.int64)
-        words, inverse = np.unique(np.concatenate([self._sorted, ids]), axis=0, return_inverse=True)
+        if not self._is_unique:
+            return self._rows_by_words(ids)
+        place = np.searchsorted(self._sorted, _mixed(ids))
+        row = self._order[np.minimum(place, len(self._order) - 1)]
+        return np.where((self._ids[row] == ids).all(axis=1), row, -1).astype(np.int64)
+
+    def _rows_by_words(self, ids: IdArray) -> NDArray[np.int64]:
+        words, inverse = np.unique(np.concatenate([self._ids, ids]), axis=0, return_inverse=True)
         inverse = inverse.reshape(-1)
         row_of_word = np.full(len(words), -1, dtype=np.int64)
-        row_of_word[inverse[: len(self._sorted)]] = self._order
-        return np.asarray(row_of_word[inverse[len(self._sorted) :]])
+        row_of_word[inverse[: len(self._ids)]] = np.arange(len(self._ids))
+        return np.asarray(row_of_word[inverse[len(self._ids) :]])
+
+
+def _mixed(ids: IdArray) -> NDArray[np.uint64]:
+    """Mix both words of ids (N, 2) to one (multiplications modulo 2^64, odd constants)."""
+    high, low = np.asarray(ids[:, 0]), np.asarray(ids[:, 1])
+    mixed = high * np.uint64(0x9E3779B97F4A7C15) + (low ^ (low >> np.uint64(29)))
+    return np.asarray((mixed ^ (mixed >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93))

@@ -227,7 +227,10 @@ def test_resource_folders(session: Session, tmp_path: Path) -> None:
     )
     session.maps.add("a", VIMap(resources=resources))
     counted: Any = session.run("resource_statistics")
-    assert [(t.resource_type, t.resources) for t in counted.types] == [(1, 2), (16, 1)]
+    assert [(t.resource_type, t.resources) for t in counted.types] == [
+        ("undistorted_images", 2),
+        ("point_cloud", 1),
+    ]
     session.run("use_external_resource_folder", resource_folder=tmp_path)
     session.run("use_external_resource_folder", resource_folder=tmp_path)
     folders: Any = session.run("list_resource_folders")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.storage.resource_types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 
 MAP_FOLDER = -1
@@ -35,7 +36,7 @@ class ResourceFolderList(Report):
 class ResourceCount:
     """How many resources of one type belong to one kind of owner."""
 
-    resource_type: int
+    resource_type: str
     owner: str
     resources: int
 
@@ -80,7 +81,9 @@ def resource_statistics(context: CommandContext) -> Report:
     kinds, counts = np.unique(pairs, axis=0, return_counts=True)
     return ResourceStatistics(
         tuple(
-            ResourceCount(int(kind), ResourceOwner(int(owner)).name.lower(), int(count))
+            ResourceCount(
+                resource_type(int(kind)).name, ResourceOwner(int(owner)).name.lower(), int(count)
+            )
             for (kind, owner), count in zip(kinds, counts, strict=True)
         )
     )

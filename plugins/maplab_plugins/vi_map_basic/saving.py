@@ -5,7 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
+
+from maplab_py.options import option
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.vimap import VIMap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +28,40 @@ class SavedMaps(Report):
     details: tuple[Report, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class ResourceMigration:
+    """Where the resource files go when a map is saved; at most one of the four is given."""
+
+    copy_resources_to_map_folder: bool = option(
+        False, help="Copy all resources into the map's folder."
+    )
+    move_resources_to_map_folder: bool = option(
+        False, help="Move all resources into the map's folder."
+    )
+    copy_resources_to_external_folder: str = option(
+        "", help="Copy all resources to this folder and refer to it."
+    )
+    move_resources_to_external_folder: str = option(
+        "", help="Move all resources to this folder and refer to it."
+    )
+
+    def check(self) -> None:
+        """Refuse contradicting wishes."""
+        wishes = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        if len(wishes) > 1:
+            raise UserError(f"save: give only one of {', '.join(f'--{name}' for name in wishes)}")
+
+
+_NO_MIGRATION = ResourceMigration()
+
+
 @command("save", example="save --map_folder=maps/merged --overwrite", see_also=("save_all",))
 def save(
-    context: CommandContext, map_folder: Path | None = None, *, overwrite: bool = False
+    context: CommandContext,
+    map_folder: Path | None = None,
+    *,
+    overwrite: bool = False,
+    migration: ResourceMigration = _NO_MIGRATION,
 ) -> SavedMaps:
     """Save the selected map; the folder's old content stays until the new one is complete.
 
@@ -37,12 +72,16 @@ def save(
     folder = map_folder or context.map_folder
     if folder is None:
         raise UserError(f"save: map '{context.map_key}' has no folder yet; give --map_folder=...")
-    return _save(context, [(context.map_key, folder)], overwrite=overwrite)
+    return _save(context, [(context.map_key, folder)], migration, overwrite=overwrite)
 
 
 @command("save_all", example="save_all --maps_folder=results", needs_map=False)
 def save_all(
-    context: CommandContext, maps_folder: Path | None = None, *, overwrite: bool = False
+    context: CommandContext,
+    maps_folder: Path | None = None,
+    *,
+    overwrite: bool = False,
+    migration: ResourceMigration = _NO_MIGRATION,
 ) -> SavedMaps:
     """Save all maps in memory.
 
@@ -61,7 +100,7 @@ def save_all(
         jobs.append((entry.key, folder))
     if not jobs:
         raise UserError("save_all: no maps in memory")
-    return _save(context, jobs, overwrite=overwrite)
+    return _save(context, jobs, migration, overwrite=overwrite)
 
 
 @command("get_map_folder")
@@ -82,16 +121,59 @@ def set_map_folder(context: CommandContext, map_folder: Path) -> Message:
     return Message(f"map '{entry.key}' will be saved to {map_folder}")
 
 
-def _save(context: CommandContext, jobs: list[tuple[str, Path]], *, overwrite: bool) -> SavedMaps:
+def _save(
+    context: CommandContext,
+    jobs: list[tuple[str, Path]],
+    migration: ResourceMigration,
+    *,
+    overwrite: bool,
+) -> SavedMaps:
     from maplab_py.storage.native import is_map_folder, save_map
 
+    migration.check()
     for key, folder in jobs:
         if is_map_folder(folder) and not overwrite:
             raise UserError(f"map '{key}': {folder} holds a map already; give --overwrite")
     reports = []
     for done, (key, folder) in enumerate(jobs):
         context.progress.step(done, len(jobs), f"save {key}")
-        vi_map = context.maps.get(key).vi_map
-        reports.append(save_map(vi_map, folder, overwrite=overwrite))
+        entry = context.maps.get(key)
+        vi_map, files, sources = _with_resources(entry.vi_map, entry.folder, folder, migration)
+        reports.append(save_map(vi_map, folder, overwrite=overwrite, resource_files=files))
+        if vi_map is not entry.vi_map:
+            context.maps.update(entry.with_value(vi_map, "save"))
         context.mark_saved(key, vi_map, folder)
+        for source in sources:
+            source.unlink(missing_ok=True)
     return SavedMaps(tuple(SavedMap(key, folder) for key, folder in jobs), tuple(reports))
+
+
+def _with_resources(
+    vi_map: VIMap, old_folder: Path | None, folder: Path, migration: ResourceMigration
+) -> tuple[VIMap, list[tuple[Path, Path]], list[Path]]:
+    """Return the map to save, files to bring into its folder, and files to delete afterwards.
+
+    A map's own resources always come along when it is saved to another folder.
+    """
+    if not len(vi_map.resources):
+        return vi_map, [], []
+    from maplab_py.storage import resources
+
+    home = old_folder or folder
+    external = (
+        migration.copy_resources_to_external_folder or migration.move_resources_to_external_folder
+    )
+    if external:
+        before = [path for path, _ in resources.existing_files(vi_map, home)]
+        moved = resources.copied_to_external(vi_map, home, Path(external))
+        kept = {path.resolve() for path, _ in resources.existing_files(moved, folder)}
+        leaving = [path for path in before if path.resolve() not in kept]
+        return moved, [], leaving if migration.move_resources_to_external_folder else []
+    to_map = migration.copy_resources_to_map_folder or migration.move_resources_to_map_folder
+    own = np.flatnonzero(vi_map.resources.folder == resources.OWN_FOLDER)
+    files = resources.existing_files(vi_map, home, None if to_map else own)
+    if to_map:
+        vi_map = resources.in_map_folder(vi_map)
+    inside = (folder / "resources").resolve()
+    leaving = [path for path, _ in files if not path.resolve().is_relative_to(inside)]
+    return vi_map, files, leaving if migration.move_resources_to_map_folder else []

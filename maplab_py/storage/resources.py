@@ -1,0 +1,165 @@
+"""Resource files of a map: where they are, loading them with a cache, moving them."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
+
+OWN_FOLDER = -1
+_IMAGE_SUFFIXES = (".pgm", ".ppm")
+_DEFAULT_CACHE_BYTES = 512_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class CacheStatistics:
+    """How the cache has done."""
+
+    hits: int
+    misses: int
+    entries: int
+    bytes: int
+
+
+def resource_path(vi_map: VIMap, row: int, map_folder: Path) -> Path:
+    """Return where the file of a resource (row) is.
+
+    Raises:
+        MapError: Its type or its folder does not exist in the map.
+    """
+    table, metadata = vi_map.resources, vi_map.metadata
+    index = int(table.folder[row])
+    if index == OWN_FOLDER:
+        root = map_folder / (metadata.map_resource_folder or "resources")
+    elif 0 <= index < len(metadata.external_resource_folders):
+        root = Path(metadata.external_resource_folders[index])
+    else:
+        raise MapError(
+            f"resource {to_hex(table.id[row])} is in folder {index}, which is not listed"
+        )
+    return root / relative_path(vi_map, row)
+
+
+def relative_path(vi_map: VIMap, row: int) -> Path:
+    """Return <type name>/<id><suffix> of a resource (row)."""
+    kind = resource_type(int(vi_map.resources.type[row]))
+    return Path(kind.name) / f"{to_hex(vi_map.resources.id[row])}{kind.suffix}"
+
+
+class ResourceStore:
+    """Loads resources of a map when they are wanted and keeps the latest, up to a size."""
+
+    def __init__(
+        self, vi_map: VIMap, map_folder: Path, *, max_bytes: int = _DEFAULT_CACHE_BYTES
+    ) -> None:
+        """Serve the resources of a map that was loaded from `map_folder`."""
+        self._map, self._folder, self._max_bytes = vi_map, Path(map_folder), max_bytes
+        self._cache: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
+        self._bytes = self._hits = self._misses = 0
+
+    @property
+    def statistics(self) -> CacheStatistics:
+        """How often the cache could serve, and what it holds."""
+        return CacheStatistics(self._hits, self._misses, len(self._cache), self._bytes)
+
+    def load(self, row: int) -> Any:
+        """Return a resource: an image (H, W[, 3] BGR), a text, or the file's bytes.
+
+        Raises:
+            MapError: The file is missing or cannot be read as what it should be.
+        """
+        path = resource_path(self._map, row, self._folder)
+        if path in self._cache:
+            self._hits += 1
+            self._cache.move_to_end(path)
+            return self._cache[path][0]
+        self._misses += 1
+        value, size = _read(path)
+        if size <= self._max_bytes:
+            self._cache[path] = value, size
+            self._bytes += size
+            while self._bytes > self._max_bytes:
+                _, (_, dropped) = self._cache.popitem(last=False)
+                self._bytes -= dropped
+        return value
+
+
+def _read(path: Path) -> tuple[Any, int]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MapError(f"{path}: the resource cannot be read ({error.strerror})") from error
+    if path.suffix in _IMAGE_SUFFIXES:
+        import cv2
+
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise MapError(f"{path}: the resource is not an image")
+        image.flags.writeable = False
+        return image, int(image.nbytes)
+    if path.suffix == ".txt":
+        return data.decode("utf-8", errors="replace"), len(data)
+    return data, len(data)
+
+
+def existing_files(
+    vi_map: VIMap, map_folder: Path, rows: NDArray[np.int64] | None = None
+) -> list[tuple[Path, Path]]:
+    """Return (file, path relative to a resource folder) of resources (rows, None = all).
+
+    Raises:
+        MapError: A file is missing.
+    """
+    every = np.arange(len(vi_map.resources)) if rows is None else rows
+    files = {}
+    for row in every.tolist():
+        path = resource_path(vi_map, row, map_folder)
+        if not path.is_file():
+            raise MapError(f"{path}: the resource's file is missing")
+        files[relative_path(vi_map, row)] = path
+    return [(path, relative) for relative, path in sorted(files.items())]
+
+
+def in_map_folder(vi_map: VIMap) -> VIMap:
+    """Return the map with all resources in its own folder (the files must follow)."""
+    table = vi_map.resources
+    metadata = dataclasses.replace(vi_map.metadata, map_resource_folder="./resources/")
+    folder = np.full(len(table), OWN_FOLDER, dtype=np.int32)
+    return vi_map.replace(resources=table.replace(folder=folder), metadata=metadata)
+
+
+def copied_to_external(vi_map: VIMap, map_folder: Path | None, target: Path) -> VIMap:
+    """Copy all resource files to a folder outside the map; return the map that refers to them.
+
+    Raises:
+        UserError: The folder cannot be written.
+        MapError: A file is missing.
+    """
+    target = Path(target).absolute()
+    for source, relative in existing_files(vi_map, map_folder or Path()):
+        destination = target / relative
+        if destination.exists() and destination.samefile(source):
+            continue
+        try:
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source, destination)
+        except OSError as error:
+            raise UserError(f"{destination}: cannot be written ({error.strerror})") from error
+    known = vi_map.metadata.external_resource_folders
+    folders = known if str(target) in known else (*known, str(target))
+    index = folders.index(str(target))
+    folder = np.full(len(vi_map.resources), index, dtype=np.int32)
+    return vi_map.replace(
+        resources=vi_map.resources.replace(folder=folder),
+        metadata=dataclasses.replace(vi_map.metadata, external_resource_folders=folders),
+    )
