@@ -260,3 +260,15 @@ def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path: Path) -> None:
         child.send_signal(signal.SIGKILL)
         child.wait()
         assert differences(vi_map, load_map(folder)[0]) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the lock is a POSIX one")
+def test_the_second_program_that_saves_is_told(tmp_path: Path) -> None:
+    from maplab_py.storage.atomic import replaced_folder
+
+    vi_map, _ = load_map(shared_data(SUBMAP))
+    with replaced_folder(tmp_path / "map") as temporary:
+        with pytest.raises(UserError, match="another program is saving"):
+            save_map(vi_map, tmp_path / "map")
+        (temporary / "file").write_text("first")
+    assert (tmp_path / "map/file").read_text() == "first"
