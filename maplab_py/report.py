@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+SCHEMA_VERSION = 1
+"""Version of the JSON that --json prints; it rises when a field changes its meaning or goes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +28,18 @@ class Report:
         """One line that says why the command failed although it ran; empty when it succeeded."""
         return ""
 
+    def as_text(self) -> str | None:
+        """Return the report as people shall read it; None lets the console lay out the fields."""
+        return None
+
     def as_json(self) -> dict[str, Any]:
         """Return the report's fields as plain JSON types."""
         return {f.name: to_json(getattr(self, f.name)) for f in dataclasses.fields(self)}
+
+    def _repr_html_(self) -> str:
+        """Return the report as tables, for notebooks."""
+        text = self.as_text()
+        return f"<pre>{html.escape(text)}</pre>" if text is not None else to_html(self.as_json())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +47,10 @@ class Message(Report):
     """A report of one sentence."""
 
     text: str
+
+    def as_text(self) -> str:
+        """Return the sentence."""
+        return self.text
 
 
 def to_json(value: Any) -> Any:
@@ -57,3 +74,22 @@ def to_json(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def to_html(value: Any) -> str:
+    """Write plain JSON types as HTML: objects and lists of objects as tables."""
+    if isinstance(value, dict):
+        rows = (
+            f"<tr><th>{html.escape(k)}</th><td>{to_html(v)}</td></tr>" for k, v in value.items()
+        )
+        return f"<table>{''.join(rows)}</table>"
+    if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+        names = list(value[0])
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
+        rows = ("".join(f"<td>{to_html(item.get(name))}</td>" for name in names) for item in value)
+        return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+    if isinstance(value, list):
+        return ", ".join(map(to_html, value))
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return html.escape("" if value is None else str(value))

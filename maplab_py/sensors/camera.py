@@ -51,6 +51,7 @@ class Camera:
     topic: str = ""
     description: str = ""
     time_offset_ns: int = 0  # t_imu = t_camera + offset
+    image_delay_s: float = 0.0  # images were taken this much after their vertices' times
     extra: dict[str, Any] = dataclasses.field(default_factory=dict)  # keys not understood
 
     def __post_init__(self) -> None:

@@ -210,7 +210,9 @@ def _parse_rig(entry: Entry, sensor_id: str, source: str) -> CameraRig:
         pose = _parse_mount(mounted, "T_B_C", "T_C_B")
         poses.append(pose[0])
         offset = mounted.integer("time_offset_ns", 0)
-        cameras.append(dataclasses.replace(_parse_camera(inner, camera_id), time_offset_ns=offset))
+        delay = mounted.number("image_delay_s", 0.0)
+        camera = _parse_camera(inner, camera_id)
+        cameras.append(dataclasses.replace(camera, time_offset_ns=offset, image_delay_s=delay))
         rest = mounted.rest()
         rest.pop("camera", None)
         extras.append({**rest, **pose[1]})
@@ -348,6 +350,8 @@ def _rig_entry(rig: CameraRig) -> dict[str, Any]:
         mount: dict[str, Any] = {"camera": _camera_entry(camera)}
         if camera.time_offset_ns != 0:
             mount["time_offset_ns"] = int(camera.time_offset_ns)
+        if camera.image_delay_s != 0.0:
+            mount["image_delay_s"] = float(camera.image_delay_s)
         mount.update(_mount_entry(T_B_C, extra, "T_B_C", "T_C_B"))
         cameras.append(mount)
     entry = {

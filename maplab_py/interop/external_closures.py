@@ -1,0 +1,113 @@
+"""Loop closures of other programs in maplab's YAML: times, poses, and the transformation between.
+
+A list of entries with `camera_from` and `camera_to` (each `timestamp_ns` and `pose`: where that
+program believed the device to be, in G), `T_from_to`, `switch_variable`, `switch_variable_variance`
+and `covariance` (36 numbers, position before orientation). Poses are `rotation_xyzw` and
+`translation_m`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+from maplab_py.geometry import se3, so3
+from maplab_py.vimap import LoopClosureEdges, VIMap
+from maplab_py.vimap.edits import content_rng
+from maplab_py.vimap.ids import random_ids
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_MAX_TIME_NS = 20_000_000
+"""Entries farther in time from every vertex are left out, as maplab does."""
+
+
+def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges, list[str]]:
+    """Read loop closures and carry them over to the nearest vertices.
+
+    From the device's pose S at the entry's time to the vertex pose S2 nearby, and T to T2 at the
+    other end: T_S2_T2 = T_S2_S T_S_T T_T_T2, where T_S2_S follows from the map and the entry's pose.
+
+    Returns:
+        The edges, and a note on entries without a vertex within 20 ms.
+
+    Raises:
+        MapError: The file cannot be read or an entry is wrong; names file and entry.
+    """
+    entries = _entries(path)
+    count = len(entries)
+    time_ns = np.zeros((count, 2), dtype=np.int64)
+    T_G_S, T_S_T = np.zeros((count, 2, 7)), np.zeros((count, 7))
+    covariance, switch = np.zeros((count, 6, 6)), np.zeros((count, 2))
+    for i, entry in enumerate(entries):
+        try:
+            for end, name in enumerate(("camera_from", "camera_to")):
+                time_ns[i, end] = int(entry[name]["timestamp_ns"])
+                T_G_S[i, end] = _pose(entry[name]["pose"])
+            T_S_T[i] = _pose(entry["T_from_to"])
+            numbers = np.array(entry["covariance"], dtype=np.float64)
+            covariance[i] = numbers.reshape(6, 6)
+            switch[i] = float(entry["switch_variable"]), float(entry["switch_variable_variance"])
+        except (KeyError, TypeError, ValueError) as error:
+            what = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
+            raise MapError(f"{path}: entry {i + 1}: {what}") from None
+    vertex, near = _nearest(vi_map, time_ns)
+    rows = np.flatnonzero(near.all(axis=1))
+    T_G_V = vi_map.T_G_I[vertex[rows]]
+    T_V_S = se3.relative(T_G_V, T_G_S[rows])
+    T_A_B = se3.compose(se3.compose(T_V_S[:, 0], T_S_T[rows]), se3.inverse(T_V_S[:, 1]))
+    edges = LoopClosureEdges.filled(
+        len(rows),
+        id=random_ids(len(rows), content_rng(vi_map, "external loop closures")),
+        from_vertex=vertex[rows, 0],
+        to_vertex=vertex[rows, 1],
+        T_A_B=T_A_B,
+        covariance=covariance[rows],
+        switch_variable=switch[rows, 0],
+        switch_variable_variance=switch[rows, 1],
+    )
+    left_out = count - len(rows)
+    notes = [f"{left_out} of {count} entries have no vertex within 20 ms"] if left_out else []
+    return edges, notes
+
+
+def _entries(path: Path) -> list[Any]:
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise MapError(f"{path} is not YAML: {error}") from error
+    if not isinstance(content, list):
+        raise MapError(f"{path}: a list of loop closures is wanted")
+    return content
+
+
+def _pose(node: Any) -> F64:
+    q = np.array(node["rotation_xyzw"], dtype=np.float64)
+    p = np.array(node["translation_m"], dtype=np.float64)
+    if q.shape != (4,) or p.shape != (3,) or not np.linalg.norm(q) > 0.0:
+        raise ValueError("a pose needs rotation_xyzw (4 numbers) and translation_m (3)")
+    return se3.make(so3.normalize(q), p)
+
+
+def _nearest(vi_map: VIMap, time_ns: I64) -> tuple[I64, NDArray[np.bool_]]:
+    """Return the vertex rows (N, 2) nearest in time, and which are near enough."""
+    order = np.argsort(vi_map.vertices.timestamp_ns, kind="stable")
+    times = vi_map.vertices.timestamp_ns[order]
+    if len(times) == 0:
+        return np.zeros(time_ns.shape, dtype=np.int64), np.zeros(time_ns.shape, dtype=np.bool_)
+    after = np.clip(np.searchsorted(times, time_ns), 1, max(len(times) - 1, 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.where(
+        np.abs(times[after] - time_ns) < np.abs(times[before] - time_ns), after, before
+    )
+    return order[closer], np.abs(times[closer] - time_ns) <= _MAX_TIME_NS

@@ -1,0 +1,175 @@
+"""Pose graphs in g2o's text format: VERTEX_SE3:QUAT, EDGE_SE3:QUAT, VERTEX_SE2, EDGE_SE2 and FIX.
+
+Information matrices are of Log(T_measured^-1 T_A_B), position before angle, as GTSAM and SE-Sync
+read them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError
+from maplab_py.geometry import se3, so3
+from maplab_py.interop.text_table import format_rows, write_text
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_POSE, _PLANAR_POSE = "VERTEX_SE3:QUAT", "VERTEX_SE2"
+_EDGE, _PLANAR_EDGE = "EDGE_SE3:QUAT", "EDGE_SE2"
+_WIDTH = {_POSE: 8, _EDGE: 30, _PLANAR_POSE: 4, _PLANAR_EDGE: 11}
+_OUT_OF_PLANE = 1e4
+"""Information of the height and the tilt that a planar edge says nothing of."""
+_PLANAR = np.array([0, 1, 5])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses and measurements between them; planar files are read as graphs in the plane z = 0."""
+
+    id: I64  # (V,) sorted
+    T_G_V: F64  # (V, 7)
+    first: I64  # (E,) rows of poses
+    second: I64  # (E,)
+    T_A_B: F64  # (E, 7)
+    information: F64  # (E, 6, 6) position, orientation
+    fixed: I64  # rows of poses that are to stay
+
+
+def read_g2o(path: Path) -> PoseGraph:
+    """Read a pose graph.
+
+    Raises:
+        MapError: The file cannot be read or a line is wrong; names file and line.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise MapError(f"cannot read {path}: {reason}") from error
+    found = _split(lines, path)
+    poses = [_numbers(found, kind, path) for kind in (_POSE, _PLANAR_POSE)]
+    edges = [_numbers(found, kind, path) for kind in (_EDGE, _PLANAR_EDGE)]
+    ids = np.concatenate([poses[0][0][:, 0], poses[1][0][:, 0]])
+    T = np.concatenate([_pose(poses[0][1]), _planar_pose(poses[1][1])])
+    if len(ids) == 0:
+        raise MapError(f"{path}: there are no poses in the file")
+    order = np.argsort(ids, kind="stable")
+    ids, T = ids[order], T[order]
+    if np.any(ids[1:] == ids[:-1]):
+        twice = ids[1:][ids[1:] == ids[:-1]][0]
+        raise MapError(f"{path}: pose {twice} is there twice")
+    ends = np.concatenate([edges[0][0], edges[1][0]])
+    rows = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
+    missing = np.flatnonzero(ids[rows] != ends)
+    if len(missing):
+        raise MapError(f"{path}: an edge names pose {ends.ravel()[missing[0]]}, which is not there")
+    fixed = np.array([int(words[1]) for _, words in found.get("FIX", [])], dtype=np.int64)
+    return PoseGraph(
+        id=ids,
+        T_G_V=T,
+        first=rows[:, 0],
+        second=rows[:, 1],
+        T_A_B=np.concatenate([_pose(edges[0][1][:, :7]), _planar_pose(edges[1][1][:, :3])]),
+        information=np.concatenate(
+            [_symmetric(edges[0][1][:, 7:], 6), _lifted(_symmetric(edges[1][1][:, 3:], 3))]
+        ),
+        fixed=np.flatnonzero(np.isin(ids, fixed)),
+    )
+
+
+def write_g2o(graph: PoseGraph, path: Path, *, overwrite: bool = False) -> None:
+    """Write a pose graph as SE(3) poses and edges, every number exact.
+
+    Raises:
+        UserError: The file exists and `overwrite` is not set, or it cannot be written.
+    """
+    to_file = [4, 5, 6, 0, 1, 2, 3]
+    upper = graph.information[:, *np.triu_indices(6)]
+
+    def chunks() -> Iterator[str]:
+        pose_line = f"{_POSE} %d" + " %.17g" * 7
+        yield from format_rows(pose_line, [graph.id, graph.T_G_V[:, to_file]])
+        yield from (f"FIX {number}\n" for number in graph.id[graph.fixed].tolist())
+        ends = [graph.id[graph.first], graph.id[graph.second]]
+        edge_line = f"{_EDGE} %d %d" + " %.17g" * 28
+        yield from format_rows(edge_line, [*ends, graph.T_A_B[:, to_file], upper])
+
+    write_text(path, chunks(), overwrite=overwrite)
+
+
+def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]]]:
+    """Return line numbers and words by the first word."""
+    found: dict[str, list[tuple[int, list[str]]]] = {}
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        kind = words[0]
+        if kind not in _WIDTH and kind != "FIX":
+            raise MapError(f"{path}:{number}: '{kind}' is not among {', '.join(_WIDTH)}, FIX")
+        wanted = _WIDTH.get(kind, len(words) - 1)
+        if len(words) - 1 != wanted:
+            raise MapError(f"{path}:{number}: {kind} has {len(words) - 1} numbers, not {wanted}")
+        found.setdefault(kind, []).append((number, words))
+    return found
+
+
+def _numbers(
+    found: dict[str, list[tuple[int, list[str]]]], kind: str, path: Path
+) -> tuple[I64, F64]:
+    """Return the ids (N, 1 or 2) and the values of the lines of one kind."""
+    ids = 2 if kind in (_EDGE, _PLANAR_EDGE) else 1
+    lines = found.get(kind, [])
+    try:
+        names = [[int(word) for word in words[1 : 1 + ids]] for _, words in lines]
+        values = [[float(word) for word in words[1 + ids :]] for _, words in lines]
+    except ValueError:
+        for number, words in lines:
+            _check_line(number, words, ids, path)
+        raise
+    width = _WIDTH[kind] - ids
+    return (
+        np.array(names, dtype=np.int64).reshape(-1, ids),
+        np.array(values, dtype=np.float64).reshape(-1, width),
+    )
+
+
+def _check_line(number: int, words: list[str], ids: int, path: Path) -> None:
+    try:
+        [int(word) for word in words[1 : 1 + ids]]
+        [float(word) for word in words[1 + ids :]]
+    except ValueError as error:
+        raise MapError(f"{path}:{number}: {error}") from None
+
+
+def _pose(values: F64) -> F64:
+    """Turn [p, q] (N, 7) into poses; quaternions are printed with few digits."""
+    return se3.make(so3.normalize(values[:, 3:]), values[:, :3])
+
+
+def _planar_pose(values: F64) -> F64:
+    turn = np.zeros((len(values), 3))
+    turn[:, 2] = values[:, 2]
+    position = np.zeros((len(values), 3))
+    position[:, :2] = values[:, :2]
+    return se3.make(so3.exp(turn), position)
+
+
+def _symmetric(upper: F64, size: int) -> F64:
+    """Return matrices (N, size, size) of their upper triangles, row by row."""
+    full = np.zeros((len(upper), size, size))
+    full[:, *np.triu_indices(size)] = upper
+    return full + np.triu(full, 1).transpose(0, 2, 1)
+
+
+def _lifted(information: F64) -> F64:
+    """Put planar information (N, 3, 3) of x, y, angle into (N, 6, 6)."""
+    full = np.tile(np.eye(6) * _OUT_OF_PLANE, (len(information), 1, 1))
+    full[:, _PLANAR[:, None], _PLANAR] = information
+    return full

@@ -1,0 +1,190 @@
+"""PLY files: points with colours and intensities, and triangle meshes.
+
+Source: Greg Turk, The PLY Polygon File Format, 1994.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError, UserError
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_INTENSITIES = ("intensity", "scalar_intensity", "scalar_Intensity", "i")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PlyCloud:
+    """What a PLY file holds."""
+
+    p: F64  # (N, 3) [m]
+    colours: U8 | None = None  # (N, 3)
+    intensity: F64 | None = None  # (N,)
+    faces: NDArray[np.int32] | None = None  # (F, 3)
+
+
+@dataclasses.dataclass
+class _Element:
+    name: str
+    count: int
+    fields: list[tuple[str, str]]  # name and numpy type
+    list_types: tuple[str, str] | None = None  # types of the count and of the entries
+
+
+def read_ply(path: Path) -> PlyCloud:
+    """Read a PLY file, ascii or binary.
+
+    Raises:
+        MapError: The file cannot be read, or is not PLY with vertices x, y, z.
+    """
+    try:
+        return parse_ply(path.read_bytes(), str(path))
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def parse_ply(data: bytes, source: str) -> PlyCloud:
+    """Read the content of a PLY file.
+
+    Raises:
+        MapError: It is not PLY with vertices x, y, z; names the source.
+    """
+    order, elements, begin = _header(data, source)
+    vertices: NDArray[np.void] | None = None
+    faces: NDArray[np.int32] | None = None
+    body = data[begin:]
+    try:
+        if order == "=":
+            vertices, faces = _read_ascii(body, elements)
+        else:
+            vertices, faces = _read_binary(body, elements, order)
+    except (ValueError, IndexError) as error:
+        raise MapError(f"{source}: the PLY data end early or do not fit ({error})") from None
+    if vertices is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
+        raise MapError(f"{source}: the PLY file has no vertices with x, y, z")
+    names = vertices.dtype.names or ()
+    p = np.stack([vertices[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
+    intensity = next((vertices[n].astype(np.float64) for n in _INTENSITIES if n in names), None)
+    return PlyCloud(p, _colours(vertices), intensity, faces)
+
+
+def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise MapError(f"{source}: this is not a PLY file")
+    begin = data.index(b"\n", end) + 1
+    order, elements = "", list[_Element]()
+    for line in data[:end].decode("ascii", errors="replace").splitlines():
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                order = _ORDERS[words[1]]
+            elif words[:1] == ["element"]:
+                elements.append(_Element(words[1], int(words[2]), []))
+            elif words[:2] == ["property", "list"]:
+                elements[-1].list_types = (_TYPES[words[2]], _TYPES[words[3]])
+            elif words[:1] == ["property"]:
+                elements[-1].fields.append((words[2], _TYPES[words[1]]))
+        except (KeyError, IndexError, ValueError):
+            raise MapError(f"{source}: the PLY header has a wrong line '{line.strip()}'") from None
+    if not order:
+        raise MapError(f"{source}: the PLY header names no format")
+    return order, elements, begin
+
+
+def _read_binary(
+    body: bytes, elements: list[_Element], order: str
+) -> tuple[NDArray[np.void] | None, NDArray[np.int32] | None]:
+    vertices, faces, place = None, None, 0
+    for element in elements:
+        if element.list_types is not None and (element.fields or element.name != "face"):
+            break  # of no use here, and its length is not known in advance
+        dtype = np.dtype([(name, order + kind) for name, kind in element.fields])
+        if element.list_types is not None:
+            count, entry = (order + kind for kind in element.list_types)
+            dtype = np.dtype([("n", count), ("v", entry, (3,))])
+        block = np.frombuffer(body, dtype=dtype, count=element.count, offset=place)
+        place += block.nbytes
+        if element.name == "vertex":
+            vertices = block
+        elif element.name == "face":
+            if not (block["n"] == 3).all():
+                raise ValueError("a face is not a triangle")
+            faces = block["v"].astype(np.int32)
+    return vertices, faces
+
+
+def _read_ascii(
+    body: bytes, elements: list[_Element]
+) -> tuple[NDArray[np.void] | None, NDArray[np.int32] | None]:
+    lines = body.decode("ascii", errors="replace").splitlines()
+    vertices, faces, place = None, None, 0
+    for element in elements:
+        rows = lines[place : place + element.count]
+        place += element.count
+        if len(rows) < element.count:
+            raise ValueError(f"{element.name}: {len(rows)} of {element.count} lines")
+        if element.name not in ("vertex", "face"):
+            continue
+        if element.name == "face":
+            table = np.array([row.split()[:4] for row in rows], dtype=np.int64).reshape(-1, 4)
+            if not (table[:, 0] == 3).all():
+                raise ValueError("a face is not a triangle")
+            faces = table[:, 1:].astype(np.int32)
+            continue
+        values = np.array(" ".join(rows).split(), dtype=np.float64)
+        values = values.reshape(element.count, len(element.fields))
+        vertices = np.zeros(element.count, dtype=np.dtype(element.fields))
+        for column, (name, _) in enumerate(element.fields):
+            vertices[name] = values[:, column]
+    return vertices, faces
+
+
+def _colours(vertices: NDArray[np.void]) -> U8 | None:
+    names = vertices.dtype.names or ()
+    for triple in (("red", "green", "blue"), ("r", "g", "b")):
+        if set(triple) <= set(names):
+            columns = np.stack([vertices[name] for name in triple], axis=1)
+            if columns.dtype.kind == "f":
+                columns = np.round(255.0 * np.clip(columns, 0.0, 1.0))
+            return columns.astype(np.uint8)
+    return None
+
+
+def write_ply(cloud: PlyCloud, path: Path) -> None:
+    """Write points, with colours and intensities where there are any, as binary PLY.
+
+    Raises:
+        UserError: The file cannot be written.
+    """
+    fields = [(name, "<f4") for name in ("x", "y", "z")]
+    columns: list[NDArray[Any]] = [cloud.p[:, axis] for axis in range(3)]
+    if cloud.intensity is not None:
+        fields.append(("intensity", "<f4"))
+        columns.append(cloud.intensity)
+    if cloud.colours is not None:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
+        columns += [cloud.colours[:, axis] for axis in range(3)]
+    table = np.zeros(len(cloud.p), dtype=np.dtype(fields))
+    for (name, _), values in zip(fields, columns, strict=True):
+        table[name] = values
+    kinds = {"<f4": "float", "u1": "uchar"}
+    lines = [f"property {kinds[kind]} {name}" for name, kind in fields]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *lines]
+    try:
+        path.write_bytes(("\n".join([*head, "end_header"]) + "\n").encode() + table.tobytes())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,224 @@
+"""The summary map: what localisation needs of a map, in one file.
+
+The fields that C++ maplab knows are written as it writes them, so that it can read the file.
+It skips `extras`: ids, landmark covariances, sensors, the descriptor projection and a checksum. A
+file without extras is read too; localisation then needs the projection from elsewhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.sensors import SensorSet
+from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.files import read_message
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U32 = NDArray[np.uint32]
+U64 = NDArray[np.uint64]
+
+FILE_NAME = "localization_summary_map"
+
+_GZIP_LEVEL = 6
+_UPPER_TRIANGLE = np.triu_indices(3)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SummaryMap:
+    """L landmarks, K observing vertices, N observations with a projected descriptor each."""
+
+    p_G: F32  # (L, 3) landmarks [m]
+    p_G_observer: F32  # (K, 3) [m]
+    descriptors: F32  # (N, dimensions)
+    landmark: U32  # (N,) rows of p_G
+    observer: U32  # (N,) rows of p_G_observer
+    # extras, None or empty where the file has none
+    landmark_id: U64 | None = None  # (L, 2)
+    observer_id: U64 | None = None  # (K, 2)
+    landmark_covariance: F32 | None = None  # (L, 3, 3) in G [m^2]
+    projection: F32 | None = None  # (dimensions, descriptor bits)
+    sensors: SensorSet | None = None
+
+
+def summary_map_file(path: Path) -> Path | None:
+    """Return the file of a summary map: the path itself or a file in that folder; None if none."""
+    if path.is_file():
+        return path
+    inside = path / FILE_NAME
+    return inside if inside.is_file() else None
+
+
+def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = False) -> Path:
+    """Write `localization_summary_map` into a folder; it is there completely or not at all.
+
+    Raises:
+        UserError: The file exists and `overwrite` is not set, or it cannot be written.
+    """
+    path = folder / FILE_NAME
+    if path.exists() and not overwrite:
+        raise UserError(f"{path} exists: give --overwrite to replace it")
+    data = gzip.compress(_message(summary).SerializeToString(), _GZIP_LEVEL, mtime=0)
+    temporary = ""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f".{FILE_NAME}.", dir=folder)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+        temporary = ""
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        if temporary:
+            Path(temporary).unlink(missing_ok=True)
+    return path
+
+
+def read_summary_map(path: Path, *, max_size_megabytes: int = 2000) -> SummaryMap:
+    """Read a summary map, the file or the folder that holds it.
+
+    Raises:
+        MapError: There is no such file, it is damaged, or its parts do not fit together.
+    """
+    file = summary_map_file(path)
+    if file is None:
+        raise MapError(f"{path}: there is no file {FILE_NAME}")
+    message = pb.LocalizationSummaryMap()
+    read_message(file, message, max_size_megabytes * 1_000_000)
+    inner = message.uncompressed_map
+    summary = SummaryMap(
+        p_G=_points(message.p_G_landmark, f"{file}: landmark positions"),
+        p_G_observer=_points(inner.p_G_observer, f"{file}: observer positions"),
+        descriptors=_matrix(inner.descriptors, f"{file}: descriptors").T.copy(),
+        landmark=np.array(inner.observation_to_landmark_index, dtype=np.uint32),
+        observer=np.array(inner.observer_indices, dtype=np.uint32),
+    )
+    _check_references(summary, file)
+    if not message.HasField("extras"):
+        return summary
+    summary = _with_extras(summary, message.extras, file)
+    if message.extras.sha256 and message.extras.sha256 != _digest(summary):
+        raise MapError(f"{file}: is damaged: it does not have its checksum")
+    return summary
+
+
+def _message(summary: SummaryMap) -> Any:
+    message = pb.LocalizationSummaryMap()
+    message.p_G_landmark.extend(summary.p_G.ravel().tolist())
+    inner = message.uncompressed_map
+    _fill_matrix(inner.descriptors, summary.descriptors.T)
+    inner.p_G_observer.extend(summary.p_G_observer.ravel().tolist())
+    inner.observer_indices.extend(summary.observer.tolist())
+    inner.observation_to_landmark_index.extend(summary.landmark.tolist())
+    extras = message.extras
+    if summary.landmark_id is not None:
+        extras.landmark_ids = _id_bytes(summary.landmark_id)
+    if summary.observer_id is not None:
+        extras.observer_ids = _id_bytes(summary.observer_id)
+    if summary.landmark_covariance is not None:
+        upper = summary.landmark_covariance[:, _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]]
+        extras.landmark_covariance.extend(upper.ravel().tolist())
+    if summary.projection is not None:
+        _fill_matrix(extras.projection, summary.projection)
+    if summary.sensors is not None:
+        extras.sensors_yaml = write_sensors(summary.sensors)
+    extras.sha256 = _digest(summary)
+    return message
+
+
+def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
+    landmarks, observers = len(summary.p_G), len(summary.p_G_observer)
+    found: dict[str, Any] = {}
+    if extras.landmark_ids:
+        found["landmark_id"] = _ids(extras.landmark_ids, landmarks, f"{file}: landmark ids")
+    if extras.observer_ids:
+        found["observer_id"] = _ids(extras.observer_ids, observers, f"{file}: observer ids")
+    if len(extras.landmark_covariance):
+        flat = np.array(extras.landmark_covariance, dtype=np.float32)
+        if len(flat) != 6 * landmarks:
+            raise MapError(f"{file}: {len(flat)} numbers in covariances of {landmarks} landmarks")
+        full = np.zeros((landmarks, 3, 3), dtype=np.float32)
+        full[:, _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]] = flat.reshape(-1, 6)
+        full[:, _UPPER_TRIANGLE[1], _UPPER_TRIANGLE[0]] = flat.reshape(-1, 6)
+        found["landmark_covariance"] = full
+    if extras.HasField("projection"):
+        matrix = _matrix(extras.projection, f"{file}: projection")
+        if len(matrix) != summary.descriptors.shape[1] or matrix.shape[1] % 8:
+            raise MapError(f"{file}: the projection does not fit the descriptors")
+        found["projection"] = np.ascontiguousarray(matrix)
+    if extras.sensors_yaml:
+        found["sensors"] = parse_sensors(extras.sensors_yaml, f"{file}: sensors")
+    return dataclasses.replace(summary, **found)
+
+
+def _digest(summary: SummaryMap) -> bytes:
+    """Return the SHA-256 of all numbers and the sensors, little-endian, in the order of fields."""
+    digest = hashlib.sha256()
+    for field in dataclasses.fields(summary):
+        value = getattr(summary, field.name)
+        digest.update(f"{field.name}:".encode())
+        if isinstance(value, np.ndarray):
+            digest.update(np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes())
+        elif value is not None:
+            digest.update(write_sensors(value).encode())
+    return digest.digest()
+
+
+def _check_references(summary: SummaryMap, file: Path) -> None:
+    count = len(summary.descriptors)
+    for name, index, size in (
+        ("landmarks", summary.landmark, len(summary.p_G)),
+        ("observers", summary.observer, len(summary.p_G_observer)),
+    ):
+        if len(index) != count:
+            raise MapError(f"{file}: {count} descriptors, but {len(index)} references to {name}")
+        if count and int(index.max()) >= size:
+            raise MapError(f"{file}: refers to {name} beyond the {size} that there are")
+
+
+def _points(flat: Any, where: str) -> F32:
+    values = np.array(flat, dtype=np.float32)
+    if len(values) % 3:
+        raise MapError(f"{where}: {len(values)} numbers are not points")
+    if not np.isfinite(values).all():
+        raise MapError(f"{where}: one is not a number")
+    return values.reshape(-1, 3)
+
+
+def _matrix(message: Any, where: str) -> F32:
+    values = np.array(message.data, dtype=np.float32)
+    if len(values) != message.rows * message.cols:
+        raise MapError(f"{where}: {len(values)} numbers are no {message.rows} x {message.cols}")
+    if not np.isfinite(values).all():
+        raise MapError(f"{where}: one is not a number")
+    return values.reshape(message.cols, message.rows).T
+
+
+def _fill_matrix(message: Any, values: F32) -> None:
+    message.rows, message.cols = values.shape
+    message.data.extend(values.T.ravel().tolist())
+
+
+def _id_bytes(ids: U64) -> bytes:
+    return np.ascontiguousarray(ids, dtype=">u8").tobytes()
+
+
+def _ids(data: bytes, count: int, where: str) -> U64:
+    if len(data) != 16 * count:
+        raise MapError(f"{where}: {len(data)} bytes are not the ids of {count}")
+    return np.frombuffer(data, dtype=">u8").astype(np.uint64).reshape(-1, 2)
