@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.loss import Loss, robust
 from maplab_py.estimation.states import F64, States
 
 I64 = NDArray[np.int64]
@@ -47,38 +47,20 @@ class FactorSystem:
     cost: float
 
 
-def robust(loss: Loss, scale: float, s: F64) -> tuple[F64, F64]:
-    """Return rho(s) and its derivative for squared whitened residuals (N,)."""
-    c2 = scale * scale
-    if loss is Loss.HUBER:
-        root = np.sqrt(c2 / np.maximum(s, c2))
-        return np.where(s <= c2, s, 2.0 * s * root - c2), root
-    if loss is Loss.CAUCHY:
-        return c2 * np.log1p(s / c2), 1.0 / (1.0 + s / c2)
-    if loss is Loss.TUKEY:
-        t = np.maximum(1.0 - s / c2, 0.0)
-        return c2 / 3.0 * (1.0 - t**3), t * t
-    if loss is Loss.GEMAN_MCCLURE:
-        t = c2 / (c2 + s)
-        return s * t, t * t
-    if loss is Loss.DCS:
-        t = np.minimum(1.0, 2.0 * c2 / (c2 + s))
-        return np.where(s <= c2, s, c2 * (3.0 * s - c2) / (s + c2)), t * t
-    return s, np.ones_like(s)
-
-
 def cost(term: FactorTerm, states: States) -> float:
     """Return half the sum of rho of a term."""
     residual, _ = term.evaluate(states)
     loss, scale = term.loss
-    return 0.5 * float(np.sum(robust(loss, scale, np.einsum("nm,nm->n", residual, residual))[0]))
+    return 0.5 * float(
+        np.sum(robust(loss, scale * scale, np.einsum("nm,nm->n", residual, residual))[0])
+    )
 
 
 def linearize(term: FactorTerm, states: States) -> tuple[FactorSystem, F64, F64]:
     """Return the normal equations, and the weighted residuals and Jacobians they came from."""
     residual, jacobian = term.evaluate(states)
     loss, scale = term.loss
-    rho, weight = robust(loss, scale, np.einsum("nm,nm->n", residual, residual))
+    rho, weight = robust(loss, scale * scale, np.einsum("nm,nm->n", residual, residual))
     root = np.sqrt(weight)
     residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
     count = len(jacobian)

@@ -23,12 +23,13 @@ from maplab_py.estimation.states import (
 
 I64 = NDArray[np.int64]
 
-_FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
+FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
 """Added to covariances: edges of a few microseconds stay finite (1 um, 0.1 urad, 1 um/s)."""
 
-_GYRO_MOVED_RADPS = 1e-3
-_ACCEL_MOVED_MPS2 = 1e-2
-"""Beyond these the first-order bias correction is replaced by a new integration."""
+_GYRO_MOVED_RADPS = 1e-4
+_ACCEL_MOVED_MPS2 = 1e-3
+"""Beyond these the first-order bias correction, wrong by up to 0.1 nm in 0.2 s then, is replaced by
+a new integration."""
 
 
 class InertialTerm:
@@ -59,28 +60,37 @@ class InertialTerm:
             moved_a = np.abs(b_a - old.accel_bias).max(initial=0.0) > _ACCEL_MOVED_MPS2
             if not moved_g and not moved_a:
                 return False
-        self._measured = new = integrate(self._data, b_g, b_a)
-        self._whitening = np.linalg.inv(np.linalg.cholesky(new.covariance + _FLOOR))
+        new = integrate(self._data, b_g, b_a)
+        self._whitening = np.linalg.inv(np.linalg.cholesky(new.covariance + FLOOR))
+        self._set_measured(new)
+        return True
+
+    def _set_measured(self, new: Preintegrated, *more: F64) -> None:
+        """Keep the kernel's arguments that do not depend on states."""
+        self._measured = new
         self._fixed_arguments = np.concatenate(
             [
                 new.q_A_B,
                 new.dp,
                 new.dv,
-                _column_major(new.jacobian_gyro_bias),
-                _column_major(new.jacobian_accel_bias),
+                column_major(new.jacobian_gyro_bias),
+                column_major(new.jacobian_accel_bias),
                 new.gyro_bias,
                 new.accel_bias,
                 new.duration_s[:, None],
                 np.broadcast_to(self._g, (len(new.dp), 3)),
+                *more,
             ],
             axis=1,
         )
-        return True
 
     def evaluate(self, states: States) -> tuple[F64, F64]:
         """Return whitened residuals (E, 9) and Jacobians (E, 9, 24)."""
         if self._measured is None:
             self.integrate(states)
+        return self._evaluate(states)
+
+    def _evaluate(self, states: States) -> tuple[F64, F64]:
         a, b = self._a, self._b
         arguments = np.concatenate(
             [
@@ -94,7 +104,8 @@ class InertialTerm:
             ],
             axis=1,
         )
-        residual, jacobian = np.empty((len(a), 9)), np.empty((len(a), 9, 24))
+        residual = np.empty((len(a), 9))
+        jacobian = np.empty((len(a), 9, 3 * self.nodes.shape[1]))
         self._kernel.evaluate(arguments, self._whitening, residual, jacobian)
         return residual, jacobian
 
@@ -122,6 +133,6 @@ class BiasWalkTerm:
         return (biases[self._b] - biases[self._a]) * self._weight, self._jacobian
 
 
-def _column_major(matrices: F64) -> F64:
-    """Flatten (E, 9, 3) matrices column by column, as casadi orders them."""
+def column_major(matrices: F64) -> F64:
+    """Flatten (E, 9, k) matrices column by column, as casadi orders them."""
     return matrices.transpose(0, 2, 1).reshape(len(matrices), -1)

@@ -8,10 +8,13 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.estimation.blocks import Manifold, ParameterBlock
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.states import F64, NODES_PER_VERTEX, ORIENTATION, POSITION, States
+from maplab_py.estimation.states import F64, States, pose_nodes
 
 I64 = NDArray[np.int64]
+
+MOUNTING, SWITCH = "sensor extrinsics", "loop closure switch"
 
 _SMALLEST_VARIANCE = 1e-14
 
@@ -28,9 +31,40 @@ def whitening(covariance: F64) -> F64:
     return np.asarray(scale[:, :, None] * vectors.transpose(0, 2, 1))
 
 
+def mounting_block(T_I_S: F64, name: str = MOUNTING) -> ParameterBlock:
+    """Return the block of sensors' extrinsics T_I_S (S, 7)."""
+    return ParameterBlock(name, T_I_S, Manifold.POSE)
+
+
+def switch_block(switches: F64) -> ParameterBlock:
+    """Return the block of switches (N,), which stay within [0, 1]."""
+    return ParameterBlock(SWITCH, switches.reshape(-1, 1), lower=0.0, upper=1.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mounting:
+    """Where the extrinsics of measurements are kept: rows (N,) of a block of the states."""
+
+    block: str
+    row: I64
+    nodes: I64  # (N, 2)
+
+    @classmethod
+    def of(cls, states: States, row: I64, block: str = MOUNTING) -> Mounting:
+        """Refer to rows (N,) of a block of the states."""
+        return cls(block, row, states.nodes(block)[row])
+
+    def T_I_S(self, states: States) -> F64:
+        """Return the extrinsics (N, 7)."""
+        return np.asarray(states.blocks[self.block].values[self.row])
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class RelativePoseTerm:
-    """Measured relative poses T_SA_SB of a sensor between two vertices: odometry, loop closures."""
+    """Measured relative poses T_SA_SB of a sensor between two vertices: odometry, loop closures.
+
+    With a mounting the extrinsics are states and the kernel is `relative_pose_with_mounting`.
+    """
 
     kernel: ModuleType
     name: str
@@ -40,26 +74,62 @@ class RelativePoseTerm:
     T_SA_SB: F64  # (N, 7)
     whitening: F64  # (N, 6, 6)
     loss: tuple[Loss, float] = (Loss.NONE, 1.0)
+    mounting: Mounting | None = None
 
     @property
     def nodes(self) -> I64:
-        """Nodes (N, 4)."""
-        return np.concatenate([_pose_nodes(self.first), _pose_nodes(self.second)], axis=1)
+        """Nodes (N, 4), or (N, 6) with the mounting's."""
+        more = [] if self.mounting is None else [self.mounting.nodes]
+        return np.concatenate([pose_nodes(self.first), pose_nodes(self.second), *more], axis=1)
 
     def evaluate(self, states: States) -> tuple[F64, F64]:
-        """Return whitened residuals (N, 6) and Jacobians (N, 6, 12)."""
+        """Return whitened residuals (N, 6) and Jacobians (N, 6, 12 or 18)."""
         poses = states.T_G_I
-        arguments = np.concatenate(
-            [poses[self.first], poses[self.second], self.T_I_S, self.T_SA_SB], axis=1
+        T_I_S = self.T_I_S if self.mounting is None else self.mounting.T_I_S(states)
+        arguments = np.concatenate([poses[self.first], poses[self.second], T_I_S, self.T_SA_SB], 1)
+        return _evaluated(
+            self.kernel, arguments, self.whitening, 12 if self.mounting is None else 18
         )
-        residual, jacobian = np.empty((len(arguments), 6)), np.empty((len(arguments), 6, 12))
-        self.kernel.evaluate(arguments, self.whitening, residual, jacobian)
-        return residual, jacobian
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SwitchedRelativePoseTerm:
+    """Relative poses T_A_B that switches, states in `switch_block`, turn down or off.
+
+    A prior on the switches (`PriorTerm` at 1) keeps those of consistent measurements on.
+    """
+
+    kernel: ModuleType
+    name: str
+    first: I64
+    second: I64
+    T_A_B: F64
+    whitening: F64
+    switch: I64  # (N,) rows of the block
+    switch_nodes: I64  # (N, 1)
+    loss: tuple[Loss, float] = (Loss.NONE, 1.0)
+
+    @property
+    def nodes(self) -> I64:
+        """Nodes (N, 5)."""
+        poses = [pose_nodes(self.first), pose_nodes(self.second)]
+        return np.concatenate([*poses, self.switch_nodes], axis=1)
+
+    def evaluate(self, states: States) -> tuple[F64, F64]:
+        """Return whitened residuals (N, 6) and Jacobians (N, 6, 15)."""
+        poses = states.T_G_I
+        switch = np.zeros((len(self.first), 3))
+        switch[:, 0] = states.blocks[SWITCH].values[self.switch, 0]
+        arguments = np.concatenate([poses[self.first], poses[self.second], switch, self.T_A_B], 1)
+        return _evaluated(self.kernel, arguments, self.whitening, 15)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AbsolutePoseTerm:
-    """Measured poses T_G_S of a sensor at vertices."""
+    """Measured poses T_G_S of a sensor at vertices.
+
+    With a mounting the extrinsics are states and the kernel is `absolute_pose_with_mounting`.
+    """
 
     kernel: ModuleType
     vertex: I64  # (N,)
@@ -68,20 +138,26 @@ class AbsolutePoseTerm:
     whitening: F64  # (N, 6, 6)
     loss: tuple[Loss, float] = (Loss.NONE, 1.0)
     name: str = "absolute pose"
+    mounting: Mounting | None = None
 
     @property
     def nodes(self) -> I64:
-        """Nodes (N, 2)."""
-        return _pose_nodes(self.vertex)
+        """Nodes (N, 2), or (N, 4) with the mounting's."""
+        more = [] if self.mounting is None else [self.mounting.nodes]
+        return np.concatenate([pose_nodes(self.vertex), *more], axis=1)
 
     def evaluate(self, states: States) -> tuple[F64, F64]:
-        """Return whitened residuals (N, 6) and Jacobians (N, 6, 6)."""
-        arguments = np.concatenate([states.T_G_I[self.vertex], self.T_I_S, self.T_G_S], axis=1)
-        residual, jacobian = np.empty((len(arguments), 6)), np.empty((len(arguments), 6, 6))
-        self.kernel.evaluate(arguments, self.whitening, residual, jacobian)
-        return residual, jacobian
+        """Return whitened residuals (N, 6) and Jacobians (N, 6, 6 or 12)."""
+        T_I_S = self.T_I_S if self.mounting is None else self.mounting.T_I_S(states)
+        arguments = np.concatenate([states.T_G_I[self.vertex], T_I_S, self.T_G_S], axis=1)
+        return _evaluated(
+            self.kernel, arguments, self.whitening, 6 if self.mounting is None else 12
+        )
 
 
-def _pose_nodes(vertices: I64) -> I64:
-    base = NODES_PER_VERTEX * vertices.astype(np.int64)
-    return np.stack([base + POSITION, base + ORIENTATION], axis=1)
+def _evaluated(
+    kernel: ModuleType, arguments: F64, root_information: F64, columns: int
+) -> tuple[F64, F64]:
+    residual, jacobian = np.empty((len(arguments), 6)), np.empty((len(arguments), 6, columns))
+    kernel.evaluate(arguments, root_information, residual, jacobian)
+    return residual, jacobian

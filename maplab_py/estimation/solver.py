@@ -1,10 +1,4 @@
-"""Levenberg-Marquardt over a `Problem`.
-
-The trust region's radius follows Madsen, Nielsen and Tingleff (Methods for Non-Linear Least
-Squares Problems, 2004, section 3.2), as in Ceres: a step whose real decrease is a good part of the
-promised one enlarges the radius, a rejected step shrinks it by 2, 4, 8 ... Damping is 1 / radius
-times the clamped diagonal of the normal equations.
-"""
+"""Levenberg-Marquardt over a `Problem` (trust region: see `trust_region`)."""
 
 from __future__ import annotations
 
@@ -21,6 +15,7 @@ from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.problem import Linearization, Problem
 from maplab_py.estimation.states import F64, States
+from maplab_py.estimation.trust_region import Schedule, StepJudge, TrustRegion
 from maplab_py.progress import Progress
 
 _SUFFICIENT_GAIN = 1e-3
@@ -38,6 +33,8 @@ class SolverOptions:
     function_tolerance: float = 1e-6
     gradient_tolerance: float = 1e-10
     parameter_tolerance: float = 1e-8
+    schedule: Schedule = Schedule.STEP_QUALITY
+    max_uphill_steps: int = 0  # consecutive steps that may raise the cost
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +47,7 @@ class SolverSummary:
     rejected_steps: int
     termination: str
     seconds: float
+    singular_at: tuple[int, ...] = ()  # nodes at which a factorisation failed
 
 
 AfterStep = Callable[[int, States], bool]
@@ -61,50 +59,74 @@ class _Run:
 
     def __init__(self, problem: Problem, states: States, options: SolverOptions) -> None:
         self.problem, self.states, self.options = problem, states, options
-        self.radius = options.initial_radius
-        self.shrink = 2.0
+        self.region = TrustRegion(
+            options.initial_radius, options.min_radius, options.max_radius, options.schedule
+        )
+        self.linear = self.linearize()
+        self.judge = StepJudge(self.linear.cost, options.max_uphill_steps)
+        self.best, self.best_cost = states, self.linear.cost
         self.rejected = 0
+        self.singular: list[int] = []
 
     def linearize(self) -> Linearization:
         for term in self.problem.factors:
             if isinstance(term, InertialTerm):
                 term.integrate(self.states)
-        return self.problem.linearize(self.states, 1.0 / self.radius)
+        return self.problem.linearize(self.states, 1.0 / self.region.radius)
 
-    def try_step(self, linear: Linearization) -> tuple[States, float, float, float]:
+    def try_step(self) -> tuple[States, float, float, float]:
         """Return the states after one step, their cost, the promised decrease and the step's norm.
 
         Raises:
             NotPositiveDefinite: The damped system is singular.
         """
-        problem, states, damping = self.problem, self.states, 1.0 / self.radius
-        step = problem.solve(linear, damping)
+        problem, states, damping = self.problem, self.states, 1.0 / self.region.radius
+        step = problem.solve(self.linear, damping)
         moved = states.moved(step, states.p_G)
         new_cost, promised = 0.0, 0.0
         if problem.visual is not None:
-            pose_step = step[:, :2].reshape(-1, 6)
-            p_G, new_cost, promised = problem.visual.step(
-                states.T_G_I, states.p_G, pose_step, moved.T_G_I, damping
-            )
+            p_G, new_cost, promised = problem.visual.take_step(states, step, moved, damping)
             moved = dataclasses.replace(moved, p_G=p_G)
-        flat = step.reshape(-1, 3)
-        for nodes, residual, jacobian in linear.factors:
-            change = np.einsum("nmk,nk->nm", jacobian, flat[nodes].reshape(len(nodes), -1))
-            promised -= float(np.sum(change * (residual + 0.5 * change)))
+        promised += self._promised_by_factors(step)
         new_cost += sum(factor_terms.cost(term, moved) for term in problem.factors)
         norm = float(np.sqrt(np.sum(step**2) + np.sum((moved.p_G - states.p_G) ** 2)))
         return moved, new_cost, promised, norm
 
-    def accept(self, states: States, gain: float) -> None:
+    def look_around(self, *, is_last: bool) -> None:
+        """Linearise at the present states; after the last step only their cost is wanted."""
+        if is_last:
+            costs = self.problem.costs(self.states)
+            self.linear = dataclasses.replace(self.linear, costs=costs)
+        else:
+            self.linear = self.linearize()
+
+    def _promised_by_factors(self, step: F64) -> float:
+        promised = 0.0
+        for nodes, residual, jacobian in self.linear.factors:
+            change = np.einsum("nmk,nk->nm", jacobian, step[nodes].reshape(len(nodes), -1))
+            promised -= float(np.sum(change * (residual + 0.5 * change)))
+        return promised
+
+    def accept(self, states: States, new_cost: float, promised: float, gain: float) -> None:
         self.states = states
-        widen = 1.0 / max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-        self.radius = min(self.radius * widen, self.options.max_radius)
-        self.shrink = 2.0
+        self.region.accept(gain)
+        if self.judge.accept(new_cost, promised):
+            self.best, self.best_cost = states, new_cost
+
+    def problem_changed(self) -> None:
+        """Judge anew: costs before and after the change cannot be compared."""
+        self.judge.restart(self.linear.cost)
+        self.best, self.best_cost = self.states, self.linear.cost
 
     def reject(self) -> None:
-        self.radius /= self.shrink
-        self.shrink *= 2.0
+        self.region.reject()
         self.rejected += 1
+
+    def return_to_best(self) -> None:
+        """Undo uphill steps that led nowhere."""
+        if self.best is not self.states and self.best_cost < self.linear.cost:
+            self.states = self.best
+            self.linear = self.linearize()
 
 
 def optimize_states(
@@ -127,11 +149,10 @@ def optimize_states(
         EstimationError: The cost is not finite at the beginning.
     """
     began = time.perf_counter()
-    run = _Run(problem, states, options)
     with single_blas_thread():
-        linear = run.linearize()
-        initial = dict(linear.costs)
-        if not np.isfinite(linear.cost):
+        run = _Run(problem, states, options)
+        initial = dict(run.linear.costs)
+        if not np.isfinite(run.linear.cost):
             raise EstimationError(f"the cost is not finite before the first iteration: {initial}")
         termination, iterations = "iteration limit", 0
         for iteration in range(1, options.num_iterations + 1):
@@ -139,54 +160,59 @@ def optimize_states(
             if time.perf_counter() - began > options.max_time_seconds:
                 termination = "time limit"
                 break
-            if np.abs(problem.projected_gradient(linear)).max() <= options.gradient_tolerance:
+            if _is_stationary(problem, run.linear, options.gradient_tolerance):
                 termination = "gradient is zero"
                 break
             iterations = iteration
-            reason, linear = _iterate(run, linear, iteration, progress, after_step)
-            if reason:
+            if reason := _iterate(run, iteration, progress, after_step):
                 termination = reason
                 break
+        run.return_to_best()
     summary = SolverSummary(
-        initial, dict(linear.costs), iterations, run.rejected, termination,
-        time.perf_counter() - began,
+        initial, dict(run.linear.costs), iterations, run.rejected, termination,
+        time.perf_counter() - began, tuple(dict.fromkeys(run.singular)),
     )  # fmt: skip
     return run.states, summary
 
 
-def _iterate(
-    run: _Run,
-    linear: Linearization,
-    iteration: int,
-    progress: Progress,
-    after_step: AfterStep | None,
-) -> tuple[str, Linearization]:
-    """Try one step. Return why to stop (empty = go on) and the current linearisation."""
-    options, cost = run.options, linear.cost
+def _is_stationary(problem: Problem, linear: Linearization, tolerance: float) -> bool:
+    """Tell whether the gradient is zero; that of landmarks that move is not known."""
+    if problem.visual is not None and problem.visual.moves_points:
+        return False
+    return bool(np.abs(problem.projected_gradient(linear)).max(initial=0.0) <= tolerance)
+
+
+def _iterate(run: _Run, iteration: int, progress: Progress, after_step: AfterStep | None) -> str:
+    """Try one step. Return why to stop; empty = go on."""
+    options, cost, radius = run.options, run.linear.cost, run.region.radius
     try:
-        moved, new_cost, promised, norm = run.try_step(linear)
-        gain = (cost - new_cost) / promised if promised > 0.0 else -1.0
-    except NotPositiveDefinite:
-        moved, new_cost, norm, gain = run.states, np.inf, np.inf, -1.0
+        moved, new_cost, promised, norm = run.try_step()
+        gain = run.judge.gain(new_cost, promised)
+    except NotPositiveDefinite as error:
+        run.singular.append(error.node)
+        moved, new_cost, promised, norm, gain = run.states, np.inf, 0.0, np.inf, -1.0
     progress.line(
         f"{iteration:4d}  cost {cost:14.6e} -> {new_cost:14.6e}  gain {gain:7.3f}  "
-        f"step {norm:9.2e}  radius {run.radius:9.2e}"
+        f"step {norm:9.2e}  radius {radius:9.2e}"
     )
     if norm <= options.parameter_tolerance * (run.states.size() + options.parameter_tolerance):
-        return "step is small", linear
+        return "step is small"
     if not np.isfinite(new_cost) or gain < _SUFFICIENT_GAIN:
         if abs(cost - new_cost) <= options.function_tolerance * cost:
-            return "cost has settled", linear
+            return "cost has settled"
         run.reject()
-        if run.radius < options.min_radius:
-            return "no step lowers the cost", linear
-        return "", run.linearize()  # the elimination of the landmarks depends on the damping
-    run.accept(moved, gain)
+        if run.region.is_exhausted:
+            return "no step lowers the cost"
+        run.linear = run.linearize()  # the elimination of the landmarks depends on the damping
+        return ""
+    run.accept(moved, new_cost, promised, gain)
     changed = after_step is not None and after_step(iteration, run.states)
-    linear = run.linearize()
-    if not changed and cost - new_cost <= options.function_tolerance * cost:
-        return "cost has settled", linear
-    return "", linear
+    run.look_around(is_last=iteration == options.num_iterations)
+    if changed:
+        run.problem_changed()
+    elif abs(cost - new_cost) <= options.function_tolerance * cost:
+        return "cost has settled"
+    return ""
 
 
 def null_projector(direction: F64) -> F64:

@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.estimation.blocks import ParameterBlock, ParameterBlocks
 from maplab_py.geometry import se3
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 NODES_PER_VERTEX = 5
 """Nodes of three numbers each: position, orientation, velocity, gyroscope and accelerometer bias.
@@ -19,30 +21,62 @@ which see only their neighbours in time, from poses, which see all that share la
 """
 
 POSITION, ORIENTATION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = range(NODES_PER_VERTEX)
+NODE_NAMES = ("position", "orientation", "velocity", "gyroscope bias", "accelerometer bias")
+
+
+def pose_nodes(vertices: NDArray[np.integer]) -> I64:
+    """Return the position and orientation nodes (N, 2) of vertices (N,)."""
+    base = NODES_PER_VERTEX * vertices.astype(np.int64)
+    return np.stack([base + POSITION, base + ORIENTATION], axis=1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class States:
-    """States of V vertices and L landmarks, everything in G."""
+    """States of V vertices and L landmarks, everything in G, and parameters of other kinds.
+
+    Nodes are numbered vertex by vertex (see NODES_PER_VERTEX), then block by block.
+    """
 
     T_G_I: F64  # (V, 7)
     v_G: F64  # (V, 3)
     gyro_bias: F64  # (V, 3)
     accel_bias: F64  # (V, 3)
     p_G: F64  # (L, 3)
+    blocks: ParameterBlocks = dataclasses.field(default_factory=ParameterBlocks)
+
+    @property
+    def num_vertex_nodes(self) -> int:
+        """Nodes of the vertices; those of the blocks follow."""
+        return NODES_PER_VERTEX * len(self.T_G_I)
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes of vertices and blocks."""
+        return self.num_vertex_nodes + self.blocks.num_nodes
+
+    def nodes(self, block: str) -> I64:
+        """Return the nodes (N, nodes each) of a block."""
+        return self.blocks.nodes(block, self.num_vertex_nodes)
+
+    def with_blocks(self, *blocks: ParameterBlock) -> States:
+        """Return the states with further blocks after those they have."""
+        return dataclasses.replace(self, blocks=ParameterBlocks([*self.blocks, *blocks]))
 
     def moved(self, step: F64, p_G: F64) -> States:
-        """Apply a step (V, 5, 3) by node and take new landmarks."""
-        pose_step = step[:, [POSITION, ORIENTATION]].reshape(-1, 6)
+        """Apply a step (nodes, 3) and take new landmarks."""
+        count = self.num_vertex_nodes
+        by_vertex = step[:count].reshape(-1, NODES_PER_VERTEX, 3)
+        pose_step = by_vertex[:, [POSITION, ORIENTATION]].reshape(-1, 6)
         return States(
             se3.retract(self.T_G_I, pose_step),
-            self.v_G + step[:, VELOCITY],
-            self.gyro_bias + step[:, GYRO_BIAS],
-            self.accel_bias + step[:, ACCEL_BIAS],
+            self.v_G + by_vertex[:, VELOCITY],
+            self.gyro_bias + by_vertex[:, GYRO_BIAS],
+            self.accel_bias + by_vertex[:, ACCEL_BIAS],
             p_G,
+            self.blocks.moved(step[count:]),
         )
 
     def size(self) -> float:
         """Return the norm of all values, for the relative size of a step."""
         parts = (self.T_G_I, self.v_G, self.gyro_bias, self.accel_bias, self.p_G)
-        return float(np.sqrt(sum(np.sum(part * part) for part in parts)))
+        return float(np.sqrt(sum(np.sum(part * part) for part in parts) + self.blocks.size2()))

@@ -8,15 +8,17 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.states import F64, NODES_PER_VERTEX
+from maplab_py.estimation.loss import Loss, robust
+from maplab_py.estimation.states import F64, NODES_PER_VERTEX, States
+from maplab_py.estimation.visual_structure import reduced_blocks
 from maplab_py.vimap.table import starts_of_counts
 
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
 
-_CHUNKS = 4
-"""Landmarks are summed in this many parts, whatever the number of threads (determinism)."""
+_CHUNKS, _CHUNKS_OF_LARGE, _MANY_BLOCKS = 4, 2, 500_000
+"""Landmarks are summed in this many parts, whatever the number of threads (determinism). Each part
+has blocks of its own, which for many blocks (of 288 bytes) would take too much memory."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,6 +63,16 @@ class VisualSystem:
     cost: float  # half the sum of rho
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class NodeSystem:
+    """Reduced normal equations by node, ready for the solver."""
+
+    values: F64  # (B, 3, 3) at `block_nodes`
+    gradient: F64  # (nodes, 3)
+    diagonal: F64  # (nodes, 3) of the unreduced equations
+    cost: float
+
+
 class VisualTerms:
     """All reprojection errors of a problem.
 
@@ -77,23 +89,86 @@ class VisualTerms:
         *,
         loss: Loss = Loss.HUBER,
         move_points: bool = True,
+        landmark_prior: F64 | None = None,
     ) -> None:
-        """Analyse who sees what together."""
+        """Analyse who sees what together.
+
+        Args:
+            kernels: Compiled for the cameras' models.
+            observations: Grouped by landmark.
+            cameras: As `observations` count them.
+            num_vertices: V.
+            loss: Robust loss of reprojection errors.
+            move_points: Whether landmarks are estimated.
+            landmark_prior: Places and inverse standard deviations (L, 4) [m, 1/m]; 0 = none.
+        """
         self._kernels = kernels
         self._cameras = cameras
         self._loss = int(loss)
         self._move_points = move_points
+        count = len(observations.start) - 1
+        self._prior = np.zeros((count, 4)) if landmark_prior is None else landmark_prior
         self.observations = observations
         self._num_vertices = num_vertices
         counts = np.diff(observations.start)
         self._pair_start = starts_of_counts(counts * (counts + 1) // 2)
-        self.pair_row, self.pair_col, self._pair_block, self._diagonal_block = _pairs(
-            observations, self._pair_start, num_vertices
+        self.pair_row, self.pair_col, self._pair_block, self._diagonal_block = reduced_blocks(
+            observations.start, observations.vertex, self._pair_start, num_vertices
         )
-        self._chunk_start = _balanced_chunks(counts)
-        shape = (_CHUNKS, num_vertices, 6)
-        self._blocks = np.empty((_CHUNKS, len(self.pair_row), 6, 6))
+        self.num_chunks = _CHUNKS if len(self.pair_row) < _MANY_BLOCKS else _CHUNKS_OF_LARGE
+        self._chunk_start = _balanced_chunks(counts, self.num_chunks)
+        shape = (self.num_chunks, num_vertices, 6)
+        self._blocks = np.empty((self.num_chunks, len(self.pair_row), 6, 6))
         self._gradient, self._diagonal = np.empty(shape), np.empty(shape)
+        self._is_diagonal = self.pair_row == self.pair_col
+
+    def block_nodes(self, states: States) -> tuple[I64, I64]:  # noqa: ARG002
+        """Return node row and column (B,) of every block of the system."""
+        return node_blocks(self.pair_row, self.pair_col)
+
+    def node_system(self, states: States, damping: float) -> NodeSystem:
+        """Eliminate the landmarks and return what is left, by node."""
+        system = self.linearize(states.T_G_I, states.p_G, damping)
+        gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))
+        pose_part(gradient, states)[:] = system.gradient
+        pose_part(diagonal, states)[:] = system.diagonal
+        values = split_blocks(system.blocks, self._is_diagonal)
+        return NodeSystem(values, gradient, diagonal, system.cost)
+
+    def take_step(
+        self, states: States, step: F64, moved: States, damping: float
+    ) -> tuple[F64, float, float]:
+        """Return landmarks, cost and promised decrease for a step (nodes, 3) to `moved` poses."""
+        pose_step = pose_part(step, states)
+        return self.step(states.T_G_I, states.p_G, pose_step, moved.T_G_I, damping)
+
+    def refresh(self, states: States) -> bool:  # noqa: ARG002
+        """Update what is held constant between calls; tell whether costs have changed."""
+        return False
+
+    def errors(self, states: States) -> tuple[F64, F64]:
+        """Return reprojection error [px] and depth [m] (O,) of every observation, used or not."""
+        return self.reprojection(states.T_G_I, states.p_G)
+
+    def cost(self, states: States) -> float:
+        """Return half the sum of rho at some states, without forming any equations."""
+        data = self.observations
+        used = data.inverse_sigma > 0.0
+        squared = np.square(self.errors(states)[0][used] * data.inverse_sigma[used])
+        scale2 = data.loss_scale[used] ** 2
+        total = float(np.sum(robust(Loss(self._loss), scale2, squared)[0]))
+        off = (states.p_G - self._prior[:, :3]) * self._prior[:, 3:]
+        return 0.5 * (total + float(np.sum(off * off)))
+
+    @property
+    def has_landmark_prior(self) -> bool:
+        """Whether some landmark has a prior."""
+        return bool(self._prior[:, 3].any())
+
+    @property
+    def moves_points(self) -> bool:
+        """Whether landmarks are estimated."""
+        return self._move_points
 
     def use(self, observations: Observations) -> None:
         """Exchange weights and losses; the structure must be the same."""
@@ -101,10 +176,10 @@ class VisualTerms:
 
     def linearize(self, T_G_I: F64, p_G: F64, damping: float) -> VisualSystem:
         """Eliminate the landmarks at the given states. The arrays are reused by the next call."""
-        cost = np.empty(_CHUNKS)
+        cost = np.empty(self.num_chunks)
         self._kernels.eliminate(
             *self._measured(), T_G_I, self._cameras.T_I_C, self._cameras.parameters, p_G,
-            self._pair_start, self._pair_block, self._diagonal_block, damping, self._move_points,
+            self._prior, self._pair_start, self._pair_block, self._diagonal_block, damping, self._move_points,
             self._chunk_start, self._blocks, self._gradient, self._diagonal, cost,
         )  # fmt: skip
         return VisualSystem(
@@ -115,10 +190,10 @@ class VisualTerms:
         self, T_G_I: F64, p_G: F64, pose_step: F64, new_T_G_I: F64, damping: float
     ) -> tuple[F64, float, float]:
         """Return the new landmarks (L, 3), the new cost and the decrease the model promised."""
-        new_p_G, sums = np.empty_like(p_G), np.zeros((_CHUNKS, 2))
+        new_p_G, sums = np.empty_like(p_G), np.zeros((self.num_chunks, 2))
         self._kernels.substitute(
             *self._measured(), T_G_I, self._cameras.T_I_C, self._cameras.parameters, p_G,
-            np.ascontiguousarray(pose_step), damping, self._move_points, self._chunk_start,
+            self._prior, np.ascontiguousarray(pose_step), damping, self._move_points, self._chunk_start,
             new_T_G_I, new_p_G, sums,
         )  # fmt: skip
         return new_p_G, 0.5 * float(sums[0, 0]), 0.5 * float(sums[0, 1])
@@ -147,42 +222,10 @@ class VisualTerms:
         )
 
 
-def _pairs(
-    observations: Observations, pair_start: I64, num_vertices: int
-) -> tuple[I64, I64, I32, I64]:
-    """Return row and column vertex of every block, and the block of each pair of observations.
-
-    The pairs of a landmark with n observations are (b, a), a <= b < n, in row order.
-    """
-    counts = np.diff(observations.start)
-    total = int(pair_start[-1])
-    b, a = _triangle(int(counts.max(initial=0)))
-    within = np.arange(total) - np.repeat(pair_start[:-1], np.diff(pair_start))
-    first = np.repeat(observations.start[:-1], np.diff(pair_start))
-    row = observations.vertex[first + b[within]].astype(np.int64)
-    col = observations.vertex[first + a[within]].astype(np.int64)
-    own = np.arange(num_vertices, dtype=np.int64)
-    keys = np.concatenate([own * num_vertices + own, row * num_vertices + col])
-    places, block = np.unique(keys, return_inverse=True)
-    block = np.asarray(block, dtype=np.int64).reshape(-1)
-    return (
-        places // num_vertices,
-        places % num_vertices,
-        block[num_vertices:].astype(np.int32),
-        block[:num_vertices],
-    )
-
-
-def _triangle(size: int) -> tuple[I64, I64]:
-    """Return the index pairs (b, a), a <= b < size, in row order."""
-    b, a = np.tril_indices(size)
-    return b.astype(np.int64), a.astype(np.int64)
-
-
-def _balanced_chunks(counts: I64) -> I64:
+def _balanced_chunks(counts: I64, num_chunks: int) -> I64:
     """Cut the landmarks into chunks of about equal work."""
     work = np.concatenate([[0.0], np.cumsum(counts * (counts + 8.0))])
-    chunks = np.searchsorted(work, np.linspace(0.0, work[-1], _CHUNKS + 1))
+    chunks = np.searchsorted(work, np.linspace(0.0, work[-1], num_chunks + 1))
     chunks[0], chunks[-1] = 0, len(counts)
     return chunks.astype(np.int64)
 
@@ -203,3 +246,9 @@ def split_blocks(blocks: F64, is_diagonal: NDArray[np.bool_]) -> F64:
     parts = blocks.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4).copy()
     parts[is_diagonal, 0, 1] = 0.0
     return parts.reshape(-1, 3, 3)
+
+
+def pose_part(by_node: F64, states: States) -> F64:
+    """View the position and orientation nodes of (nodes, 3) as (V, 6)."""
+    by_vertex = by_node[: states.num_vertex_nodes].reshape(-1, NODES_PER_VERTEX * 3)
+    return by_vertex[:, :6]

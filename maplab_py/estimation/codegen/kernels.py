@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
 from maplab_py.estimation.codegen.modules import generated_module, template_source
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors.camera import Distortion, Projection
+from maplab_py.sensors.camera import (
+    DISTORTION_SIZE,
+    INTRINSICS_SIZE,
+    Distortion,
+    Projection,
+)
 
 CameraModel = tuple[Projection, Distortion]
 
@@ -16,7 +21,7 @@ _HEADER = (
     '"""Generated; do not edit."""\n\n'
     "import math\n\nimport numpy as np\nfrom numba import njit, prange\n\n"
 )
-_FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})\n'
+_FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)\n'
 
 
 def visual_kernels(models: tuple[CameraModel, ...], progress: Progress = SILENT) -> ModuleType:
@@ -26,6 +31,13 @@ def visual_kernels(models: tuple[CameraModel, ...], progress: Progress = SILENT)
     """
     names = [f"{p.name.lower()}_{d.name.lower()}" for p, d in models]
     return generated_module("visual_" + "__".join(names), lambda: _visual_source(models), progress)
+
+
+def calibrating_kernels(models: tuple[CameraModel, ...], progress: Progress = SILENT) -> ModuleType:
+    """Return the module of the same functions for cameras whose calibration is estimated too."""
+    names = [f"{p.name.lower()}_{d.name.lower()}" for p, d in models]
+    name = "calibrating_" + "__".join(names)
+    return generated_module(name, lambda: _calibrating_source(models), progress)
 
 
 def residual_kernel(
@@ -41,11 +53,60 @@ def residual_kernel(
     return generated_module(name, lambda: _batch_source(make_function()), progress)
 
 
+_REPROJECTION = "poses, k, extrinsics, c, parameters, points, l, uv, o, out"
+
+
 def _visual_source(models: tuple[CameraModel, ...]) -> str:
-    from maplab_py.estimation.codegen.lowering import entries, function_body, row_entries
+    from maplab_py.estimation.codegen.lowering import entries
     from maplab_py.estimation.symbolic.residuals import reprojection
 
-    arguments = "poses, k, extrinsics, c, parameters, points, l, uv, o, out"
+    result, depth = entries("out"), entries("out", 2)
+    parts = [_HEADER, "NUM_OUT = 21\n\n\n"]
+    for suffix, jacobian in (("", entries("out", 3)), ("_only", None)):
+        for index, model in enumerate(models):
+            name, function = f"reproject{suffix}_{index}", reprojection(*model)
+            parts.append(_reprojection(name, function, [result, depth, jacobian]))
+        parts.append(_dispatcher(f"reproject{suffix}", _REPROJECTION, len(models)))
+    return "".join([*parts, template_source("visual_common"), "\n\n", template_source("visual")])
+
+
+def _calibrating_source(models: tuple[CameraModel, ...]) -> str:
+    from maplab_py.estimation.codegen.lowering import entries
+    from maplab_py.estimation.symbolic.residuals import calibrating_reprojection
+
+    result, depth = entries("out"), entries("out", 2)
+    widest = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in models)
+    columns = camera_columns(widest)
+    first, end = 21 + 2 * CAMERA_INTRINSICS_COLUMN, 21 + 2 * columns
+    parts = [_HEADER, f"NUM_OUT = {end}\nCAMERA_COLUMNS = {columns}\n\n\n"]
+    for index, (projection, distortion) in enumerate(models):
+        function = calibrating_reprojection(projection, distortion)
+        by_camera = [entries("out", 3), entries("out", 21), entries("out", first)]
+        used = first + 2 * (INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion])
+        padding = [*range(21 + 12, first), *range(used, end)]
+        places = [result, depth, *by_camera]
+        parts.append(_reprojection(f"reproject_{index}", function, places, zero=padding))
+        parts.append(
+            _reprojection(f"reproject_only_{index}", function, [result, depth, None, None, None])
+        )
+    names = ("reproject", "reproject_only")
+    parts += [_dispatcher(name, _REPROJECTION, len(models)) for name in names]
+    templates = ("visual_common", "visual", "visual_calibration")
+    return "".join(parts) + "\n\n".join(template_source(name) for name in templates)
+
+
+CAMERA_INTRINSICS_COLUMN = 9
+"""Columns of a camera: position 3, orientation 3, time offset 1 and 2 of padding, then this."""
+
+
+def camera_columns(num_parameters: int) -> int:
+    """Return the columns of a camera with so many intrinsic parameters, whole nodes of three."""
+    return CAMERA_INTRINSICS_COLUMN + 3 * -(-num_parameters // 3)
+
+
+def _reprojection(name: str, function: Any, outputs: list[Any], zero: Sequence[int] = ()) -> str:
+    from maplab_py.estimation.codegen.lowering import function_body, row_entries
+
     inputs = [
         row_entries("poses", "k"),
         row_entries("extrinsics", "c"),
@@ -53,15 +114,8 @@ def _visual_source(models: tuple[CameraModel, ...]) -> str:
         row_entries("points", "l"),
         row_entries("uv", "o"),
     ]
-    parts = [_HEADER]
-    for suffix, jacobian in (("", entries("out", 3)), ("_only", None)):
-        for index, model in enumerate(models):
-            lines = function_body(
-                reprojection(*model), inputs, [entries("out"), entries("out", 2), jacobian]
-            )
-            parts.append(_function(f"reproject{suffix}_{index}", arguments, lines))
-        parts.append(_dispatcher(f"reproject{suffix}", arguments, len(models)))
-    return "".join([*parts, template_source("visual")])
+    lines = function_body(function, inputs, outputs)
+    return _function(name, _REPROJECTION, [*lines, *(f"out[{k}] = 0.0" for k in zero)])
 
 
 def _batch_source(function: Any) -> str:

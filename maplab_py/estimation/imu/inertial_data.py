@@ -64,14 +64,14 @@ class InertialData:
         rows = np.arange(len(table)) if edges is None else np.asarray(edges, dtype=np.int64)
         samples = ragged_rows(vi_map.sample_start, rows)
         mission = vi_map.vertices.mission[table.from_vertex[rows]]
-        used, imu_of_edge = np.unique(mission, return_inverse=True)
-        ids = vi_map.missions.sensor_id[used, MissionSensor.IMU]
+        sensor_id = vi_map.missions.sensor_id[mission, MissionSensor.IMU]
+        ids, imu_of_edge = np.unique(sensor_id, axis=0, return_inverse=True)
         return cls(
             sample_start=starts_of_counts(table.sample_count[rows]),
             timestamp_ns=vi_map.imu_samples.timestamp_ns[samples],
             accel_gyro=vi_map.imu_samples.accel_gyro[samples],
             imus=tuple(vi_map.sensors.imu(to_hex(sensor_id)) for sensor_id in ids),
-            imu_of_edge=np.asarray(imu_of_edge, dtype=np.int64),
+            imu_of_edge=np.asarray(imu_of_edge, dtype=np.int64).reshape(-1),
             edge_id=table.id[rows],
         )
 
@@ -97,6 +97,13 @@ class InertialData:
                 gyro[row] = np.linalg.inv(imu.intrinsics.T_g)
                 accel[row] = np.linalg.inv(imu.intrinsics.T_a @ imu.intrinsics.R_A_I)
         return gyro, accel
+
+    @cached_property
+    def internal_rotation(self) -> F64:
+        """R_A_I (K, 3, 3) of every IMU."""
+        known = (imu.intrinsics for imu in self.imus)
+        matrices = [np.eye(3) if one is None else one.R_A_I for one in known]
+        return np.ascontiguousarray(np.stack(matrices)) if matrices else np.zeros((0, 3, 3))
 
     @cached_property
     def noise_variance_density(self) -> F64:

@@ -4,12 +4,13 @@ One rule serves preintegration and prediction. Between two samples, dt apart, wi
 velocities w and specific forces f:
 
     E = Exp((w_0 + w_1) / 2 dt),   R_1 = R_0 E
-    a = (R_0 f_0 + R_1 f_1) / 2
-    v_1 = v_0 + a dt
-    p_1 = p_0 + v_0 dt + a dt^2 / 2
+    a = (R_0 f_0 + R_1 f_1) / 2,     v_1 = v_0 + a dt
+    b = (2 R_0 f_0 + R_1 f_1) / 3,   p_1 = p_0 + v_0 dt + b dt^2 / 2
 
-It is of second order: half the step, a quarter of the error. (Forster et al., On-Manifold
-Preintegration, TRO 2017, eq. (31) holds w and f constant instead, which is of first order.)
+which is exact where the acceleration changes evenly. It is of second order: half the step, a
+quarter of the error. With a in place of b, positions would err by another jerk dt^2 / 12 per
+second. (Forster et al., On-Manifold Preintegration, TRO 2017, eq. (31) holds w and f constant
+instead, which is of first order.)
 """
 
 from __future__ import annotations
@@ -104,13 +105,14 @@ def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: 
 
 @compiled()
 def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) -> None:
-    """Add the motion under the mean acceleration (R_0 f_0 + R_1 f_1) / 2 to p and v."""
+    """Add the motion under an evenly changing acceleration R_0 f_0 .. R_1 f_1 to p and v."""
     for i in range(3):
-        a = 0.0
+        first, last = 0.0, 0.0
         for j in range(3):
-            a += 0.5 * (R_0[i, j] * f_0[j] + R_1[i, j] * f_1[j])
-        p[i] += dt * (v[i] + 0.5 * dt * a)
-        v[i] += dt * a
+            first += R_0[i, j] * f_0[j]
+            last += R_1[i, j] * f_1[j]
+        p[i] += dt * (v[i] + dt * (2.0 * first + last) / 6.0)
+        v[i] += 0.5 * dt * (first + last)
 
 
 @compiled()
@@ -126,35 +128,40 @@ def _acceleration_derivatives(
     by_gyro: F64,
     by_accel: F64,
 ) -> None:
-    """Compute the derivatives (3, 3) of the mean acceleration a.
+    """Compute the derivatives (2, 3, 3) of the accelerations a and b, which move v and p.
 
-    By the orientation at the beginning, -(R_0 [f_0]x + R_1 [f_1]x E^T) / 2; by the mean angular
-    velocity, -R_1 [f_1]x J dt / 2; by the mean specific force, (R_0 + R_1) / 2.
+    With w the weight of the second sample, 1/2 in a and 1/3 in b: by the orientation at the
+    beginning, -(1 - w) R_0 [f_0]x - w R_1 [f_1]x E^T; by the mean angular velocity,
+    -w R_1 [f_1]x J dt; by the mean specific force, (1 - w) R_0 + w R_1.
     """
-    _times_skew(R_0, f_0, by_theta)
-    _times_skew(R_1, f_1, by_accel)  # only kept here until it is used
-    _multiply(by_accel, J, by_gyro)
-    for i in range(3):
-        x, y, z = by_accel[i, 0], by_accel[i, 1], by_accel[i, 2]
-        for j in range(3):
-            by_theta[i, j] = -0.5 * (by_theta[i, j] + x * E[j, 0] + y * E[j, 1] + z * E[j, 2])
-            by_gyro[i, j] *= -0.5 * dt
-            by_accel[i, j] = 0.5 * (R_0[i, j] + R_1[i, j])
+    for k in range(2):
+        w = 1.0 / (2.0 + k)
+        _times_skew(R_0, f_0, by_theta[k])
+        _times_skew(R_1, f_1, by_accel[k])  # only kept here until it is used
+        _multiply(by_accel[k], J, by_gyro[k])
+        for i in range(3):
+            x, y, z = by_accel[k, i, 0], by_accel[k, i, 1], by_accel[k, i, 2]
+            for j in range(3):
+                turned = x * E[j, 0] + y * E[j, 1] + z * E[j, 2]
+                by_theta[k, i, j] = -(1.0 - w) * by_theta[k, i, j] - w * turned
+                by_gyro[k, i, j] *= -w * dt
+                by_accel[k, i, j] = (1.0 - w) * R_0[i, j] + w * R_1[i, j]
 
 
 @compiled()
 def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
     """Multiply the rows of state (9, n), ordered p, theta, v, by the error transition F.
 
-    F = [[I, M dt^2 / 2, I dt], [0, E^T, 0], [0, M dt, I]]; after Forster, appendix A, with the mean
-    acceleration a, whose derivative by theta is M.
+    F = [[I, M_b dt^2 / 2, I dt], [0, E^T, 0], [0, M_a dt, I]]; after Forster, appendix A, with the
+    accelerations a and b, whose derivatives by theta are M (2, 3, 3).
     """
     for col in range(state.shape[1]):
         x, y, z = state[3, col], state[4, col], state[5, col]
         for i in range(3):
-            turned = dt * (M[i, 0] * x + M[i, 1] * y + M[i, 2] * z)
-            state[i, col] += dt * (state[6 + i, col] + 0.5 * turned)
-            state[6 + i, col] += turned
+            a = M[0, i, 0] * x + M[0, i, 1] * y + M[0, i, 2] * z
+            b = M[1, i, 0] * x + M[1, i, 1] * y + M[1, i, 2] * z
+            state[i, col] += dt * (state[6 + i, col] + 0.5 * dt * b)
+            state[6 + i, col] += dt * a
             state[3 + i, col] = E[0, i] * x + E[1, i] * y + E[2, i] * z
 
 
@@ -163,7 +170,7 @@ def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: 
     """Compute gain (9, 3): change of [p, theta, v] per unit of measured value during dt.
 
     Args:
-        by_accel: Derivative (3, 3) of the mean acceleration a by the corrected value.
+        by_accel: Derivatives (2, 3, 3) of the accelerations a and b by the corrected value.
         by_theta: Derivative (3, 3) of the rotation vector per dt by the corrected value.
         correction: Corrected value = correction (measured - bias).
         dt: Interval [s].
@@ -171,12 +178,12 @@ def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: 
     """
     for i in range(3):
         for j in range(3):
-            a = 0.0
-            theta = 0.0
+            a, b, theta = 0.0, 0.0, 0.0
             for k in range(3):
-                a += by_accel[i, k] * correction[k, j]
+                a += by_accel[0, i, k] * correction[k, j]
+                b += by_accel[1, i, k] * correction[k, j]
                 theta += by_theta[i, k] * correction[k, j]
-            gain[i, j] = 0.5 * dt * dt * a
+            gain[i, j] = 0.5 * dt * dt * b
             gain[3 + i, j] = dt * theta
             gain[6 + i, j] = dt * a
 
@@ -192,6 +199,55 @@ def _add_noise(covariance: F64, gain: F64, variance: float) -> None:
 
 
 @compiled()
+def _add_intrinsics(
+    samples: F64,
+    row: int,
+    gyro_bias: F64,
+    C_g: F64,
+    C_a: F64,
+    R_A_I: F64,
+    R_0: F64,
+    R_1: F64,
+    f_0: F64,
+    f_1: F64,
+    gyro_gain: F64,
+    dt: float,
+    D: F64,
+) -> None:
+    """Add one interval's effect of the intrinsics to the columns 6 to 20 of D (9, 21).
+
+    Raising T_g[i, j] acts like a measured angular velocity that is lower by w_j in component i;
+    raising T_a[i, j] likewise, with the force R_A_I f at both ends; and R_A_I Exp(phi) turns f by
+    f x phi. Columns: T_g, then T_a, each by diagonal and 01, 02, 12; then phi.
+    """
+    w, u_0, u_1 = np.zeros(3), np.zeros(3), np.zeros(3)
+    A_0, A_1 = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            mean = 0.5 * (samples[row, 3 + j] + samples[row + 1, 3 + j])
+            w[i] += C_g[i, j] * (mean - gyro_bias[j])
+            u_0[i] += R_A_I[i, j] * f_0[j]
+            u_1[i] += R_A_I[i, j] * f_1[j]
+    _multiply(R_0, C_a, A_0)
+    _multiply(R_1, C_a, A_1)
+    for k in range(6):
+        i = k if k < 3 else (0 if k < 5 else 1)
+        j = k if k < 3 else (1 if k == 3 else 2)
+        for n in range(9):
+            D[n, 6 + k] -= gyro_gain[n, i] * w[j]
+        for n in range(3):
+            first, last = A_0[n, i] * u_0[j], A_1[n, i] * u_1[j]
+            D[n, 12 + k] -= dt * dt * (2.0 * first + last) / 6.0
+            D[6 + n, 12 + k] -= 0.5 * dt * (first + last)
+    _times_skew(R_0, f_0, A_0)
+    _times_skew(R_1, f_1, A_1)
+    for n in range(3):
+        for k in range(3):
+            D[n, 18 + k] += dt * dt * (2.0 * A_0[n, k] + A_1[n, k]) / 6.0
+            D[6 + n, 18 + k] += 0.5 * dt * (A_0[n, k] + A_1[n, k])
+
+
+@compiled()
 def _preintegrate_edge(
     stamps: I64,
     samples: F64,
@@ -199,6 +255,7 @@ def _preintegrate_edge(
     accel_bias: F64,
     C_g: F64,
     C_a: F64,
+    R_A_I: F64,
     noise: F64,
     R: F64,
     v: F64,
@@ -208,7 +265,7 @@ def _preintegrate_edge(
 ) -> None:
     """Integrate one edge; see `preintegrate`. R, v, p, P, D are results, given as zeros."""
     E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    by_theta, by_gyro, by_accel = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    by_theta, by_gyro, by_accel = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
     zero = np.zeros((3, 3))
     gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
     phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
@@ -236,6 +293,10 @@ def _preintegrate_edge(
             for j in range(3):
                 D[i, j] -= gyro_gain[i, j]
                 D[i, 3 + j] -= accel_gain[i, j]
+        if D.shape[1] > 6:
+            _add_intrinsics(
+                samples, row, gyro_bias, C_g, C_a, R_A_I, R, next_R, f_0, f_1, gyro_gain, dt, D
+            )
         _advance(R, next_R, f_0, f_1, dt, v, p)
         for i in range(3):
             for j in range(3):
@@ -292,6 +353,7 @@ def preintegrate(
     imu_of_edge: I64,
     gyro_corrections: F64,
     accel_corrections: F64,
+    internal_rotation: F64,
     noise: F64,
     rotation: F64,
     velocity: F64,
@@ -310,12 +372,14 @@ def preintegrate(
         imu_of_edge: Row (E,) of the following three arrays.
         gyro_corrections: T_g^-1 (K, 3, 3).
         accel_corrections: (T_a R_A_I)^-1 (K, 3, 3).
+        internal_rotation: R_A_I (K, 3, 3).
         noise: Squared densities (K, 2) of gyroscope and accelerometer.
         rotation: Result (E, 3, 3), change of orientation; all results are given as zeros.
         velocity: Result (E, 3).
         position: Result (E, 3).
         covariance: Result (E, 9, 9), order p, theta, v.
-        bias_jacobian: Result (E, 9, 6), columns gyroscope bias, accelerometer bias.
+        bias_jacobian: Result (E, 9, 6), columns gyroscope bias, accelerometer bias; or (E, 9, 21)
+            with those of the intrinsics (see `_add_intrinsics`) after them.
     """
     for edge in numba.prange(len(start) - 1):
         imu = imu_of_edge[edge]
@@ -326,6 +390,7 @@ def preintegrate(
             accel_bias[edge],
             gyro_corrections[imu],
             accel_corrections[imu],
+            internal_rotation[imu],
             noise[imu],
             rotation[edge],
             velocity[edge],

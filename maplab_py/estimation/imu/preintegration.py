@@ -45,9 +45,12 @@ class Preintegrated:
     accel_bias: F64  # (E, 3) [m/s^2]
     gyro_walk_variance: F64  # (E,) variance of each component of the change of the bias
     accel_walk_variance: F64  # (E,)
+    jacobian_intrinsics: F64 | None = None  # (E, 9, 15): T_g and T_a (diagonal, 01, 02, 12), R_A_I
 
 
-def integrate(data: InertialData, gyro_bias: F64, accel_bias: F64) -> Preintegrated:
+def integrate(
+    data: InertialData, gyro_bias: F64, accel_bias: F64, *, with_intrinsics: bool = False
+) -> Preintegrated:
     """Preintegrate all edges.
 
     White noise of density s counts as independent noise of variance s^2 / dt in the mean value of
@@ -57,12 +60,16 @@ def integrate(data: InertialData, gyro_bias: F64, accel_bias: F64) -> Preintegra
         data: Samples.
         gyro_bias: Linearisation points (E, 3) or (3,) [rad/s].
         accel_bias: Linearisation points (E, 3) or (3,) [m/s^2].
+        with_intrinsics: Also differentiate by scale, misalignment and R_A_I (a right perturbation).
     """
     edges = len(data)
     b_g = np.array(np.broadcast_to(gyro_bias, (edges, 3)), dtype=np.float64)
     b_a = np.array(np.broadcast_to(accel_bias, (edges, 3)), dtype=np.float64)
     rotation, dv, dp = np.zeros((edges, 3, 3)), np.zeros((edges, 3)), np.zeros((edges, 3))
-    covariance, bias_jacobian = np.zeros((edges, 9, 9)), np.zeros((edges, 9, 6))
+    covariance, bias_jacobian = (
+        np.zeros((edges, 9, 9)),
+        np.zeros((edges, 9, 21 if with_intrinsics else 6)),
+    )
     kernels.preintegrate(
         data.sample_start,
         data.timestamp_ns,
@@ -71,6 +78,7 @@ def integrate(data: InertialData, gyro_bias: F64, accel_bias: F64) -> Preintegra
         b_a,
         data.imu_of_edge,
         *data.corrections,
+        data.internal_rotation,
         data.noise_variance_density,
         rotation,
         dv,
@@ -86,9 +94,10 @@ def integrate(data: InertialData, gyro_bias: F64, accel_bias: F64) -> Preintegra
         dp=dp,
         covariance=covariance,
         jacobian_gyro_bias=np.ascontiguousarray(bias_jacobian[:, :, :3]),
-        jacobian_accel_bias=np.ascontiguousarray(bias_jacobian[:, :, 3:]),
+        jacobian_accel_bias=np.ascontiguousarray(bias_jacobian[:, :, 3:6]),
         gyro_bias=b_g,
         accel_bias=b_a,
         gyro_walk_variance=walk[:, 0],
         accel_walk_variance=walk[:, 1],
+        jacobian_intrinsics=bias_jacobian[:, :, 6:].copy() if with_intrinsics else None,
     )

@@ -1,0 +1,31 @@
+"""Angular velocity at the vertices of a map, from the nearest inertial samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.vimap import VIMap
+
+F64 = NDArray[np.float64]
+
+
+def angular_velocity_at_vertices(vi_map: VIMap) -> F64:
+    """Return the angular velocity (V, 3) in I [rad/s], biases and intrinsics taken off.
+
+    The first sample of the edge that leaves a vertex counts, else the last of the one that arrives;
+    a vertex without either is taken to stand still.
+    """
+    result = np.zeros((len(vi_map.vertices), 3))
+    table = vi_map.imu_edges
+    edges = np.flatnonzero(table.sample_count > 0)
+    data = InertialData.of_map(vi_map, edges)
+    if not len(edges):
+        return result
+    gyro_corrections = data.corrections[0][data.imu_of_edge]
+    last, first = data.sample_start[1:] - 1, data.sample_start[:-1]
+    for vertex, sample in ((table.to_vertex[edges], last), (table.from_vertex[edges], first)):
+        measured = data.accel_gyro[sample, 3:] - vi_map.vertices.gyro_bias[vertex]
+        result[vertex] = np.einsum("nij,nj->ni", gyro_corrections, measured)
+    return result

@@ -1,0 +1,259 @@
+"""Compiled loops over relative-pose edges: whitened errors, and blocks of the normal equations.
+
+An edge measures T_A_B between poses A and B. Its residual [e_p, e_r] has e_r = Log(R_m^T R_A_B) and
+
+- split: e_p = p_A_B - p_m, in A (as the map's covariances are meant), or
+- logarithm: [e_p, e_r] = Log(T_m^-1 T_A_B) in SE(3), as public pose-graph files are meant.
+
+Perturbations: p <- p + dp in G, R <- R exp(dtheta). The loops take some milliseconds for thousands of
+edges, less than it costs to wake threads on a busy machine: they run on one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.estimation.linear.jit import compiled
+
+
+@compiled(inline="always")
+def _conjugate_times(a, b, out):  # type: ignore[no-untyped-def]
+    """Quaternion product conj(a) b, [x y z w]."""
+    x, y, z, w = -a[0], -a[1], -a[2], a[3]
+    out[0] = w * b[0] + x * b[3] + y * b[2] - z * b[1]
+    out[1] = w * b[1] - x * b[2] + y * b[3] + z * b[0]
+    out[2] = w * b[2] + x * b[1] - y * b[0] + z * b[3]
+    out[3] = w * b[3] - x * b[0] - y * b[1] - z * b[2]
+
+
+@compiled(inline="always")
+def _matrix(q, R):  # type: ignore[no-untyped-def]
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+
+
+@compiled(inline="always")
+def _log(q, angle):  # type: ignore[no-untyped-def]
+    sign = -1.0 if q[3] < 0.0 else 1.0
+    n = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    w = sign * q[3]
+    factor = 2.0 / w * (1.0 - n * n / (3.0 * w * w)) if n < 1e-6 else 2.0 * np.arctan2(n, w) / n
+    for i in range(3):
+        angle[i] = sign * factor * q[i]
+
+
+@compiled(inline="always")
+def _curvature(t):  # type: ignore[no-untyped-def]
+    """Return b of J^-1 = I -+ K/2 + b K^2, and b'(|t|) / |t|."""
+    square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+    if square < 1e-4:
+        return (
+            1.0 / 12.0 + square / 720.0 + square * square / 30240.0,
+            1.0 / 360.0 + square / 7560.0,
+        )
+    a = np.sqrt(square)
+    sine = np.sin(0.5 * a)
+    cot = np.cos(0.5 * a) / sine
+    b = 1.0 / square - cot / (2.0 * a)
+    slope = -2.0 / (square * a) + cot / (2.0 * square) + 1.0 / (4.0 * a * sine * sine)
+    return b, slope / a
+
+
+@compiled(inline="always")
+def _residual(A, B, measured, is_log, e, p, q_B_A, y, R, q_A_B, q):  # type: ignore[no-untyped-def]
+    """Fill in the residual, p_A_B, the rotation that takes A to B, and R_m^T (p_A_B - p_m).
+
+    R (3, 3), q_A_B (4,) and q (4,) are room to work in.
+    """
+    _matrix(A, R)
+    d0, d1, d2 = B[4] - A[4], B[5] - A[5], B[6] - A[6]
+    for i in range(3):
+        p[i] = R[0, i] * d0 + R[1, i] * d1 + R[2, i] * d2
+    _conjugate_times(A, B, q_A_B)
+    q_B_A[0], q_B_A[1], q_B_A[2], q_B_A[3] = -q_A_B[0], -q_A_B[1], -q_A_B[2], q_A_B[3]
+    _conjugate_times(measured, q_A_B, q)
+    t = e[3:]
+    _log(q, t)
+    g0, g1, g2 = p[0] - measured[4], p[1] - measured[5], p[2] - measured[6]
+    e[0], e[1], e[2] = g0, g1, g2
+    if is_log:
+        _matrix(measured, R)
+        for i in range(3):
+            y[i] = R[0, i] * g0 + R[1, i] * g1 + R[2, i] * g2
+        b, _ = _curvature(t)
+        dot = t[0] * y[0] + t[1] * y[1] + t[2] * y[2]
+        square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+        e[0] = y[0] - 0.5 * (t[1] * y[2] - t[2] * y[1]) + b * (t[0] * dot - y[0] * square)
+        e[1] = y[1] - 0.5 * (t[2] * y[0] - t[0] * y[2]) + b * (t[1] * dot - y[1] * square)
+        e[2] = y[2] - 0.5 * (t[0] * y[1] - t[1] * y[0]) + b * (t[2] * dot - y[2] * square)
+
+
+@compiled()
+def relative_pose_errors(T, from_vertex, to_vertex, measured, W, is_log, out):  # type: ignore[no-untyped-def]
+    """Fill in the whitened residuals W e (E, 6) for poses (V, 7)."""
+    e, p, q_B_A, y = np.empty(6), np.empty(3), np.empty(4), np.empty(3)
+    R, q_A_B, q = np.empty((3, 3)), np.empty(4), np.empty(4)
+    for edge in range(len(from_vertex)):
+        A, B = T[from_vertex[edge]], T[to_vertex[edge]]
+        _residual(A, B, measured[edge], is_log[edge], e, p, q_B_A, y, R, q_A_B, q)
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                total += W[edge, i, j] * e[j]
+            out[edge, i] = total
+
+
+@compiled(inline="always")
+def _skew(v, K):  # type: ignore[no-untyped-def]
+    K[0, 0], K[0, 1], K[0, 2] = 0.0, -v[2], v[1]
+    K[1, 0], K[1, 1], K[1, 2] = v[2], 0.0, -v[0]
+    K[2, 0], K[2, 1], K[2, 2] = -v[1], v[0], 0.0
+
+
+@compiled(inline="always")
+def _derivatives(A, measured, is_log, e, p, q_B_A, y, J_a, J_b, work):  # type: ignore[no-untyped-def]
+    """Fill in the derivatives (6, 6) of the residual by [dp, dtheta] of A and of B."""
+    R_G_A, R_B_A, K, R_m, M, N, D = work
+    _matrix(A, R_G_A)
+    _matrix(q_B_A, R_B_A)
+    t = e[3:]
+    b, slope = _curvature(t)
+    square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+    J_a[:], J_b[:] = 0.0, 0.0
+    _skew(t, K)
+    for i in range(3):  # Jr^-1(t) = I + K/2 + b K^2, and K^2 = t t^T - |t|^2 I
+        for j in range(3):
+            J_b[3 + i, 3 + j] = 0.5 * K[i, j] + b * t[i] * t[j]
+        J_b[3 + i, 3 + i] += 1.0 - b * square
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += J_b[3 + i, 3 + k] * R_B_A[k, j]
+            J_a[3 + i, 3 + j] = -total
+    _skew(p, K)
+    if not is_log:
+        for i in range(3):
+            for j in range(3):
+                J_b[i, j] = R_G_A[j, i]
+                J_a[i, j] = -R_G_A[j, i]
+                J_a[i, 3 + j] = K[i, j]
+        return
+    # e_p = M y with M = Jl^-1(t); y = R_m^T (p_A_B - p_m)
+    _matrix(measured, R_m)
+    dot = t[0] * y[0] + t[1] * y[1] + t[2] * y[2]
+    _skew(t, M)
+    _skew(y, D)
+    for i in range(3):
+        bend = t[i] * dot - y[i] * square  # K^2 y
+        for j in range(3):
+            M[i, j] = -0.5 * M[i, j] + b * t[i] * t[j]
+            D[i, j] = 0.5 * D[i, j] + b * (t[i] * y[j] - 2.0 * y[i] * t[j]) + slope * bend * t[j]
+        M[i, i] += 1.0 - b * square
+        D[i, i] += b * dot
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += M[i, k] * R_m[j, k]
+            N[i, j] = total
+    for i in range(3):
+        for j in range(3):
+            by_p, by_turn, by_a, by_b = 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                by_p += N[i, k] * R_G_A[j, k]
+                by_turn += N[i, k] * K[k, j]
+                by_a += D[i, k] * J_a[3 + k, 3 + j]
+                by_b += D[i, k] * J_b[3 + k, 3 + j]
+            J_b[i, j], J_a[i, j] = by_p, -by_p
+            J_a[i, 3 + j] = by_turn + by_a
+            J_b[i, 3 + j] = by_b
+
+
+@compiled()
+def relative_pose_jacobians(  # type: ignore[no-untyped-def]
+    T, from_vertex, to_vertex, measured, W, is_log, error, J_a, J_b
+):
+    """Fill in W e (E, 6) and its derivatives (E, 6, 6) by [dp, dtheta] of A and of B."""
+    e, p, q_B_A, y = np.empty(6), np.empty(3), np.empty(4), np.empty(3)
+    R, q_A_B, q = np.empty((3, 3)), np.empty(4), np.empty(4)
+    D_a, D_b, work = np.empty((6, 6)), np.empty((6, 6)), np.empty((7, 3, 3))
+    parts = (work[0], work[1], work[2], work[3], work[4], work[5], work[6])
+    for edge in range(len(from_vertex)):
+        A, B = T[from_vertex[edge]], T[to_vertex[edge]]
+        _residual(A, B, measured[edge], is_log[edge], e, p, q_B_A, y, R, q_A_B, q)
+        _derivatives(A, measured[edge], is_log[edge], e, p, q_B_A, y, D_a, D_b, parts)
+        W_e, A_e, B_e = W[edge], J_a[edge], J_b[edge]
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                A_e[i, j], B_e[i, j] = 0.0, 0.0
+            for k in range(6):
+                w = W_e[i, k]
+                total += w * e[k]
+                for j in range(6):
+                    A_e[i, j] += w * D_a[k, j]
+                    B_e[i, j] += w * D_b[k, j]
+            error[edge, i] = total
+
+
+@compiled()
+def normal_blocks(  # type: ignore[no-untyped-def]
+    error, J_a, J_b, weight, slot, node_a, node_b, blocks, gradient, diagonal
+):
+    """Fill in the blocks of the normal equations of weighted edges; add to gradient and diagonal.
+
+    Args:
+        error: W e (E, 6).
+        J_a: Derivatives (E, 6, 6) by A.
+        J_b: Derivatives (E, 6, 6) by B.
+        weight: Weights (E,) of the squared errors.
+        slot: Rows (E, 3) of `blocks` for A with A, B with B, and the block below the diagonal;
+            -1 = not wanted. The last is (B, A); where A comes after B it is -2 - row, for (A, B).
+        node_a: Node (E,) of A, -1 where A does not move.
+        node_b: Node (E,) of B.
+        blocks: (N, 6, 6), written.
+        gradient: (nodes, 6), J^T W e is added.
+        diagonal: (nodes, 6), the diagonals of the blocks are added.
+    """
+    for edge in range(len(weight)):
+        w = weight[edge]
+        E, A, B = error[edge], J_a[edge], J_b[edge]
+        a, b = node_a[edge], node_b[edge]
+        if a >= 0:
+            block = blocks[slot[edge, 0]]
+            _product(A, A, w, block)
+            _add(A, E, w, block, gradient[a], diagonal[a])
+        if b >= 0:
+            block = blocks[slot[edge, 1]]
+            _product(B, B, w, block)
+            _add(B, E, w, block, gradient[b], diagonal[b])
+        below = slot[edge, 2]
+        if below >= 0:
+            _product(B, A, w, blocks[below])
+        elif below < -1:
+            _product(A, B, w, blocks[-below - 2])
+
+
+@compiled(inline="always")
+def _add(J, E, w, block, gradient, diagonal):  # type: ignore[no-untyped-def]
+    for k in range(6):
+        diagonal[k] += block[k, k]
+        e = w * E[k]
+        for i in range(6):
+            gradient[i] += J[k, i] * e
+
+
+@compiled(inline="always")
+def _product(A, B, w, out):  # type: ignore[no-untyped-def]
+    """Fill in w A^T B."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 0.0
+    for k in range(6):
+        for i in range(6):
+            a = w * A[k, i]
+            for j in range(6):
+                out[i, j] += a * B[k, j]

@@ -1,0 +1,114 @@
+"""Robust losses: both implementations against the formulas of the literature and differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from maplab_py.estimation.codegen.kernels import visual_kernels
+from maplab_py.estimation.loss import Loss, robust
+from maplab_py.estimation.visual_terms import Cameras, Observations, VisualTerms
+from maplab_py.geometry import se3
+from maplab_py.sensors import Distortion, Projection
+
+SCALE = 1.7
+RESIDUALS = np.array([0.0, 1e-3, 0.3, 1.0, 1.69999, 1.70001, 2.5, 10.0, 300.0])
+
+
+def huber(r: float) -> float:
+    return r * r if r <= SCALE else 2.0 * SCALE * r - SCALE**2
+
+
+def cauchy(r: float) -> float:
+    return SCALE**2 * float(np.log1p((r / SCALE) ** 2))
+
+
+def tukey(r: float) -> float:
+    inside = max(1.0 - (r / SCALE) ** 2, 0.0)
+    return SCALE**2 / 3.0 * (1.0 - inside**3)
+
+
+def geman_mcclure(r: float) -> float:
+    return r * r / (1.0 + (r / SCALE) ** 2)
+
+
+def dcs(r: float) -> float:
+    """Integral of the weight s^2, s = min(1, 2 phi / (phi + r^2)), by r^2.
+
+    Source: MacTavish and Barfoot, At all costs, CRV 2015, table I.
+    """
+    phi = SCALE**2
+    return r * r if r * r <= phi else 4.0 * phi * r * r / (phi + r * r) - phi
+
+
+RHO: dict[Loss, Callable[[float], float]] = {
+    Loss.NONE: lambda r: r * r,
+    Loss.HUBER: huber,
+    Loss.CAUCHY: cauchy,
+    Loss.TUKEY: tukey,
+    Loss.GEMAN_MCCLURE: geman_mcclure,
+    Loss.DCS: dcs,
+}
+
+
+def slope(loss: Loss, s: float) -> float:
+    """Differentiate rho by s = r^2, one-sided so that no kink lies between."""
+    step = 1e-6 * max(s, 1e-3)
+    value = [RHO[loss](float(np.sqrt(s + k * step))) for k in range(3)]
+    return (-3.0 * value[0] + 4.0 * value[1] - value[2]) / (2.0 * step)
+
+
+@pytest.mark.parametrize("loss", Loss)
+def test_cost_and_weight_of_factors(loss: Loss) -> None:
+    rho, weight = robust(loss, SCALE**2, RESIDUALS**2)
+    np.testing.assert_allclose(rho, [RHO[loss](r) for r in RESIDUALS], rtol=1e-12, atol=1e-24)
+    wanted = [slope(loss, r * r) for r in RESIDUALS]
+    np.testing.assert_allclose(weight, wanted, rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("loss", Loss)
+def test_compiled_kernels_agree(loss: Loss) -> None:
+    visual = one_landmark_each(loss)
+    T_G_I, p_G = se3.identity(len(RESIDUALS)), np.tile([0.0, 0.0, 2.0], (len(RESIDUALS), 1))
+    system = visual.linearize(T_G_I, p_G, 0.0)
+    rho, weight = robust(loss, SCALE**2, RESIDUALS**2)
+    assert system.cost == pytest.approx(0.5 * rho.sum(), rel=1e-12)
+    # the residual is r along u; d u / d x_C = fu / z = 50, so the gradient is -50 w r
+    np.testing.assert_allclose(system.gradient[:, 0], -50.0 * weight * RESIDUALS, rtol=1e-9)
+    np.testing.assert_allclose(system.diagonal[:, 0], 2500.0 * weight, rtol=1e-9)
+    new_cost = visual.step(T_G_I, p_G, np.zeros((len(RESIDUALS), 6)), T_G_I, 1.0)[1]
+    assert new_cost == pytest.approx(system.cost, rel=1e-12)
+
+
+def test_every_observation_has_its_own_scale() -> None:
+    visual = one_landmark_each(Loss.HUBER)
+    scales = np.linspace(0.5, 5.0, len(RESIDUALS))
+    data = visual.observations
+    visual.use(
+        Observations(data.start, data.vertex, data.camera, data.uv_px, data.inverse_sigma, scales)
+    )
+    T_G_I, p_G = se3.identity(len(RESIDUALS)), np.tile([0.0, 0.0, 2.0], (len(RESIDUALS), 1))
+    wanted = [
+        robust(Loss.HUBER, c * c, np.array([r * r]))[0][0]
+        for c, r in zip(scales, RESIDUALS, strict=True)
+    ]
+    assert visual.linearize(T_G_I, p_G, 0.0).cost == pytest.approx(0.5 * sum(wanted), rel=1e-12)
+
+
+def one_landmark_each(loss: Loss) -> VisualTerms:
+    """Return one observation per vertex and landmark, off by RESIDUALS sigmas; landmarks fixed."""
+    count = len(RESIDUALS)
+    sigma = 0.5
+    observations = Observations(
+        start=np.arange(count + 1, dtype=np.int64),
+        vertex=np.arange(count, dtype=np.int32),
+        camera=np.zeros(count, dtype=np.int32),
+        uv_px=np.stack([50.0 - sigma * RESIDUALS, np.full(count, 50.0)], axis=1),
+        inverse_sigma=np.full(count, 1.0 / sigma),
+        loss_scale=np.full(count, SCALE),
+    )
+    cameras = Cameras(se3.identity(1), np.array([[0.0, 50.0, 50.0, 50.0, 50.0]]))
+    kernels = visual_kernels(((Projection.PINHOLE, Distortion.NONE),))
+    return VisualTerms(kernels, observations, cameras, count, loss=loss, move_points=False)
