@@ -56,7 +56,7 @@ def optimize_visual(
     return _optimize(context, visual_only, map_mission, map_mission_list)
 
 
-@command("warmup", example="warmup", needs_map=False)
+@command("warmup", example="warmup", needs_map=False, acts_outside=True)
 def warmup(context: CommandContext) -> WarmupReport:
     """Compile every numeric kernel now, so that no later command waits for it."""
     from maplab_py.algorithms.vi_optimization.warmup import compile_kernels
@@ -75,6 +75,7 @@ def _optimize(
         options,
         missions=context.mission_rows(mission, mission_list),
         progress=context.progress,
+        watch=context.session.watchers.during_command,
     )
     context.commit(result)
     return report

@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.estimation import gauge
+from maplab_py.estimation.camera_terms import CalibratingVisualTerms
+from maplab_py.estimation.factor_terms import FactorTerm
 from maplab_py.estimation.inertial_terms import InertialTerm
 from maplab_py.estimation.pose_terms import AbsolutePoseTerm
+from maplab_py.estimation.prior_terms import PosePrior
 from maplab_py.estimation.problem import Problem
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
 
@@ -15,29 +18,40 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-def hold_unconstrained(problem: Problem, num_vertices: int) -> I64:
+def hold_unconstrained(problem: Problem, states: States) -> I64:
     """Fix the nodes that no term touches; return the vertices whose pose is among them."""
+    num_vertices = len(states.T_G_I)
     touched = np.zeros(problem.num_nodes, dtype=np.bool_)
     if problem.visual is not None:
-        data = problem.visual.observations
-        seeing = np.unique(data.vertex[data.inverse_sigma > 0.0]).astype(np.int64)
+        seeing = np.unique(_observing(problem))
         touched[NODES_PER_VERTEX * seeing + POSITION] = True
         touched[NODES_PER_VERTEX * seeing + ORIENTATION] = True
+        if isinstance(problem.visual, CalibratingVisualTerms):
+            data = problem.visual.observations
+            used = np.unique(data.camera[data.inverse_sigma > 0.0])
+            touched[problem.visual.camera_nodes(states)[used]] = True
     for term in problem.factors:
         touched[term.nodes.reshape(-1)] = True
     problem.fix(np.flatnonzero(~touched))
     return np.flatnonzero(~touched[NODES_PER_VERTEX * np.arange(num_vertices) + POSITION])
 
 
-def fix_gauge(problem: Problem, states: States, held: I64, *, has_inertial: bool) -> str:
+def fix_gauge(
+    problem: Problem, states: States, held: I64, *, has_inertial: bool, has_fixed_landmarks: bool
+) -> str:
     """Fix what each cluster cannot observe; return one sentence about it."""
     num_vertices = len(states.T_G_I)
-    labels = gauge.clusters(num_vertices, _links(problem))
+    labels = gauge.clusters(num_vertices, _links(problem, num_vertices))
     is_held = np.zeros(num_vertices, dtype=np.bool_)
     is_held[held] = True
     anchored = _labels_of(labels, problem, AbsolutePoseTerm)
+    if any(isinstance(t, PosePrior) and t.determines_poses for t in problem.factors):
+        anchored |= _labels_of(labels, problem, PosePrior)
+    has_prior = problem.visual is not None and problem.visual.has_landmark_prior
+    if has_fixed_landmarks or has_prior:
+        anchored |= set(np.unique(labels[_observing(problem)]).tolist())
     inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
-    relative = _labels_of(labels, problem, object)
+    scaled = _labels_of(labels, problem, object) | _labels_of_rigs(labels, problem)
     counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}
     for first in gauge.first_of_each(labels).tolist():
         label = int(labels[first])
@@ -52,7 +66,7 @@ def fix_gauge(problem: Problem, states: States, held: I64, *, has_inertial: bool
         else:
             gauge.fix_pose(problem, vertex)
             members = np.flatnonzero(labels == label)
-            if label in relative or len(members) < 2:
+            if label in scaled or len(members) < 2:
                 counts["pose"] += 1
                 continue
             offset = states.T_G_I[members, 4:] - states.T_G_I[first, 4:]
@@ -62,7 +76,7 @@ def fix_gauge(problem: Problem, states: States, held: I64, *, has_inertial: bool
     return ", ".join(f"{what} of {n} cluster(s)" for what, n in counts.items() if n) or "none"
 
 
-def _links(problem: Problem) -> list[tuple[I64, I64]]:
+def _links(problem: Problem, num_vertices: int) -> list[tuple[I64, I64]]:
     """Return pairs of vertices that a landmark or a factor joins."""
     links = []
     if problem.visual is not None:
@@ -72,15 +86,45 @@ def _links(problem: Problem) -> list[tuple[I64, I64]]:
         same = landmark[1:] == landmark[:-1]
         links.append((vertex[:-1][same], vertex[1:][same]))
     for term in problem.factors:
-        vertices = term.nodes // NODES_PER_VERTEX
-        links.append((vertices.min(axis=1), vertices.max(axis=1)))
+        vertices = _vertices_of(term, num_vertices)
+        if vertices is not None:
+            links.append((vertices.min(axis=1), vertices.max(axis=1)))
     return links
 
 
-def _labels_of(labels: I64, problem: Problem, kind: type) -> set[int]:
-    """Return the clusters that terms of a kind touch."""
+def _observing(problem: Problem) -> I64:
+    """Return the vertex of every observation that takes part."""
+    if problem.visual is None:
+        return np.zeros(0, dtype=np.int64)
+    data = problem.visual.observations
+    return data.vertex[data.inverse_sigma > 0.0].astype(np.int64)
+
+
+def _labels_of_rigs(labels: I64, problem: Problem) -> set[int]:
+    """Return the clusters that vertices see with several cameras: their distances show scale."""
+    if problem.visual is None:
+        return set()
+    data = problem.visual.observations
+    used = data.inverse_sigma > 0.0
+    views = np.unique(np.stack([data.vertex[used], data.camera[used]], axis=1), axis=0)
+    vertices, cameras = np.unique(views[:, 0], return_counts=True)
+    return set(np.unique(labels[vertices[cameras > 1]]).tolist())
+
+
+def _vertices_of(term: FactorTerm, num_vertices: int) -> I64 | None:
+    """Return the vertices (N, n) of a term; None when it touches other parameters only."""
+    is_vertex = term.nodes < NODES_PER_VERTEX * num_vertices
+    if not is_vertex.any():
+        return None
+    some = np.take_along_axis(term.nodes, is_vertex.argmax(axis=1)[:, None], axis=1)
+    return np.asarray(np.where(is_vertex, term.nodes, some) // NODES_PER_VERTEX)
+
+
+def _labels_of(labels: I64, problem: Problem, *kinds: type) -> set[int]:
+    """Return the clusters that terms of some kinds touch."""
     found: set[int] = set()
     for term in problem.factors:
-        if isinstance(term, kind):
-            found.update(np.unique(labels[term.nodes // NODES_PER_VERTEX]).tolist())
+        vertices = _vertices_of(term, len(labels)) if isinstance(term, kinds) else None
+        if vertices is not None:
+            found.update(np.unique(labels[vertices]).tolist())
     return found

@@ -20,17 +20,60 @@ class VIOptimizationOptions:
     include_inertial: bool = option(True, help="Use the IMU edges and the walk of their biases.")
     include_6dof_odometry: bool = option(False, help="Use the odometry edges.")
     include_wheel_odometry: bool = option(False, help="Use the wheel odometry edges.")
-    include_loop_closure_edges: bool = option(
-        False, help="Use the loop closure edges, robustly (dynamic covariance scaling)."
+    include_loop_closure_edges: bool = option(False, help="Use the loop closure edges, robustly.")
+    loop_closure_robustness: str = option(
+        "dcs",
+        help="How wrong loop closure edges lose their say: dynamic covariance scaling, a switch "
+        "variable each, or not at all.",
+        choices=("dcs", "switchable", "none"),
     )
     include_absolute_pose_constraints: bool = option(
         False, help="Use the absolute pose measurements; they then fix position and heading."
     )
+    position_prior_sigma_m: float = option(
+        0.0, help="Tie vertices to their positions with this deviation; 0 = do not.", unit="m"
+    )
+    orientation_prior_sigma_rad: float = option(
+        0.0, help="Tie vertices to their orientations likewise; 0 = do not.", unit="rad"
+    )
+    gyro_bias_prior_sigma_radps: float = option(
+        0.0, help="Tie gyroscope biases to their values likewise; 0 = do not.", unit="rad/s"
+    )
+    accel_bias_prior_sigma_mps2: float = option(
+        0.0, help="Tie accelerometer biases to their values likewise; 0 = do not.", unit="m/s^2"
+    )
+    landmark_prior_sigma_m: float = option(
+        0.0, help="Tie landmarks to their positions likewise; 0 = do not.", unit="m"
+    )
+    residuals: str = option("", help="Residuals of plugins to use as well, separated by commas.")
     fix_vertices: bool = option(False, help="Keep all poses.")
     fix_velocity: bool = option(False, help="Keep all velocities.")
     fix_gyro_bias: bool = option(False, help="Keep all gyroscope biases.")
     fix_accel_bias: bool = option(False, help="Keep all accelerometer biases.")
-    fix_landmark_positions: bool = option(False, help="Keep all landmarks.")
+    fix_landmark_positions: bool = option(False, help="Keep all landmarks where they are in G.")
+    fix_ncamera_intrinsics: bool = option(True, help="Keep focal lengths, centres, distortion.")
+    fix_ncamera_extrinsics_rotation: bool = option(
+        True, help="Keep the orientation of the cameras on the IMU."
+    )
+    fix_ncamera_extrinsics_translation: bool = option(
+        True, help="Keep the position of the cameras on the IMU."
+    )
+    fix_ncamera_time_offset: bool = option(
+        True, help="Keep the delay of images against the times of their vertices."
+    )
+    fix_imu_intrinsics: bool = option(
+        True, help="Keep scale and misalignment of gyroscope and accelerometer, and R_A_I."
+    )
+    fix_6dof_odometry_extrinsics: bool = option(True, help="Keep the odometry sensor's mounting.")
+    fix_wheel_odometry_extrinsics: bool = option(True, help="Keep the wheel sensor's mounting.")
+    fix_absolute_pose_sensor_extrinsics: bool = option(
+        True, help="Keep the mounting of the sensor of absolute poses."
+    )
+    absolute_pose_sensor_fix_mission_baseframes: bool = option(
+        True,
+        help="Keep the missions' base frames; otherwise each takes up the movement of its "
+        "mission's first vertex.",
+    )
     loss: str = option(
         "cauchy",
         help="Robust loss of reprojection errors.",
@@ -56,13 +99,36 @@ class VIOptimizationOptions:
         3, help="Look for outliers every this many iterations."
     )
     outlier_rejection_max_reprojection_error_px: float = option(
-        5.0, help="Observations off by more are outliers once solving has begun.", unit="px"
+        5.0,
+        help="Observations off by more, and by more than three times the median, are outliers once "
+        "solving has begun; they return when they no longer are.",
+        unit="px",
     )
     retriangulate_doubtful: bool = option(
         True, help="Triangulate landmarks anew that the gate would take observations from."
     )
     gate_reprojection_error_px: float = option(
-        20.0, help="Observations off by more at the beginning do not take part.", unit="px"
+        20.0,
+        help="Observations off by more at the beginning, and by more than three times the median, "
+        "do not take part.",
+        unit="px",
+    )
+    linear_solver_type: str = option(
+        "multifrontal",
+        help="Block Cholesky, or scipy's SuperLU, which is slower and gives the same answer.",
+        choices=("multifrontal", "superlu"),
+    )
+    trust_region_schedule: str = option(
+        "step_quality",
+        help="How the trust region follows the quality of steps: as Ceres does, or the same but "
+        "bolder after nearly perfect steps.",
+        choices=("step_quality", "ceres"),
+    )
+    use_nonmonotonic_steps: bool = option(
+        False, help="Let the cost rise for some steps on the way to a lower one."
+    )
+    max_consecutive_nonmonotonic_steps: int = option(
+        5, help="How many steps in a row may raise the cost, if any may."
     )
     initial_trust_region_radius: float = option(1e5, help="Radius of the trust region at first.")
     max_trust_region_radius: float = option(1e20, help="Largest radius of the trust region.")
@@ -76,5 +142,14 @@ class VIOptimizationOptions:
     )
     gravity_magnitude_mps2: float = option(
         0.0, help="Gravity; 0 = that of the map's IMU calibration.", unit="m/s^2"
+    )
+    latitude: float = option(
+        float("nan"),
+        help="Compute gravity for this latitude instead; nan = no.",
+        unit="deg",
+    )
+    altitude_meters: float = option(0.0, help="Altitude that goes with --ba_latitude.", unit="m")
+    visualize_every_n_iterations: int = option(
+        3, help="Show the map in an open viewer every this many iterations; 0 = only at the end."
     )
     hide_iterations_console_output: bool = option(False, help="Print no line per iteration.")

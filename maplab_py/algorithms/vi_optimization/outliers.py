@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,22 +15,33 @@ Mask = NDArray[np.bool_]
 
 _MIN_OBSERVATIONS = 2
 """A landmark that keeps fewer does not take part."""
+_OUTLYING = 3.0
+"""An error of fewer medians is no outlier, however large: the states are still far off."""
 
 
 class OutlierRejection:
-    """Switches observations off, never on again."""
+    """Switches observations off, and on again where better states show that they were right."""
 
     def __init__(self, visual: VisualTerms, sigma_px: F64, options: VIOptimizationOptions) -> None:
         """Begin with all observations of landmarks that have at least two."""
         self._visual, self._sigma_px, self._options = visual, sigma_px, options
         self.is_used: Mask = np.ones(len(sigma_px), dtype=np.bool_)
-        self.gated = 0
-        self.rejected = 0
+        self._passed_gate: Mask = self.is_used
+
+    @property
+    def gated(self) -> int:
+        """How many observations were left out from the beginning to now."""
+        return int(np.count_nonzero(~self._passed_gate & ~self.is_used))
+
+    @property
+    def rejected(self) -> int:
+        """How many observations that took part at the beginning do no more."""
+        return int(np.count_nonzero(self._passed_gate & ~self.is_used))
 
     def gate(self, states: States) -> None:
         """Leave out what is hopeless: behind the camera or off by more than the gate."""
         self._reject(states, self._options.gate_reprojection_error_px)
-        self.gated = int(np.count_nonzero(~self.is_used))
+        self._passed_gate = self.is_used
 
     def doubtful_landmarks(self) -> NDArray[np.int64]:
         """Return the landmarks that lost observations to the gate."""
@@ -41,25 +54,42 @@ class OutlierRejection:
         self._visual.use(self._visual.observations.switched(self.is_used, self._sigma_px))
 
     def after_step(self, iteration: int, states: States) -> bool:
-        """Reject outliers every n iterations; tell whether there were any."""
+        """Judge all observations anew every n iterations; tell whether anything has changed."""
         options = self._options
-        every = max(options.outlier_rejection_reject_every_n_iters, 1)
-        if not options.use_visual_outlier_rejection_solver or iteration % every:
+        if iteration % max(options.outlier_rejection_reject_every_n_iters, 1):
             return False
-        before = int(np.count_nonzero(self.is_used))
+        changed = self._visual.refresh(states)
+        if not options.use_visual_outlier_rejection_solver:
+            return changed
+        before = self.is_used
         self._reject(states, options.outlier_rejection_max_reprojection_error_px)
-        rejected = before - int(np.count_nonzero(self.is_used))
-        self.rejected += rejected
-        return rejected > 0
+        return changed or bool(np.any(before != self.is_used))
 
     def used_landmarks(self) -> Mask:
         """Tell which landmarks (L,) take part."""
         return self._used_per_landmark() >= _MIN_OBSERVATIONS
 
-    def _reject(self, states: States, max_error_px: float) -> None:
-        error_px, depth_m = self._visual.reprojection(states.T_G_I, states.p_G)
+    def better_placed(self, states: States, others: States) -> States:
+        """Return the states with every landmark where more of its observations pass the gate."""
+        data, limit = self._visual.observations, self._options.gate_reprojection_error_px
+        passing = [
+            np.bincount(data.landmark, self._agree(s, limit), minlength=len(data.start) - 1)
+            for s in (states, others)
+        ]
+        is_better = (passing[1] > passing[0])[:, None]
+        return dataclasses.replace(states, p_G=np.where(is_better, others.p_G, states.p_G))
+
+    def _agree(self, states: States, max_error_px: float) -> Mask:
+        """Tell which observations lie in front of the camera and are not too far off."""
+        error_px, depth_m = self._visual.errors(states)
         # comparisons with NaN are false: a point that does not project is rejected
-        self.is_used = self.is_used & (error_px <= max_error_px) & (depth_m > 0.0)
+        ahead = (depth_m > 0.0) & np.isfinite(error_px)
+        known = error_px[ahead & self.is_used]
+        usual = float(np.median(known)) if len(known) else 0.0
+        return np.asarray(ahead & (error_px <= max(max_error_px, _OUTLYING * usual)))
+
+    def _reject(self, states: States, max_error_px: float) -> None:
+        self.is_used = self._agree(states, max_error_px)
         alive = self.used_landmarks()
         self.is_used &= alive[self._visual.observations.landmark]
         self._visual.use(self._visual.observations.switched(self.is_used, self._sigma_px))

@@ -30,6 +30,16 @@ class MissionReprojection:
 
 
 @dataclasses.dataclass(frozen=True)
+class CalibratedParameter:
+    """One calibration parameter that was estimated; poses as a change from before."""
+
+    parameter: str
+    before: float
+    after: float
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
 class VIOptimizationReport(Report):
     """Result of a batch optimisation.
 
@@ -54,6 +64,9 @@ class VIOptimizationReport(Report):
     median_reprojection_after_px: float
     missions: list[MissionReprojection]
     gauge: str
+    singular_at: list[str]  # what the measurements did not determine without damping
+    calibration: list[CalibratedParameter]
+    chi_square_per_freedom: float  # about 1 when all sigmas are right
     seconds_build: float
     seconds_solve: float
     seconds_total: float

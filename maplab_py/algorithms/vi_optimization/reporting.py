@@ -5,43 +5,35 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
+from maplab_py.algorithms.vi_optimization.building import PosedProblem
+from maplab_py.algorithms.vi_optimization.calibration_report import calibration_rows
 from maplab_py.algorithms.vi_optimization.report import (
     MissionReprojection,
     TermReport,
     VIOptimizationReport,
 )
-from maplab_py.algorithms.vi_optimization.selection import Selection
 from maplab_py.estimation import factor_terms
 from maplab_py.estimation.problem import Problem
 from maplab_py.estimation.solver import SolverSummary
-from maplab_py.estimation.states import F64, States
+from maplab_py.estimation.states import F64, NODE_NAMES, NODES_PER_VERTEX, States
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 
 I64 = NDArray[np.int64]
 
 
-def make_report(
-    vi_map: VIMap,
-    selection: Selection,
-    problem: Problem,
-    rejection: OutlierRejection | None,
-    before_after: tuple[States, States],
-    summary: SolverSummary,
-    gauge: str,
-    held: I64,
-) -> VIOptimizationReport:
+def make_report(posed: PosedProblem, after: States, summary: SolverSummary) -> VIOptimizationReport:
     """Return the report; times are filled in by the caller."""
-    before, after = before_after
+    vi_map, selection, problem, rejection = (
+        posed.vi_map, posed.selection, posed.problem, posed.rejection,
+    )  # fmt: skip
+    before = posed.states
     terms = _terms(problem, before, after)
     errors, missions = (np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
     gated = rejected = landmarks = 0
     if problem.visual is not None and rejection is not None:
         used = rejection.is_used
-        errors = np.stack(
-            [problem.visual.reprojection(s.T_G_I, s.p_G)[0][used] for s in (before, after)], axis=1
-        )
+        errors = np.stack([problem.visual.errors(s)[0][used] for s in (before, after)], axis=1)
         observing = vi_map.keypoint_vertex[selection.keypoints[used]]
         missions = vi_map.vertices.mission[observing].astype(np.int64)
         gated, rejected = rejection.gated, rejection.rejected
@@ -55,7 +47,7 @@ def make_report(
         rejected_steps=summary.rejected_steps,
         termination=summary.termination,
         vertices=len(selection.vertices),
-        vertices_held=len(held),
+        vertices_held=len(posed.held),
         landmarks=landmarks,
         observations=len(selection.keypoints),
         observations_not_used=gated,
@@ -65,18 +57,29 @@ def make_report(
         median_reprojection_before_px=median[0],
         median_reprojection_after_px=median[1],
         missions=_by_mission(vi_map, errors, missions),
-        gauge=gauge,
+        gauge=posed.gauge,
+        singular_at=[_name_of(posed, after, node) for node in summary.singular_at],
+        calibration=calibration_rows(posed, after),
+        chi_square_per_freedom=_chi_square_per_freedom(posed, after),
         seconds_build=0.0,
         seconds_solve=0.0,
         seconds_total=0.0,
     )
 
 
+def _name_of(posed: PosedProblem, states: States, node: int) -> str:
+    """Say which state of the map a node of the problem is."""
+    if node >= states.num_vertex_nodes:
+        return posed.problem.name_of_node(states, node)
+    vertex = posed.selection.vertices[node // NODES_PER_VERTEX]
+    return f"{NODE_NAMES[node % NODES_PER_VERTEX]} of {to_hex(posed.vi_map.vertices.id[vertex])}"
+
+
 def _terms(problem: Problem, before: States, after: States) -> list[TermReport]:
     terms = []
     if problem.visual is not None:
         used = int(np.count_nonzero(problem.visual.observations.inverse_sigma))
-        costs = [problem.visual.linearize(s.T_G_I, s.p_G, 0.0).cost for s in (before, after)]
+        costs = [problem.visual.cost(s) for s in (before, after)]
         terms.append(TermReport("reprojection", used, *costs))
     for term in problem.factors:
         costs = [factor_terms.cost(term, states) for states in (before, after)]
@@ -98,3 +101,21 @@ def _by_mission(vi_map: VIMap, errors: F64, missions: I64) -> list[MissionReproj
         name = to_hex(vi_map.missions.id[mission])
         rows.append(MissionReprojection(name, len(own), *mean, *median))
     return rows
+
+
+def _chi_square_per_freedom(posed: PosedProblem, states: States) -> float:
+    """Return the squared whitened residuals, no robust loss, per degree of freedom."""
+    problem, total, count = posed.problem, 0.0, 0
+    if problem.visual is not None:
+        data = problem.visual.observations
+        error_px = problem.visual.errors(states)[0]
+        total += float(np.sum(np.square(error_px * data.inverse_sigma)))
+        count += 2 * int(np.count_nonzero(data.inverse_sigma))
+    for term in problem.factors:
+        residual = term.evaluate(states)[0]
+        total += float(np.sum(residual**2))
+        count += residual.size
+    free = problem.degrees_of_freedom()
+    if posed.rejection is not None and problem.visual is not None and problem.visual.moves_points:
+        free += 3 * int(np.count_nonzero(posed.rejection.used_landmarks()))
+    return total / (count - free) if count > free else float("nan")

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.estimation.codegen.kernels import CameraModel
+from maplab_py.errors import MapError
 from maplab_py.estimation.states import F64, States
-from maplab_py.estimation.visual_terms import Cameras, Observations
+from maplab_py.estimation.visual_terms import Observations
 from maplab_py.geometry import so3
 from maplab_py.geometry.triangulation import triangulate
-from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 I64 = NDArray[np.int64]
@@ -59,8 +59,29 @@ def select(
     return Selection(vertices, landmarks, row_of_vertex, keypoints)
 
 
+def check_finite(vi_map: VIMap, selection: Selection, options: VIOptimizationOptions) -> None:
+    """Refuse states that are no numbers.
+
+    Raises:
+        MapError: A pose, or with inertial terms a velocity or bias, is not finite.
+    """
+    names = ("T_M_I", "v_M", "gyro_bias", "accel_bias") if options.include_inertial else ("T_M_I",)
+    for name in names:
+        values = getattr(vi_map.vertices, name)[selection.vertices]
+        bad = selection.vertices[~np.isfinite(values).all(axis=1)]
+        if len(bad):
+            others = f" (and of {len(bad) - 1} others)" if len(bad) > 1 else ""
+            raise MapError(
+                f"{name} of vertex {to_hex(vi_map.vertices.id[bad[0]])}{others} is not a number: "
+                "remove the vertex or load an older map"
+            )
+
+
 def initial_states(vi_map: VIMap, selection: Selection) -> States:
-    """Return the states of the selected vertices and landmarks in G."""
+    """Return the states of the selected vertices and landmarks in G.
+
+    Landmarks that are no numbers begin at zero, where the gate finds them.
+    """
     rows = selection.vertices
     q_G_M = vi_map.T_G_M[vi_map.vertices.mission[rows], :4]
     return States(
@@ -68,7 +89,7 @@ def initial_states(vi_map: VIMap, selection: Selection) -> States:
         v_G=so3.rotate(q_G_M, vi_map.vertices.v_M[rows]),
         gyro_bias=vi_map.vertices.gyro_bias[rows],
         accel_bias=vi_map.vertices.accel_bias[rows],
-        p_G=np.ascontiguousarray(vi_map.p_G[selection.landmarks]),
+        p_G=np.nan_to_num(vi_map.p_G[selection.landmarks], nan=0.0, posinf=0.0, neginf=0.0),
     )
 
 
@@ -119,32 +140,3 @@ def retriangulated(
     p_G = states.p_G.copy()
     p_G[landmarks[ok]] = points[ok]
     return dataclasses.replace(states, p_G=p_G)
-
-
-def cameras(vi_map: VIMap, missions: I64) -> tuple[Cameras, tuple[CameraModel, ...], I64]:
-    """Return the cameras of missions, their models, and each mission's first row (M,).
-
-    Raises:
-        MapError: A mission's rig or IMU is not in sensors.yaml.
-    """
-    first = np.full(len(vi_map.missions), -1, dtype=np.int64)
-    poses: list[F64] = []
-    rows: list[tuple[CameraModel, list[float]]] = []
-    models: list[CameraModel] = []
-    for mission in missions.tolist():
-        rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
-        imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
-        first[mission] = len(rows)
-        poses.append(vi_map.sensors.T_I_C(imu_id, rig_id))
-        for camera in vi_map.sensors.camera_rig(rig_id).cameras:
-            model = (camera.projection, camera.distortion)
-            if model not in models:
-                models.append(model)
-            rows.append((model, [*camera.intrinsics, *camera.distortion_parameters]))
-    ordered = tuple(sorted(models, key=lambda model: (model[0].value, model[1].value)))
-    parameters = np.zeros((len(rows), 1 + max((len(p) for _, p in rows), default=0)))
-    for row, (model, values) in enumerate(rows):
-        parameters[row, 0] = ordered.index(model)
-        parameters[row, 1 : 1 + len(values)] = values
-    T_I_C = np.concatenate(poses) if poses else np.zeros((0, 7))
-    return Cameras(np.ascontiguousarray(T_I_C), parameters), ordered, first

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization.rig_states import MountedSensors
 from maplab_py.algorithms.vi_optimization.selection import Selection
 from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.factor_terms import FactorTerm
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu_calibration_terms import CalibratingInertialTerm, imu_blocks
 from maplab_py.estimation.inertial_terms import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.pose_terms import AbsolutePoseTerm, RelativePoseTerm, whitening
+from maplab_py.estimation.pose_terms import (
+    SWITCH,
+    AbsolutePoseTerm,
+    Mounting,
+    RelativePoseTerm,
+    SwitchedRelativePoseTerm,
+    mounting_block,
+    switch_block,
+    whitening,
+)
+from maplab_py.estimation.prior_terms import BlockPrior, PosePrior, VertexVectorPrior
+from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, States
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import Progress
+from maplab_py.sensors import Imu
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
@@ -25,30 +41,88 @@ I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapFactors:
+    """The factor terms of a map, the states with the blocks they need, and whose blocks they are."""
+
+    terms: list[FactorTerm]
+    states: States
+    fixed: list[I64]  # nodes that shall not move
+    imus: tuple[Imu, ...] = ()  # rows of the IMU blocks
+    mounted: MountedSensors = dataclasses.field(default_factory=MountedSensors)
+    switched_edges: I64 = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+
 def factor_terms(
-    vi_map: VIMap, selection: Selection, options: VIOptimizationOptions, progress: Progress
-) -> list[FactorTerm]:
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    states: States,
+    progress: Progress,
+) -> MapFactors:
     """Return the terms that the options ask for and the map has."""
-    terms: list[FactorTerm] = []
+    result = MapFactors([], states, [])
     if options.include_inertial:
-        terms += _inertial(vi_map, selection, options, progress)
-    for wanted, kind, name in (
-        (options.include_6dof_odometry, TransformationKind.ODOMETRY, "odometry"),
-        (options.include_wheel_odometry, TransformationKind.WHEEL_ODOMETRY, "wheel odometry"),
+        result = _with_inertial(result, vi_map, selection, options, progress)
+    result = _with_mountings(result, vi_map, selection, options)
+    for wanted, kind, name, is_fixed in (
+        (
+            options.include_6dof_odometry,
+            TransformationKind.ODOMETRY,
+            "odometry",
+            options.fix_6dof_odometry_extrinsics,
+        ),
+        (
+            options.include_wheel_odometry,
+            TransformationKind.WHEEL_ODOMETRY,
+            "wheel odometry",
+            options.fix_wheel_odometry_extrinsics,
+        ),
     ):
         if wanted:
-            terms += _odometry(vi_map, selection, kind, name, progress)
-    if options.include_loop_closure_edges:
-        terms += _loop_closures(vi_map, selection, progress)
+            result.terms.extend(
+                _odometry(result, vi_map, selection, kind, name, is_fixed, progress)
+            )
     if options.include_absolute_pose_constraints:
-        terms += _absolute_poses(vi_map, selection, progress)
+        is_fixed = options.fix_absolute_pose_sensor_extrinsics
+        result.terms.extend(_absolute_poses(result, vi_map, selection, is_fixed, progress))
+    if options.include_loop_closure_edges:
+        result = _with_loop_closures(result, vi_map, selection, options, progress)
+    return result
+
+
+def prior_terms(states: States, options: VIOptimizationOptions) -> list[FactorTerm]:
+    """Return the priors of poses and biases that the options ask for, at the given states."""
+    vertices, terms = np.arange(len(states.T_G_I)), list[FactorTerm]()
+    sigmas = [options.position_prior_sigma_m] * 3 + [options.orientation_prior_sigma_rad] * 3
+    if any(sigmas):
+        root = np.diag([1.0 / sigma if sigma > 0.0 else 0.0 for sigma in sigmas])
+        terms.append(PosePrior(vertices, states.T_G_I, root))
+    for kind, values, sigma in (
+        (GYRO_BIAS, states.gyro_bias, options.gyro_bias_prior_sigma_radps),
+        (ACCEL_BIAS, states.accel_bias, options.accel_bias_prior_sigma_mps2),
+    ):
+        if sigma > 0.0:
+            terms.append(VertexVectorPrior(kind, vertices, values, sigma))
     return terms
 
 
-def _inertial(
-    vi_map: VIMap, selection: Selection, options: VIOptimizationOptions, progress: Progress
-) -> list[FactorTerm]:
-    from maplab_py.estimation.symbolic.sources import inertial
+def landmark_prior(states: States, options: VIOptimizationOptions) -> F64 | None:
+    """Return the landmarks' prior (L, 4) at the given states, if the options ask for one."""
+    sigma_m = options.landmark_prior_sigma_m
+    if not sigma_m > 0.0:
+        return None
+    return np.column_stack([states.p_G, np.full(len(states.p_G), 1.0 / sigma_m)])
+
+
+def _with_inertial(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    progress: Progress,
+) -> MapFactors:
+    from maplab_py.estimation.symbolic.sources import inertial, inertial_with_intrinsics
 
     table = vi_map.imu_edges
     ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
@@ -59,81 +133,188 @@ def _inertial(
         edges = edges[lasting]
         data = InertialData.of_map(vi_map, edges)
     if not len(edges):
-        return []
+        return so_far
     first, second = selection.rows(table.from_vertex[edges]), selection.rows(table.to_vertex[edges])
-    magnitudes = np.array([imu.gravity_magnitude_mps2 for imu in data.imus])[data.imu_of_edge]
-    if options.gravity_magnitude_mps2 > 0.0:
-        magnitudes = np.full(len(edges), options.gravity_magnitude_mps2)
-    g_M = np.zeros((len(edges), 3))
-    g_M[:, 2] = -magnitudes
     mission = vi_map.vertices.mission[table.from_vertex[edges]]
-    kernel = residual_kernel("inertial", inertial, progress)
-    g_G = so3.rotate(vi_map.T_G_M[mission, :4], g_M)
+    g_G = so3.rotate(vi_map.T_G_M[mission, :4], _gravity_M(data, options))
     walk = integrate(data, np.zeros(3), np.zeros(3))
-    return [
-        InertialTerm(kernel, data, first, second, g_G),
-        BiasWalkTerm(first, second, walk.gyro_walk_variance, walk.accel_walk_variance),
-    ]
+    bias_walk = BiasWalkTerm(first, second, walk.gyro_walk_variance, walk.accel_walk_variance)
+    if options.fix_imu_intrinsics:
+        kernel = residual_kernel("inertial", inertial, progress)
+        plain = InertialTerm(kernel, data, first, second, g_G)
+        return dataclasses.replace(so_far, terms=[*so_far.terms, plain, bias_walk])
+    kernel = residual_kernel("inertial_with_intrinsics", inertial_with_intrinsics, progress)
+    states = so_far.states.with_blocks(*imu_blocks(data.imus))
+    term = CalibratingInertialTerm(kernel, data, first, second, g_G, states)
+    return dataclasses.replace(
+        so_far, terms=[*so_far.terms, term, bias_walk], states=states, imus=data.imus
+    )
+
+
+def _gravity_M(data: InertialData, options: VIOptimizationOptions) -> F64:
+    """Return gravity (E, 3) in the missions' frames: the map's, or what the flags say."""
+    magnitudes = np.array([imu.gravity_magnitude_mps2 for imu in data.imus])[data.imu_of_edge]
+    if not np.isnan(options.latitude):
+        magnitudes = np.full(len(data), gravity_mps2(options.latitude, options.altitude_meters))
+    if options.gravity_magnitude_mps2 > 0.0:
+        magnitudes = np.full(len(data), options.gravity_magnitude_mps2)
+    return np.stack([np.zeros(len(data)), np.zeros(len(data)), -magnitudes], axis=1)
+
+
+def gravity_mps2(latitude_deg: float, altitude_m: float) -> float:
+    """Return gravity on the WGS 84 ellipsoid (Somigliana) with the free-air gradient [m/s^2]."""
+    sine2 = np.sin(np.radians(latitude_deg)) ** 2
+    at_sea = 9.7803253359 * (1 + 0.00193185265241 * sine2) / np.sqrt(1 - 0.00669437999013 * sine2)
+    return float(at_sea - 3.086e-6 * altitude_m)
+
+
+def _with_mountings(
+    so_far: MapFactors, vi_map: VIMap, selection: Selection, options: VIOptimizationOptions
+) -> MapFactors:
+    """Add the block of extrinsics of every sensor whose mounting is free."""
+    keys = [np.zeros((0, 3), dtype=np.uint64)]
+    table, absolute = vi_map.transformation_edges, vi_map.absolute_poses
+    for kind, is_free in (
+        (
+            TransformationKind.ODOMETRY,
+            options.include_6dof_odometry and not options.fix_6dof_odometry_extrinsics,
+        ),
+        (
+            TransformationKind.WHEEL_ODOMETRY,
+            options.include_wheel_odometry and not options.fix_wheel_odometry_extrinsics,
+        ),
+    ):
+        ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+        rows = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind) & is_free)
+        keys.append(_sensor_keys(vi_map, table.from_vertex[rows], table.sensor_id[rows]))
+    if options.include_absolute_pose_constraints and not (
+        options.fix_absolute_pose_sensor_extrinsics
+    ):
+        rows = np.flatnonzero(selection.row_of_vertex[absolute.vertex] >= 0)
+        keys.append(_sensor_keys(vi_map, absolute.vertex[rows], absolute.sensor_id[rows]))
+    owners = sorted({_owner(vi_map, key) for key in np.unique(np.concatenate(keys), axis=0)})
+    if not owners:
+        return so_far
+    T_I_S = np.stack([vi_map.sensors.T_I_S(*owner) for owner in owners])
+    states = so_far.states.with_blocks(mounting_block(T_I_S))
+    return dataclasses.replace(so_far, states=states, mounted=MountedSensors(tuple(owners)))
 
 
 def _odometry(
-    vi_map: VIMap, selection: Selection, kind: TransformationKind, name: str, progress: Progress
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    kind: TransformationKind,
+    name: str,
+    is_fixed: bool,
+    progress: Progress,
 ) -> list[FactorTerm]:
-    from maplab_py.estimation.symbolic.sources import relative_pose
+    from maplab_py.estimation.symbolic.sources import relative_pose, relative_pose_with_mounting
 
     table = vi_map.transformation_edges
     ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
     edges = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind))
     if not len(edges):
         return []
-    kernel = residual_kernel("relative_pose", relative_pose, progress)
-    T_I_S = _mounting(vi_map, table.from_vertex[edges], table.sensor_id[edges])
+    T_I_S, rows = _mounting(
+        vi_map, so_far.mounted, table.from_vertex[edges], table.sensor_id[edges]
+    )
     W = whitening(table.covariance[edges])
     measured = table.T_A_B[edges]
     first, second = ends[:, edges]
-    return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W)]
+    if is_fixed:
+        kernel = residual_kernel("relative_pose", relative_pose, progress)
+        return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W)]
+    kernel = residual_kernel("relative_pose_with_mounting", relative_pose_with_mounting, progress)
+    mounting = Mounting.of(so_far.states, rows)
+    return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)]
 
 
-def _loop_closures(vi_map: VIMap, selection: Selection, progress: Progress) -> list[FactorTerm]:
-    from maplab_py.estimation.symbolic.sources import relative_pose
+def _with_loop_closures(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    progress: Progress,
+) -> MapFactors:
+    from maplab_py.estimation.symbolic.sources import relative_pose, switched_relative_pose
 
     table = vi_map.loop_closure_edges
+    is_switched = options.loop_closure_robustness == "switchable"
     ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
-    edges = np.flatnonzero((ends >= 0).all(axis=0) & (table.switch_variable > 0.0))
+    edges = np.flatnonzero((ends >= 0).all(axis=0) & ((table.switch_variable > 0.0) | is_switched))
     if not len(edges):
-        return []
+        return so_far
+    measured, (first, second) = table.T_A_B[edges], ends[:, edges]
+    W = whitening(table.covariance[edges])
+    if is_switched:
+        kernel = residual_kernel("switched_relative_pose", switched_relative_pose, progress)
+        states = so_far.states.with_blocks(switch_block(np.ones(len(edges))))
+        rows, nodes = np.arange(len(edges)), states.nodes(SWITCH)
+        term = SwitchedRelativePoseTerm(
+            kernel, "loop closure", first, second, measured, W, rows, nodes
+        )
+        sigma = np.sqrt(np.maximum(table.switch_variable_variance[edges], 1e-16))
+        prior = BlockPrior(states, SWITCH, np.ones((len(edges), 1)), 1.0 / sigma[:, None, None])
+        terms = [*so_far.terms, term, prior]
+        return dataclasses.replace(so_far, terms=terms, states=states, switched_edges=edges)
     kernel = residual_kernel("relative_pose", relative_pose, progress)
-    W = whitening(table.covariance[edges]) * table.switch_variable[edges, None, None]
+    W = W * table.switch_variable[edges, None, None]
     T_I_S = np.broadcast_to(se3.identity(), (len(edges), 7))
-    measured = table.T_A_B[edges]
-    loss = (Loss.DCS, 3.0)
-    first, second = ends[:, edges]
-    return [RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)]
+    loss = (Loss.DCS, 3.0) if options.loop_closure_robustness == "dcs" else (Loss.NONE, 1.0)
+    plain = RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)
+    return dataclasses.replace(so_far, terms=[*so_far.terms, plain])
 
 
-def _absolute_poses(vi_map: VIMap, selection: Selection, progress: Progress) -> list[FactorTerm]:
-    from maplab_py.estimation.symbolic.sources import absolute_pose
+def _absolute_poses(
+    so_far: MapFactors, vi_map: VIMap, selection: Selection, is_fixed: bool, progress: Progress
+) -> list[FactorTerm]:
+    from maplab_py.estimation.symbolic.sources import absolute_pose, absolute_pose_with_mounting
 
     table = vi_map.absolute_poses
     rows = np.flatnonzero(selection.row_of_vertex[table.vertex] >= 0)
     if not len(rows):
         return []
-    kernel = residual_kernel("absolute_pose", absolute_pose, progress)
-    T_I_S = _mounting(vi_map, table.vertex[rows], table.sensor_id[rows])
+    T_I_S, mounted = _mounting(vi_map, so_far.mounted, table.vertex[rows], table.sensor_id[rows])
     vertex = selection.rows(table.vertex[rows])
     W = whitening(table.covariance[rows])
-    return [AbsolutePoseTerm(kernel, vertex, T_I_S, table.T_G_S[rows], W)]
+    if is_fixed:
+        kernel = residual_kernel("absolute_pose", absolute_pose, progress)
+        return [AbsolutePoseTerm(kernel, vertex, T_I_S, table.T_G_S[rows], W)]
+    kernel = residual_kernel("absolute_pose_with_mounting", absolute_pose_with_mounting, progress)
+    mounting = Mounting.of(so_far.states, mounted)
+    return [AbsolutePoseTerm(kernel, vertex, T_I_S, table.T_G_S[rows], W, mounting=mounting)]
 
 
-def _mounting(vi_map: VIMap, vertices: NDArray[np.integer], sensor_ids: NDArray[np.uint64]) -> F64:
-    """Return T_I_S (N, 7) of sensors, each on the IMU of its vertex' mission."""
-    result = np.empty((len(vertices), 7))
-    keys = np.column_stack([vi_map.vertices.mission[vertices].astype(np.uint64), sensor_ids])
+def _sensor_keys(
+    vi_map: VIMap, vertices: NDArray[np.integer], sensor_ids: NDArray[np.uint64]
+) -> NDArray[np.uint64]:
+    mission = vi_map.vertices.mission[vertices].astype(np.uint64)
+    return np.column_stack([mission, sensor_ids])
+
+
+def _owner(vi_map: VIMap, key: NDArray[np.uint64]) -> tuple[str, str]:
+    """Return the ids of the mission's IMU and of the sensor of a key [mission, id words]."""
+    imu_id = mission_sensor_id(vi_map, int(key[0]), MissionSensor.IMU)
+    sensor_id = to_hex(key[1:])
+    if sensor_id not in vi_map.sensors.sensors:
+        raise MapError(f"sensors.yaml has no sensor {sensor_id}, but measurements name it")
+    return imu_id, sensor_id
+
+
+def _mounting(
+    vi_map: VIMap,
+    mounted: MountedSensors,
+    vertices: NDArray[np.integer],
+    sensor_ids: NDArray[np.uint64],
+) -> tuple[F64, I64]:
+    """Return T_I_S (N, 7) of sensors and their rows (N,) of the mounting block (-1 = none)."""
+    result, row = np.empty((len(vertices), 7)), np.full(len(vertices), -1, dtype=np.int64)
+    keys = _sensor_keys(vi_map, vertices, sensor_ids)
     unique, inverse = np.unique(keys, axis=0, return_inverse=True)
-    for row, (mission, *words) in enumerate(unique):
-        imu_id = mission_sensor_id(vi_map, int(mission), MissionSensor.IMU)
-        sensor_id = to_hex(np.array(words, dtype=np.uint64))
-        if sensor_id not in vi_map.sensors.sensors:
-            raise MapError(f"sensors.yaml has no sensor {sensor_id}, but measurements name it")
-        result[inverse.reshape(-1) == row] = vi_map.sensors.T_I_S(imu_id, sensor_id)
-    return result
+    for number, key in enumerate(unique):
+        owner = _owner(vi_map, key)
+        own = inverse.reshape(-1) == number
+        result[own] = vi_map.sensors.T_I_S(*owner)
+        row[own] = mounted.owner.index(owner) if owner in mounted.owner else -1
+    return result, row

@@ -117,3 +117,16 @@ def test_fixed_states_stay() -> None:
 def test_nothing_to_optimise_is_said() -> None:
     with pytest.raises(EstimationError, match="nothing to optimise"):
         optimize(VIMap(), OPTIONS)
+
+
+def test_failed_factorisations_are_named_by_the_map() -> None:
+    from maplab_py.algorithms.vi_optimization.building import build
+    from maplab_py.algorithms.vi_optimization.reporting import make_report
+    from maplab_py.estimation.solver import SolverSummary
+    from maplab_py.estimation.states import NODES_PER_VERTEX, VELOCITY
+    from maplab_py.vimap.ids import to_hex
+
+    posed = build(session(), OPTIONS)
+    summary = SolverSummary({}, {}, 3, 1, "", 0.0, (3 * NODES_PER_VERTEX + VELOCITY,))
+    report = make_report(posed, posed.states, summary)
+    assert report.singular_at == [f"velocity of {to_hex(session().vertices.id[3])}"]

@@ -1,0 +1,183 @@
+"""Conduct: cancelling, time limits, hopeless input, any number of threads."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numba
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization.report import VIOptimizationReport
+from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
+from maplab_py.progress import SilentProgress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
+from tests.support.scene import Scene, corrupted
+
+OPTIONS = VIOptimizationOptions(function_tolerance=0.0, parameter_tolerance=0.0)
+
+
+def start() -> VIMap:
+    rng = np.random.default_rng(2)
+    truth = Scene(missions=2, vertices=8, noise=1.0).make()
+    return corrupted(truth, rng, position_m=0.02, quaternion=0.005, landmark_m=0.02)
+
+
+class Watcher(SilentProgress):
+    """Keeps the lines and cancels at the n-th check."""
+
+    def __init__(self, cancel_at: int = 10**9, pause_s: float = 0.0) -> None:
+        self.lines: list[str] = []
+        self.checks, self._cancel_at, self._pause_s = 0, cancel_at, pause_s
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+    def check(self) -> None:
+        self.checks += 1
+        time.sleep(self._pause_s)
+        if self.checks >= self._cancel_at:
+            raise Cancelled("cancelled")
+
+
+def contents(vi_map: VIMap) -> list[bytes]:
+    tables = (vi_map.vertices, vi_map.landmarks, vi_map.baseframes, vi_map.keypoints)
+    return [
+        column.tobytes()
+        for table in tables
+        for column in table.columns().values()
+        if column.dtype != object
+    ]
+
+
+@pytest.mark.parametrize("cancel_at", [1, 3])
+@pytest.mark.parametrize("hide", [False, True])
+def test_cancelling_between_iterations_leaves_the_map_untouched(cancel_at: int, hide: bool) -> None:
+    vi_map, watcher = start(), Watcher(cancel_at)
+    before = contents(vi_map)
+    options = dataclasses.replace(OPTIONS, hide_iterations_console_output=hide)
+    with pytest.raises(Cancelled):
+        optimize(vi_map, options, progress=watcher)
+    assert len(watcher.lines) == (0 if hide else cancel_at - 1)
+    assert contents(vi_map) == before
+
+
+def test_one_line_per_iteration() -> None:
+    watcher = Watcher()
+    _, report = optimize(start(), dataclasses.replace(OPTIONS, num_iterations=4), progress=watcher)
+    assert report.iterations == 4
+    assert report.termination == "iteration limit"
+    assert len(watcher.lines) == 4
+    assert all("\n" not in line and "cost" in line for line in watcher.lines)
+
+
+def test_no_time_means_no_iteration() -> None:
+    vi_map = start()
+    result, report = optimize(vi_map, dataclasses.replace(OPTIONS, max_time_seconds=0.0))
+    assert (report.termination, report.iterations) == ("time limit", 0)
+    np.testing.assert_allclose(result.vertices.T_M_I, vi_map.vertices.T_M_I, atol=1e-13)
+
+
+def test_time_limit_stops_between_iterations_and_keeps_what_was_reached() -> None:
+    options = dataclasses.replace(OPTIONS, max_time_seconds=1.0, num_iterations=1000)
+    _, report = optimize(start(), options, progress=Watcher(pause_s=0.3))
+    assert report.termination == "time limit"
+    assert 1 <= report.iterations <= 4
+    assert report.cost_after < report.cost_before
+
+
+def test_no_iterations_only_evaluate() -> None:
+    _, report = optimize(start(), dataclasses.replace(OPTIONS, num_iterations=0))
+    assert report.iterations == 0
+    assert report.cost_after == pytest.approx(report.cost_before)
+
+
+def with_state(vi_map: VIMap, column: str, value: float) -> VIMap:
+    values = getattr(vi_map.vertices, column).copy()
+    values[3, 0] = value
+    return vi_map.replace(vertices=vi_map.vertices.replace(**{column: values}))
+
+
+@pytest.mark.parametrize("column", ["T_M_I", "v_M", "gyro_bias", "accel_bias"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.filterwarnings("error")
+def test_states_that_are_no_numbers_are_named(column: str, value: float) -> None:
+    vi_map = start()
+    with pytest.raises(UserError) as raised:
+        optimize(with_state(vi_map, column, value), OPTIONS)
+    message = str(raised.value)
+    assert column in message
+    assert to_hex(vi_map.vertices.id[3]) in message
+    assert "\n" not in message
+
+
+def test_images_alone_do_not_mind_velocities_that_are_no_numbers() -> None:
+    vi_map = start()
+    options = dataclasses.replace(OPTIONS, include_inertial=False, num_iterations=5)
+    result, _ = optimize(with_state(vi_map, "v_M", np.nan), options)
+    expected, _ = optimize(vi_map, options)
+    np.testing.assert_array_equal(result.vertices.T_M_I, expected.vertices.T_M_I)
+    with pytest.raises(UserError, match="T_M_I"):
+        optimize(with_state(vi_map, "T_M_I", np.nan), options)
+
+
+def test_measurements_that_are_no_numbers_are_named() -> None:
+    vi_map = start()
+    readings = vi_map.imu_samples.accel_gyro.copy()
+    readings[100, 4] = np.nan
+    broken = vi_map.replace(imu_samples=vi_map.imu_samples.replace(accel_gyro=readings))
+    with pytest.raises(MaplabError, match=r"IMU edge [0-9a-f]{32}: sample \d+ is not a number"):
+        optimize(broken, OPTIONS)
+
+
+def test_keypoints_that_are_no_numbers_do_not_take_part() -> None:
+    vi_map = start()
+    uv = vi_map.keypoints.uv_px.copy()
+    uv[vi_map.observations[0]] = np.nan
+    broken = vi_map.replace(keypoints=vi_map.keypoints.replace(uv_px=uv))
+    result, report = optimize(broken, dataclasses.replace(OPTIONS, num_iterations=10))
+    assert report.observations_not_used == 1
+    for column in (result.vertices.T_M_I, result.landmarks.p_I, report.cost_after):
+        assert np.isfinite(column).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_landmarks_that_are_no_numbers_are_triangulated_anew(value: float) -> None:
+    truth = Scene(vertices=12, noise=1.0).make()
+    p_I = truth.landmarks.p_I.copy()
+    p_I[5] = value
+    broken = truth.replace(landmarks=truth.landmarks.replace(p_I=p_I))
+    result, report = optimize(broken, VIOptimizationOptions())
+    clean, expected = optimize(truth, VIOptimizationOptions())
+    assert report.cost_after == pytest.approx(expected.cost_after, rel=1e-3)
+    np.testing.assert_allclose(result.landmarks.p_I, clean.landmarks.p_I, atol=0.02)
+
+
+def test_map_without_usable_measurements_is_one_clear_error() -> None:
+    vi_map = start()
+    empty = vi_map.replace(
+        keypoints=vi_map.keypoints.replace(landmark=np.full(len(vi_map.keypoints), -1))
+    )
+    options = dataclasses.replace(OPTIONS, include_inertial=False)
+    with pytest.raises(EstimationError, match="nothing to optimise"):
+        optimize(empty, options)
+
+
+def test_any_number_of_threads_gives_the_same_bytes() -> None:
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one processor only")
+    results: list[tuple[VIMap, VIOptimizationReport]] = []
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, 2, numba.config.NUMBA_NUM_THREADS):
+            numba.set_num_threads(threads)
+            results.append(optimize(start(), dataclasses.replace(OPTIONS, num_iterations=8)))
+    finally:
+        numba.set_num_threads(before)
+    for result, report in results[1:]:
+        assert contents(result) == contents(results[0][0])
+        assert report.cost_after == results[0][1].cost_after
