@@ -1,0 +1,76 @@
+"""Times of localisation in a map of 30,000 landmarks; thesis table 4.2: matching 7.4, RANSAC 2.5 ms.
+
+python -m tests.benchmarks.localization
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+
+from maplab_py.algorithms.localization.database import database_of_map, database_of_summary
+from maplab_py.algorithms.localization.localizer import Localizer, Outcome
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.localization.queries import queries, query_vertices
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.summary import make_summary_map
+from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
+from maplab_py.simulation.simulate import simulate
+from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.merge import merge_maps
+
+LANDMARKS, QUERIES = 30_000, 60
+
+
+def maps() -> tuple[VIMap, VIMap]:
+    """Return a map of 30,000 landmarks and a session to be localised."""
+    scenario = Scenario(
+        world=WorldOptions(room_size_m=(30.0, 14.0, 3.5), landmarks_per_room=24_000),
+        measurement=MeasurementOptions(frame_rate_hz=5.0, max_keypoints=300),
+        sessions=(
+            SessionOptions(kind="loop", duration_s=60.0, turns=1.0),
+            SessionOptions(kind="loop", duration_s=60.0, turns=1.0, reverse=True),
+            SessionOptions(kind="loop", duration_s=20.0, turns=0.4, start_turn=0.2),
+        ),
+    )
+    scenario = dataclasses.replace(scenario, drift=scenario.without_noise().drift)
+    data = simulate(scenario)
+    placed = [
+        m.replace(baseframes=m.baseframes.replace(T_G_M=data.truth.T_G_M[row][None]))
+        for row, m in enumerate(data.maps)
+    ]
+    vi_map, _ = merge_maps(placed[0], placed[1])
+    quality = np.full(len(vi_map.landmarks), LandmarkQuality.BAD)
+    longest = np.argsort(-np.diff(vi_map.observation_start), kind="stable")
+    quality[longest[:LANDMARKS]] = LandmarkQuality.GOOD
+    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), placed[2]
+
+
+def main() -> None:
+    """Print times per query of both kinds of maps, wall and processor."""
+    vi_map, session = maps()
+    full = database_of_map(vi_map)
+    summary = database_of_summary(make_summary_map(vi_map, SummaryMapOptions()))
+    for name, database in (("full", full), ("summary", summary)):
+        localizer = Localizer(database, LocalizationOptions())
+        source = query_vertices(session, np.array([0]), database.projection)
+        chosen = list(queries(source))[:QUERIES]
+        localizer.localize(chosen[0])  # compiles
+        begin = time.process_time()
+        answers = [localizer.localize(query) for query in chosen]
+        processor = 1e3 * (time.process_time() - begin) / len(chosen)
+        matching = 1e3 * np.median([a.matching_s for a in answers])
+        ransac = 1e3 * np.median([a.ransac_s for a in answers])
+        share = np.mean([a.outcome is Outcome.LOCALIZED for a in answers])
+        keypoints = np.mean([a.keypoints for a in answers])
+        print(
+            f"{name}: {len(database.p_G)} landmarks, {len(database.descriptors)} observations, "
+            f"{keypoints:.0f} keypoints, {100 * share:.0f} % localised; matching {matching:.1f} ms, "
+            f"RANSAC {ransac:.1f} ms (wall, median); processor {processor:.1f} ms in all"
+        )
+
+
+if __name__ == "__main__":
+    main()
