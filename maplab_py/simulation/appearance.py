@@ -19,6 +19,7 @@ from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions
 
 F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
 
 _REFERENCE_DISTANCE_M = 3.0
 _DETECTIONS_AT_ONCE = 1 << 14
@@ -32,8 +33,9 @@ class Appearance:
     options: AppearanceOptions
     weights: F32  # (latent, bits)
     threshold: F32  # (bits,) of the activations: some bits are mostly set, others mostly clear
-    latent: F32  # (L, latent)
-    gradient: F32  # (L, 4, latent) by view direction (3) and doubling of the distance
+    look: I64  # (L,) row of the following for every point of the world
+    latent: F32  # (K, latent)
+    gradient: F32  # (K, 4, latent) by view direction (3) and doubling of the distance
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,14 +43,13 @@ class SessionAppearance:
     """How points look, and whether they are there, in one session."""
 
     world: Appearance
-    change: F32  # (L, latent)
+    change: F32  # (K, latent)
     is_there: NDArray[np.bool_]  # (L,)
 
 
-def make_appearance(
-    options: AppearanceOptions, points: int, rng: np.random.Generator
-) -> Appearance:
-    """Draw how the points look."""
+def make_appearance(options: AppearanceOptions, look: I64, rng: np.random.Generator) -> Appearance:
+    """Draw how the points look; points of equal look (L,) look alike."""
+    points = int(look.max(initial=-1)) + 1
     bits, size = 8 * options.descriptor_bytes, options.latent_dimensions
     weights = rng.standard_normal((size, bits), dtype=np.float32)
     weights /= np.linalg.norm(weights, axis=0)
@@ -57,14 +58,14 @@ def make_appearance(
     gradient = rng.standard_normal((points, 4, size), dtype=np.float32)
     gradient[:, :3] *= options.viewpoint_change
     gradient[:, 3] *= options.scale_change
-    return Appearance(options, weights, threshold, latent, gradient)
+    return Appearance(options, weights, threshold, look, latent, gradient)
 
 
 def make_session_appearance(world: Appearance, rng: np.random.Generator) -> SessionAppearance:
     """Draw what has changed in a session, and what has vanished."""
     change = rng.standard_normal(world.latent.shape, dtype=np.float32)
     change *= world.options.session_change
-    is_there = rng.uniform(size=len(world.latent)) >= world.options.vanish_share
+    is_there = rng.uniform(size=len(world.look)) >= world.options.vanish_share
     return SessionAppearance(world, change, is_there)
 
 
@@ -95,7 +96,7 @@ def _describe(
     # clutter has point -1: its latent vector is drawn anew
     latent = rng.standard_normal((len(point), world.latent.shape[1]), dtype=np.float32)
     of_point = point >= 0
-    known = point[of_point]
+    known = world.look[point[of_point]]
     latent[of_point] = world.latent[known] + session.change[known]
     latent[of_point] += np.einsum("nk,nkj->nj", view[of_point], world.gradient[known])
     activation = latent @ world.weights

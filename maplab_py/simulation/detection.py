@@ -3,25 +3,44 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
+from maplab_py.simulation.occlusion import is_hidden
 from maplab_py.simulation.scenario import MeasurementOptions
-from maplab_py.simulation.world import World, is_hidden
+from maplab_py.simulation.tracks import drifts, number_tracks, swap_identities
+from maplab_py.simulation.world import World
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _FRAMES_AT_ONCE = 64
 """Frames that are projected in one go: bounds the memory to some 50 MB."""
-_SWAP_CANDIDATES = 8
-"""A track is swapped with the nearest of so many others of its frame."""
 _SCORE_NOISE = 0.1
 """A detector's response differs this much between images; a point's own is uniform in [0, 1]."""
+
+
+_BORDER_PX, _BORDER_SIGMAS = 1.0, 5.0
+"""What is nearer to the border could be carried out of the image by noise."""
+_READOUT_ROUNDS = 4
+"""The row at which a point appears depends on when it is read out; each round gains 2 digits."""
+_SIZE_SPREAD = 0.7
+_OCTAVE_DISTANCE_M = 6.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraPoses:
+    """Where a camera is at its images, stamped in the middle of their readout."""
+
+    time_s: F64  # (F,)
+    T_G_C: F64  # (F, 7)
+    line_delay_s: float = 0.0  # between two rows
+    at_time: Callable[[F64], F64] | None = None  # poses (N, 7) at any times (N,)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,11 +54,12 @@ class Detections:
     uv_px: F64  # (N, 2)
     view_G: F64  # (N, 3) unit, from the point to the camera; clutter: zero
     distance_m: F64  # (N,) clutter: 1
+    octave: I64  # (N,) of the image pyramid in which it was found
 
 
 def detect(
     camera: Camera,
-    T_G_C: F64,
+    poses: CameraPoses,
     world: World,
     is_there: NDArray[np.bool_],
     options: MeasurementOptions,
@@ -49,63 +69,122 @@ def detect(
 
     Args:
         camera: The camera.
-        T_G_C: Its pose at every image (F, 7).
+        poses: Where it is, and when.
         world: Points and what hides them.
         is_there: Which points (L,) can be seen in this session at all.
         options: Limits, probabilities and noise.
         rng: Source of all of it.
     """
-    frame, point, uv, view, distance = _visible(camera, T_G_C, world, is_there, options)
+    frame, point, uv, view, distance = _visible(camera, poses, world, is_there, options)
     detected = rng.uniform(size=len(frame)) < options.detection_probability
     response = rng.uniform(size=len(world.p_G))
     score = response[point] + rng.normal(0.0, _SCORE_NOISE, len(frame))
     detected &= _is_best(frame, np.where(detected, score, -np.inf), options.max_keypoints)
     frame, point = frame[detected], point[detected]
     uv, view, distance = uv[detected], view[detected], distance[detected]
-    track = _tracks(frame, point, options.track_break_probability, rng)
-    track = _swap_identities(track, frame, uv, options.identity_swap_share, rng)
-    noisy = uv + options.keypoint_sigma_px * rng.standard_normal(uv.shape)
-    found = Detections(frame, point, track, uv, noisy, view, distance)
-    return _with_clutter(found, len(T_G_C), camera, options.clutter_share, rng)
+    track = number_tracks(frame, point, options.track_break_probability, rng)
+    track = swap_identities(track, frame, uv, options.identity_swap_share, rng)
+    octave = _octaves(point, distance, len(world.p_G), options.octaves, rng)
+    sigma = sigma_of_octave(options, octave)
+    noisy = uv + sigma[:, None] * rng.standard_normal(uv.shape)
+    if options.track_drift_share > 0.0:
+        noisy += drifts(track, frame, options.track_drift_share, options.track_drift_px, rng)
+    found = Detections(frame, point, track, uv, noisy, view, distance, octave)
+    return _with_clutter(found, len(poses.time_s), camera, options.clutter_share, rng)
+
+
+def sigma_of_octave(options: MeasurementOptions, octave: I64) -> F64:
+    """Return the standard deviations (N,) [px]: half an octave up, 1.4 times the error."""
+    return np.asarray(options.keypoint_sigma_px * np.sqrt(2.0) ** octave)
+
+
+def _octaves(point: I64, distance: F64, points: int, octaves: int, rng: np.random.Generator) -> I64:
+    """Return the octave (N,) in which a point is found: the nearer and larger, the higher."""
+    if octaves == 1:
+        return np.zeros(len(point), dtype=np.int64)
+    size = rng.normal(0.0, _SIZE_SPREAD, points)
+    level = size[point] + np.log2(_OCTAVE_DISTANCE_M / distance)
+    return np.asarray(np.clip(np.round(level), 0, octaves - 1), dtype=np.int64)
 
 
 def _visible(
     camera: Camera,
-    T_G_C: F64,
+    poses: CameraPoses,
     world: World,
     is_there: NDArray[np.bool_],
     options: MeasurementOptions,
 ) -> tuple[I64, I64, F64, F64, F64]:
     """Return image, point, pixel, view direction and distance of everything in sight."""
-    rows = np.flatnonzero(is_there)
-    p_G, normal_G = world.p_G[rows], world.normal_G[rows]
-    least_cosine = np.cos(np.deg2rad(options.max_view_angle_deg))
-    radius = field_of_view_radius(camera)
+    margin = _BORDER_PX + _BORDER_SIGMAS * float(
+        sigma_of_octave(options, np.array(options.octaves - 1))
+    )
+    groups = [np.flatnonzero(is_there & (world.moving < 0))]
+    groups += [np.flatnonzero(is_there & (world.moving == m)) for m in range(len(world.objects))]
     parts = []
-    for first in range(0, len(T_G_C), _FRAMES_AT_ONCE):
-        poses = T_G_C[first : first + _FRAMES_AT_ONCE]
-        ray = poses[:, None, 4:] - p_G[None]
-        squares = np.einsum("fli,fli->fl", ray, ray)
-        cosine = np.einsum("fli,li->fl", ray, normal_G)
-        near = (squares < options.max_distance_m**2) & (squares > options.min_distance_m**2)
-        frame, local = np.nonzero(near & (cosine > least_cosine * np.sqrt(squares)))
-        q_C_G = so3.inverse(poses[frame, :4])
-        p_C = so3.rotate(q_C_G, -ray[frame, local])
-        ahead = np.hypot(p_C[:, 0], p_C[:, 1]) < radius * p_C[:, 2]
-        frame, local, p_C = frame[ahead], local[ahead], p_C[ahead]
-        uv = pixels_of(camera, p_C)
-        inside = np.all((uv >= 1.0) & (uv < [camera.width_px - 2, camera.height_px - 2]), axis=1)
-        frame, local, uv = frame[inside], local[inside], uv[inside]
-        free = ~is_hidden(world.boxes, poses[frame, 4:], p_G[local])
-        frame, local, uv = frame[free], local[free], uv[free]
-        distance = np.sqrt(squares[frame, local])
-        parts.append(
-            (first + frame, rows[local], uv, ray[frame, local] / distance[:, None], distance)
-        )
+    for number, rows in enumerate(groups):
+        mover = world.objects[number - 1] if number else None
+        for first in range(0, len(poses.time_s), _FRAMES_AT_ONCE):
+            frames = slice(first, first + _FRAMES_AT_ONCE)
+            p_G = world.p_G[rows][None]
+            if mover is not None:
+                p_G = p_G + mover.displacement(poses.time_s[frames])[:, None]
+            seen = _seen(camera, poses, frames, p_G, world.normal_G[rows], options)
+            frame, local, uv, view, distance = seen
+            inside = np.all(
+                (uv >= margin) & (uv < [camera.width_px - margin, camera.height_px - margin]),
+                axis=1,
+            )
+            eye = poses.T_G_C[first + frame, 4:]
+            place = p_G[np.minimum(frame, len(p_G) - 1), local]
+            free = np.flatnonzero(inside)
+            free = free[~is_hidden(world.boxes, eye[free], place[free])]
+            parts.append(
+                (first + frame[free], rows[local[free]], uv[free], view[free], distance[free])
+            )
     frame, point, uv, view, distance = (
         np.concatenate(columns) for columns in zip(*parts, strict=True)
     )
-    return frame, point, uv, view, distance
+    order = np.lexsort((point, frame))
+    return frame[order], point[order], uv[order], view[order], distance[order]
+
+
+def _seen(
+    camera: Camera,
+    poses: CameraPoses,
+    frames: slice,
+    p_G: F64,
+    normal_G: F64,
+    options: MeasurementOptions,
+) -> tuple[I64, I64, F64, F64, F64]:
+    """Return what some images would show of points (1 or F, L, 3) if nothing hid them."""
+    T_G_C = poses.T_G_C[frames]
+    least_cosine = np.cos(np.deg2rad(options.max_view_angle_deg))
+    ray = T_G_C[:, None, 4:] - p_G
+    squares = np.einsum("fli,fli->fl", ray, ray)
+    cosine = np.einsum("fli,li->fl", ray, normal_G)
+    near = (squares < options.max_distance_m**2) & (squares > options.min_distance_m**2)
+    frame, local = np.nonzero(near & (cosine > least_cosine * np.sqrt(squares)))
+    p_C = so3.rotate(so3.inverse(T_G_C[frame, :4]), -ray[frame, local])
+    ahead = np.hypot(p_C[:, 0], p_C[:, 1]) < field_of_view_radius(camera) * p_C[:, 2]
+    frame, local, p_C = frame[ahead], local[ahead], p_C[ahead]
+    uv = pixels_of(camera, p_C)
+    if poses.line_delay_s != 0.0:
+        place = p_G[np.minimum(frame, len(p_G) - 1), local]
+        uv = _rolling(camera, poses, poses.time_s[frames][frame], place, uv)
+    distance = np.sqrt(squares[frame, local])
+    return frame, local, uv, ray[frame, local] / distance[:, None], distance
+
+
+def _rolling(camera: Camera, poses: CameraPoses, time_s: F64, p_G: F64, uv: F64) -> F64:
+    """Return pixels (N, 2) of points (N, 3) whose rows are read out one after the other."""
+    at_time = poses.at_time
+    if at_time is None:
+        return uv
+    for _ in range(_READOUT_ROUNDS):
+        row = np.clip(uv[:, 1], 0.0, camera.height_px)
+        T_G_C = at_time(time_s + poses.line_delay_s * (row - 0.5 * camera.height_px))
+        uv = pixels_of(camera, so3.rotate(so3.inverse(T_G_C[:, :4]), p_G - T_G_C[:, 4:]))
+    return uv
 
 
 def _is_best(frame: I64, score: F64, most: int) -> NDArray[np.bool_]:
@@ -116,52 +195,6 @@ def _is_best(frame: I64, score: F64, most: int) -> NDArray[np.bool_]:
     best = np.zeros(len(frame), dtype=np.bool_)
     best[order] = np.arange(len(frame)) - begins < most
     return best & np.isfinite(score)
-
-
-def _tracks(frame: I64, point: I64, break_probability: float, rng: np.random.Generator) -> I64:
-    """Number the tracks: a point seen in consecutive images, unless its track breaks."""
-    order = np.lexsort((frame, point))
-    breaks = rng.uniform(size=len(frame)) < break_probability
-    begins = np.ones(len(frame), dtype=np.bool_)
-    begins[1:] = (np.diff(point[order]) != 0) | (np.diff(frame[order]) != 1) | breaks[1:]
-    track = np.empty(len(frame), dtype=np.int64)
-    track[order] = np.cumsum(begins) - 1
-    # numbered by first appearance, as a tracker does
-    _, first = np.unique(track, return_index=True)
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
-    return rank[track]
-
-
-def _swap_identities(
-    track: I64, frame: I64, uv: F64, share: float, rng: np.random.Generator
-) -> I64:
-    """Let a share of the tracks jump onto another point near by, each at most once."""
-    tracks = int(track.max()) + 1 if len(track) else 0
-    # each swap concerns two tracks
-    wanted = int(0.5 * share * tracks)
-    if wanted == 0:
-        return track
-    start = np.searchsorted(frame, np.arange(frame.max() + 2))
-    one = rng.integers(0, len(track), wanted)
-    low, high = start[frame[one]], start[frame[one] + 1]
-    others = low[:, None] + np.floor(
-        rng.uniform(size=(wanted, _SWAP_CANDIDATES)) * (high - low)[:, None]
-    ).astype(np.int64)
-    gap = np.linalg.norm(uv[others] - uv[one][:, None], axis=2)
-    gap[others == one[:, None]] = np.inf
-    other = others[np.arange(wanted), np.argmin(gap, axis=1)]
-    pair = np.stack([track[one], track[other]], axis=1)
-    _, first, count = np.unique(pair, return_index=True, return_counts=True)
-    once = np.zeros(pair.size, dtype=np.bool_)
-    once[first[count == 1]] = True
-    chosen = np.all(once.reshape(pair.shape), axis=1)
-    partner = np.arange(tracks)
-    since = np.full(tracks, np.iinfo(np.int64).max)
-    for side in (0, 1):
-        partner[pair[chosen, side]] = pair[chosen, 1 - side]
-        since[pair[chosen, side]] = frame[one[chosen]]
-    return np.where(frame >= since[track], partner[track], track)
 
 
 def _with_clutter(
@@ -185,9 +218,5 @@ def _with_clutter(
         np.concatenate([np.clip(found.uv_px, 0.0, size), uv])[order],
         np.concatenate([found.view_G, np.zeros((total, 3))])[order],
         np.concatenate([found.distance_m, np.ones(total)])[order],
+        np.concatenate([found.octave, np.zeros(total, dtype=np.int64)])[order],
     )
-
-
-def camera_poses(T_G_I: F64, T_I_C: F64) -> F64:
-    """Return the poses (F, 7) of a camera on bodies (F, 7)."""
-    return se3.compose(T_G_I, T_I_C)

@@ -1,4 +1,4 @@
-"""How far a map is from the truth: trajectories, and where missions lie among each other."""
+"""How far a map is from the truth: states, missions, landmarks, merges, edges, calibration."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3, yaw
+from maplab_py.geometry import se3, so3, yaw
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.report import Report
+from maplab_py.simulation.calibration_evaluation import CalibrationError, calibration_errors
+from maplab_py.simulation.merge_evaluation import count_merges, shown_points, sightings
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+_FALSE_EDGE_M, _FALSE_EDGE_DEG = 0.5, 5.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +42,26 @@ class MapErrors(Report):
     ate_each_m: float  # RMSE over all vertices, every mission aligned by itself
     ate_m: float  # RMSE over all vertices, all missions aligned together
     scale: float  # of the whole map, 1 = right
+    tilt_deg: float  # RMSE of roll and pitch together
+    heading_deg: float  # RMSE, all missions aligned together
+    velocity_mps: float  # RMSE, in the body frame
+    gyro_bias_radps: float  # RMSE
+    accel_bias_mps2: float  # RMSE
+    landmarks: int  # of which the truth is known, and whose point does not move
+    landmark_median_m: float | None  # error of positions; None = there are none
+    landmark_90_percent_m: float | None  # nine of ten err by less
+    merges: int  # simulated landmarks that were joined to another one
+    false_merges: int  # of these: joined to landmarks of another world point
+    missed_merges: int  # landmarks that could still be joined to one of the same world point
+    wrong_observations: int  # show another world point than most of their landmark's do
+    loop_edges: int
+    false_loop_edges: int  # off by more than 0.5 m or 5 deg
+    false_loop_edges_trusted: int  # of these: with a switch variable above 0.5
+    calibrations: tuple[CalibrationError, ...]
 
 
 def evaluate_map(vi_map: VIMap, truth: Truth) -> MapErrors:
-    """Compare the vertices of a map with the truth, by id.
+    """Compare a map with the truth, by id.
 
     A mission's place: fit yaw and position of the mission to the truth, and of the whole map to
     the truth; offset and yaw are what differs between the two, at the middle of the mission.
@@ -53,25 +73,90 @@ def evaluate_map(vi_map: VIMap, truth: Truth) -> MapErrors:
     known = np.flatnonzero(row >= 0)
     if len(known) < 3:
         raise UserError("the truth is of another data set: it knows none of the map's vertices")
-    p_G, p_true = vi_map.T_G_I[known, 4:], truth.T_G_I[row[known], 4:]
-    mission = vi_map.vertices.mission[known]
+    row = row[known]
+    p_G, p_true = vi_map.T_G_I[known, 4:], truth.T_G_I[row, 4:]
     together, _ = umeyama(p_true, p_G)
     _, scale = umeyama(p_G, p_true, with_scale=True)
     level = align_yaw_position(p_true, p_G)
-    errors, squares = [], 0.0
+    missions = _mission_errors(vi_map, known, p_G, p_true, level)
+    squares = sum(error.ate_m**2 * error.vertices for error in missions)
+    tilt, heading = _attitude(level, vi_map.T_G_I[known], truth.T_G_I[row])
+    speed = _in_body(vi_map.vertices.T_M_I[known], vi_map.vertices.v_M[known])
+    seen = sightings(vi_map, truth)
+    shown = shown_points(seen, len(vi_map.landmarks))
+    merged = count_merges(seen, truth, shown)
+    distance = _landmark_errors(vi_map, truth, shown, together)
+    is_false = _false_loop_edges(vi_map, truth)
+    trusted = vi_map.loop_closure_edges.switch_variable > 0.5
+    return MapErrors(
+        missions=missions,
+        ate_each_m=float(np.sqrt(squares / len(known))),
+        ate_m=_rmse(p_true, se3.transform(together, p_G)),
+        scale=scale,
+        tilt_deg=tilt,
+        heading_deg=heading,
+        velocity_mps=_rmse(speed, _in_body(truth.T_G_I[row], truth.v_G[row])),
+        gyro_bias_radps=_rmse(vi_map.vertices.gyro_bias[known], truth.gyro_bias[row]),
+        accel_bias_mps2=_rmse(vi_map.vertices.accel_bias[known], truth.accel_bias[row]),
+        landmarks=len(distance),
+        landmark_median_m=float(np.median(distance)) if len(distance) else None,
+        landmark_90_percent_m=float(np.percentile(distance, 90)) if len(distance) else None,
+        **dataclasses.asdict(merged),
+        loop_edges=len(is_false),
+        false_loop_edges=int(np.count_nonzero(is_false)),
+        false_loop_edges_trusted=int(np.count_nonzero(is_false & trusted)),
+        calibrations=calibration_errors(
+            vi_map, truth, IdIndex(truth.mission_id).rows(vi_map.missions.id)
+        ),
+    )
+
+
+def _mission_errors(
+    vi_map: VIMap, known: I64, p_G: F64, p_true: F64, level: F64
+) -> tuple[MissionError, ...]:
+    mission = vi_map.vertices.mission[known]
+    errors = []
     for number in np.unique(mission):
         own = mission == number
         ate = _rmse(p_true[own], se3.transform(umeyama(p_true[own], p_G[own])[0], p_G[own]))
-        squares += ate**2 * int(own.sum())
         offset, angle = _misplacement(level, p_true[own], p_G[own])
         name = to_hex(vi_map.missions.id[number])[:8]
         errors.append(MissionError(name, int(own.sum()), ate, offset, angle))
-    return MapErrors(
-        tuple(errors),
-        float(np.sqrt(squares / len(known))),
-        _rmse(p_true, se3.transform(together, p_G)),
-        scale,
+    return tuple(errors)
+
+
+def _attitude(T_true_G: F64, T_G_I: F64, T_true_I: F64) -> tuple[float, float]:
+    """Return RMSE [deg] of roll and pitch together, and of heading, after levelled alignment."""
+    q = so3.multiply(T_true_G[:4], T_G_I[:, :4])
+    error = so3.log(so3.multiply(q, so3.inverse(T_true_I[:, :4])))
+    tilt = np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))
+    return float(np.rad2deg(tilt)), float(np.rad2deg(np.sqrt(np.mean(error[:, 2] ** 2))))
+
+
+def _in_body(T_A_I: F64, v_A: F64) -> F64:
+    return so3.rotate(so3.inverse(T_A_I[:, :4]), v_A)
+
+
+def _landmark_errors(vi_map: VIMap, truth: Truth, shown: I64, T_true_G: F64) -> F64:
+    """Return the distances (N,) [m] of landmarks from the points that they show."""
+    known = np.flatnonzero(shown >= 0)
+    known = known[truth.point_moving[shown[known]] < 0]
+    there = se3.transform(T_true_G, vi_map.p_G[known])
+    return np.asarray(np.linalg.norm(there - truth.point_G[shown[known]], axis=1))
+
+
+def _false_loop_edges(vi_map: VIMap, truth: Truth) -> NDArray[np.bool_]:
+    """Tell which loop closure edges (E,) of the map claim what is not so."""
+    edges, index = vi_map.loop_closure_edges, IdIndex(truth.vertex_id)
+    a, b = (
+        index.rows(vi_map.vertices.id[vertex]) for vertex in (edges.from_vertex, edges.to_vertex)
     )
+    known = (a >= 0) & (b >= 0)
+    true = se3.relative(truth.T_G_I[a], truth.T_G_I[b])
+    error = se3.local(true, edges.T_A_B)
+    far = np.linalg.norm(error[:, :3], axis=1) > _FALSE_EDGE_M
+    turned = np.linalg.norm(error[:, 3:], axis=1) > np.deg2rad(_FALSE_EDGE_DEG)
+    return np.asarray(known & (far | turned))
 
 
 def _misplacement(T_true_G: F64, p_true: F64, p_G: F64) -> tuple[float, float]:

@@ -23,6 +23,10 @@ class ImuRecording:
     accel_bias: F64  # (N, 3)
     gyro_bias: F64  # (N, 3)
 
+    def take(self, rows: NDArray[np.int64]) -> ImuRecording:
+        """Return some of the samples."""
+        return ImuRecording(self.accel_gyro[rows], self.accel_bias[rows], self.gyro_bias[rows])
+
 
 def intrinsics_of(options: ImuOptions) -> ImuIntrinsics | None:
     """Return scale and misalignment; None when all are ideal."""
@@ -49,18 +53,24 @@ def _upper_triangular(diagonal: tuple[float, ...], above: tuple[float, ...]) -> 
     return matrix
 
 
-def measure(options: ImuOptions, motion: MotionState, rng: np.random.Generator) -> ImuRecording:
+def measure(
+    options: ImuOptions,
+    intrinsics: ImuIntrinsics,
+    motion: MotionState,
+    rng: np.random.Generator,
+) -> ImuRecording:
     """Return what the IMU reports at the times of a motion, 1 / rate_hz apart.
 
-    Thesis eq. (7.7)-(7.10): w~ = T_g w + b_g + n_g, a~ = T_a R_A_I R_I_G (a_G - g_G) + b_a + n_a.
+    Thesis eq. (7.7)-(7.11): w~ = T_g w + b_g + n_g, a~ = T_a R_A_I R_I_G (a_G - g_G) + b_a + n_a;
+    then what the options ask for beyond it, and saturation.
     """
     count = len(motion.v_G)
     rate = options.rate_hz
-    gravity_G = np.array([0.0, 0.0, -options.gravity_mps2])
-    force_I = so3.rotate(so3.inverse(motion.T_G_I[:, :4]), motion.a_G - gravity_G)
-    intrinsics = intrinsics_of(options) or ImuIntrinsics()
-    gyro = np.einsum("ij,nj->ni", intrinsics.T_g, motion.w_I)
-    accel = np.einsum("ij,jk,nk->ni", intrinsics.T_a, intrinsics.R_A_I, force_I)
+    force_I = _specific_force(options, motion)
+    warmth = _warmth(options, count)
+    gyro = warmth * np.einsum("ij,nj->ni", intrinsics.T_g, motion.w_I)
+    gyro += options.g_sensitivity * force_I
+    accel = warmth * np.einsum("ij,jk,nk->ni", intrinsics.T_a, intrinsics.R_A_I, force_I)
     accel_bias = _bias(count, options.accel_bias_sigma, options.accel_bias_walk, rate, rng)
     gyro_bias = _bias(count, options.gyro_bias_sigma, options.gyro_bias_walk, rate, rng)
     # a density in 1 / sqrt(Hz) sampled at `rate` has the standard deviation density * sqrt(rate)
@@ -69,7 +79,26 @@ def measure(options: ImuOptions, motion: MotionState, rng: np.random.Generator) 
     samples = np.concatenate(
         [accel + accel_bias + accel_noise, gyro + gyro_bias + gyro_noise], axis=1
     )
-    return ImuRecording(samples, accel_bias, gyro_bias)
+    most = np.repeat([options.saturation_accel_mps2, options.saturation_gyro_radps], 3)
+    return ImuRecording(np.clip(samples, -most, most), accel_bias, gyro_bias)
+
+
+def _specific_force(options: ImuOptions, motion: MotionState) -> F64:
+    """Return the specific force (N, 3) at the accelerometer, in I."""
+    gravity_G = np.array([0.0, 0.0, -options.gravity_mps2])
+    force_I = so3.rotate(so3.inverse(motion.T_G_I[:, :4]), motion.a_G - gravity_G)
+    arm = np.asarray(options.lever_arm_m)
+    if not arm.any():
+        return force_I
+    # rigid body: a_A = a_I + alpha x p + w x (w x p)
+    turning = np.cross(motion.w_I, np.cross(motion.w_I, arm))
+    return np.asarray(force_I + np.cross(motion.alpha_I, arm) + turning)
+
+
+def _warmth(options: ImuOptions, count: int) -> F64:
+    """Return the factor (N, 1) that both scales have while the device warms up."""
+    time = np.arange(count) / options.rate_hz
+    return 1.0 + options.warming_scale * -np.expm1(-time / options.warming_time_s)[:, None]
 
 
 def _bias(count: int, sigma: float, walk: float, rate: float, rng: np.random.Generator) -> F64:

@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
 from maplab_py.errors import UserError
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
-from maplab_py.simulation.scenario import MOTION_KINDS, CameraOptions, MotionOptions, Scenario
+from maplab_py.simulation.scenario import (
+    LAYOUTS,
+    MOTION_KINDS,
+    AppearanceOptions,
+    CalibrationOptions,
+    CameraOptions,
+    DriftOptions,
+    MotionOptions,
+    Scenario,
+    SessionOptions,
+)
 
 _POSITIVE = (
     "world.rooms",
+    "world.floors",
+    "world.landmarks_per_object",
+    "world.object_speed_mps",
+    "measurement.octaves",
+    "imu.saturation_accel_mps2",
+    "imu.saturation_gyro_radps",
+    "imu.warming_time_s",
+    "world.corridor_width_m",
     "world.landmarks_per_room",
     "imu.rate_hz",
     "imu.gravity_mps2",
@@ -20,14 +39,33 @@ _POSITIVE = (
     "measurement.max_distance_m",
     "appearance.descriptor_bytes",
     "appearance.latent_dimensions",
+    "other_sensors.absolute_pose_sigma_m",
+    "other_sensors.absolute_pose_sigma_deg",
+    "other_sensors.odometry_sigma_m",
+    "other_sensors.odometry_sigma_deg",
+    "other_sensors.wheel_scale",
+    "other_sensors.loop_edge_sigma_m",
+    "other_sensors.loop_edge_sigma_deg",
+    "other_sensors.loop_edge_max_distance_m",
+    "images.texel_m",
+    "images.blur_samples",
+    "calibration.imu_noise_factor",
+    "calibration.keypoint_noise_factor",
 )
 _PROBABILITIES = (
     "world.patchiness",
+    "world.bare_share",
+    "measurement.track_drift_share",
+    "imu.dropped_share",
+    "world.distinct_share",
     "measurement.detection_probability",
     "measurement.track_break_probability",
     "measurement.identity_swap_share",
     "measurement.clutter_share",
     "appearance.vanish_share",
+    "other_sensors.loop_edge_false_share",
+    "images.gain_swing",
+    "images.vignette",
 )
 _NOT_NEGATIVE = (
     "seeds.world",
@@ -35,16 +73,37 @@ _NOT_NEGATIVE = (
     "seeds.measurement",
     "seeds.appearance",
     "world.furniture_per_room",
+    "world.moving_objects",
+    "measurement.track_drift_px",
+    "imu.time_jitter_s",
     "imu.gyro_noise_density",
     "imu.accel_noise_density",
     "imu.gyro_bias_walk",
     "imu.accel_bias_walk",
     "measurement.keypoint_sigma_px",
     "measurement.min_distance_m",
-    "drift.position_walk",
-    "drift.yaw_walk_deg",
-    "drift.scale_sigma",
+    "other_sensors.absolute_pose_every_s",
+    "other_sensors.loop_edges",
+    "images.exposure_s",
+    "images.noise_sigma",
+    "other_sensors.loop_edge_min_gap_s",
+    "imu.gyro_bias_sigma",
+    "imu.accel_bias_sigma",
+    *(f"drift.{field.name}" for field in dataclasses.fields(DriftOptions)),
+    *(
+        f"appearance.{field.name}"
+        for field in dataclasses.fields(AppearanceOptions)
+        if field.name not in ("descriptor_bytes", "latent_dimensions")
+    ),
+    *(
+        f"calibration.{field.name}"
+        for field in dataclasses.fields(CalibrationOptions)
+        if not field.name.endswith("_factor")
+    ),
 )
+_LARGEST = 1e6
+"""No number of a scenario may be larger: what is, is a slip of the pen."""
+_MOST_SAMPLES = 10_000_000
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -53,6 +112,7 @@ def check_scenario(scenario: Scenario) -> None:
     Raises:
         UserError: A value is out of its range; names the key.
     """
+    _check_finite(scenario, "")
     for keys, low, high, text in (
         (_POSITIVE, math.nextafter(0.0, 1.0), math.inf, "greater than 0"),
         (_NOT_NEGATIVE, 0.0, math.inf, "0 or greater"),
@@ -60,14 +120,19 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         for key in keys:
             value = _value(scenario, key)
-            if not (math.isfinite(value) and low <= value <= high):
+            if not low <= value <= high:
                 raise UserError(f"{key}: must be {text}, not {value:g}")
+    measurement = scenario.measurement
+    if not 0.0 < measurement.max_view_angle_deg <= 90.0:
+        raise UserError("measurement.max_view_angle_deg: must be greater than 0 and at most 90")
+    if measurement.min_track_length < 2:
+        raise UserError("measurement.min_track_length: must be at least 2")
     if scenario.measurement.clutter_share > 0.9:
         raise UserError("measurement.clutter_share: must not exceed 0.9")
-    if min(scenario.world.room_size_m) <= 0.0:
-        raise UserError("world.room_size_m: must be greater than 0")
+    _check_world(scenario)
     if scenario.measurement.frame_rate_hz > scenario.imu.rate_hz:
         raise UserError("measurement.frame_rate_hz: must not exceed imu.rate_hz")
+    _check_times(scenario)
     if not scenario.sessions:
         raise UserError("sessions: at least one is needed")
     if not scenario.cameras:
@@ -78,6 +143,17 @@ def check_scenario(scenario: Scenario) -> None:
         _check_camera(camera, f"cameras[{row}]")
 
 
+def _check_times(scenario: Scenario) -> None:
+    imu = scenario.imu
+    if imu.time_jitter_s > 0.1 / imu.rate_hz:
+        raise UserError("imu.time_jitter_s: must not exceed a tenth of the time between samples")
+    if abs(imu.time_offset_s) > 0.05:
+        raise UserError("imu.time_offset_s: must lie between -0.05 and 0.05")
+    for row, camera in enumerate(scenario.cameras):
+        if abs(camera.line_delay_s) * camera.height_px > 0.05:
+            raise UserError(f"cameras[{row}].line_delay_s: reads longer than 0.05 s for an image")
+
+
 def _value(scenario: Scenario, key: str) -> Any:
     value: Any = scenario
     for part in key.split("."):
@@ -85,20 +161,70 @@ def _value(scenario: Scenario, key: str) -> Any:
     return value
 
 
-def _check_session(scenario: Scenario, session: MotionOptions, key: str) -> None:
-    if session.kind not in MOTION_KINDS:
-        known = ", ".join(MOTION_KINDS)
-        raise UserError(f"{key}.kind: must be one of {known}, not '{session.kind}'")
-    frames = session.duration_s * scenario.measurement.frame_rate_hz
+def _check_finite(group: Any, key: str) -> None:
+    """Check every number, whatever it is for."""
+    if dataclasses.is_dataclass(group):
+        for field in dataclasses.fields(group):
+            inner = f"{key}.{field.name}" if key else field.name
+            _check_finite(getattr(group, field.name), inner)
+    elif isinstance(group, tuple):
+        for row, item in enumerate(group):
+            _check_finite(item, f"{key}[{row}]")
+    elif isinstance(group, (int, float)) and not abs(group) <= _LARGEST:
+        is_seed = isinstance(group, int) and key.startswith("seeds.")
+        if not is_seed:
+            raise UserError(f"{key}: must be a number up to {_LARGEST:g}, not {group:g}")
+
+
+def _check_world(scenario: Scenario) -> None:
+    world = scenario.world
+    if world.layout not in LAYOUTS:
+        known = ", ".join(LAYOUTS)
+        raise UserError(f"world.layout: must be one of {known}, not '{world.layout}'")
+    if min(world.room_size_m) <= 0.0:
+        raise UserError("world.room_size_m: must be greater than 0")
+    if world.layout == "corridor" and min(world.room_size_m[:2]) < 4.0 * world.corridor_width_m:
+        raise UserError("world.corridor_width_m: must not exceed a quarter of room_size_m")
+
+
+def _check_session(scenario: Scenario, session: SessionOptions, key: str) -> None:
+    frames = session.total_s * scenario.measurement.frame_rate_hz
     if not frames >= 2.0:
         raise UserError(f"{key}.duration_s: too short for two frames")
-    if session.turns == 0.0:
+    if session.total_s * scenario.imu.rate_hz > _MOST_SAMPLES:
+        raise UserError(f"{key}.duration_s: gives more than {_MOST_SAMPLES} IMU samples")
+    if not session.device >= 0:
+        raise UserError(f"{key}.device: must be 0 or greater")
+    if session.trajectory:
+        return
+    if not session.phases:
+        _check_motion(scenario, session, key)
+    for row, phase in enumerate(session.phases):
+        _check_motion(scenario, phase, f"{key}.phases[{row}]")
+
+
+def _check_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
+    world = scenario.world
+    if motion.kind not in MOTION_KINDS:
+        known = ", ".join(MOTION_KINDS)
+        raise UserError(f"{key}.kind: must be one of {known}, not '{motion.kind}'")
+    if not motion.duration_s >= 0.5:
+        raise UserError(f"{key}.duration_s: too short, must be at least 0.5")
+    if motion.turns == 0.0 and motion.kind not in ("straight", "stationary", "hover", "shake"):
         raise UserError(f"{key}.turns: must not be 0")
-    size = scenario.world.room_size_m
-    if not 0.0 < session.wall_distance_m < 0.5 * min(size[:2]):
+    if not motion.shake_hz > 0.0:
+        raise UserError(f"{key}.shake_hz: must be greater than 0")
+    if not 0 <= motion.room < world.rooms:
+        raise UserError(f"{key}.room: must be from 0 to {world.rooms - 1}")
+    if world.layout == "corridor" and motion.kind in ("room_scan", "figure_8", "loop", "vehicle"):
+        raise UserError(f"{key}.kind: the corridor layout has no room for {motion.kind}")
+    if world.layout != "corridor" and motion.kind == "corridor":
+        raise UserError(f"{key}.kind: corridor needs world.layout: corridor")
+    size = world.room_size_m
+    if not 0.0 < motion.wall_distance_m < 0.5 * min(size[:2]):
         raise UserError(f"{key}.wall_distance_m: leaves no room to move in")
-    swing = abs(session.height_swing_m) + session.shake_m
-    if not swing < session.height_m < size[2] - swing:
+    swing = abs(motion.height_swing_m) + motion.shake_m
+    if not swing < motion.height_m < size[2] - swing:
         raise UserError(f"{key}.height_m: leads through floor or ceiling")
 
 

@@ -1,15 +1,20 @@
-"""Generators of motion: a person or a small vehicle that carries the sensors through a room."""
+"""Motion of a session: pieces along paths or from where the body is, spliced without a jerk."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.simulation.scenario import MotionOptions
+from maplab_py.simulation.occlusion import is_hidden
+from maplab_py.simulation.paths import follow
+from maplab_py.simulation.scenario import PATH_KINDS, MotionOptions, SessionOptions, WorldOptions
 from maplab_py.simulation.spline import PoseSpline
+from maplab_py.simulation.trajectory_motion import trajectory_spline
+from maplab_py.simulation.world import World
 
 F64 = NDArray[np.float64]
 
@@ -17,65 +22,236 @@ CONTROL_SPACING_S = 0.1
 
 _SHAKES = 3
 """Sinusoids per axis that make up the shaking of a hand."""
+_RAMP_S = 1.0
+"""Pieces of a composed motion begin and end at rest, and need this time to get to speed."""
+_SETTLE_S = 0.5
+"""Shaking grows and fades in this time where two pieces meet."""
+_BRIDGE_SPEED_MPS = 0.8
+_BRIDGE_RATE_RADPS = 0.8
+_HOVER_HZ = 0.15
+_BODY_RADIUS_M = 0.05
 
-PathOfTurn = Callable[[F64, F64], tuple[F64, F64]]
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Entry:
+    """Where a piece of motion begins: the level pose that the one before has reached."""
+
+    position: F64  # (3,)
+    yaw: float
+    turns: dict[str, float]  # where each path was left [turns]
+    is_first: bool
 
 
-def motion_spline(options: MotionOptions, room_size_m: F64, rng: np.random.Generator) -> PoseSpline:
-    """Return the motion of one session: a path with a heading, plus the shaking of a hand.
+def motion_spline(
+    options: SessionOptions, world: WorldOptions, rng: np.random.Generator
+) -> PoseSpline:
+    """Return the motion of one session.
 
     Args:
-        options: Kind, duration, direction, height and amplitudes.
-        room_size_m: Length, width and height (3,) of the space that is walked through.
+        options: One piece of motion, several of them, or a trajectory file.
+        world: Gives the paths their measures.
         rng: Source of start phase and shaking.
+
+    Raises:
+        UserError: The trajectory file cannot be used.
     """
-    count = int(np.ceil(options.duration_s / CONTROL_SPACING_S)) + 4
+    if options.trajectory:
+        return trajectory_spline(options, world)
+    total = options.total_s
+    count = int(np.ceil(total / CONTROL_SPACING_S)) + 4
     time: F64 = (np.arange(count, dtype=np.float64) - 1.0) * CONTROL_SPACING_S
-    start = options.start_turn + rng.uniform(-0.02, 0.02)
-    sign = -1.0 if options.reverse else 1.0
-    turn = 2.0 * np.pi * (start + sign * options.turns * time / options.duration_s)
-    half = 0.5 * room_size_m[:2] - options.wall_distance_m
-    xy, yaw = _PATHS[options.kind](turn, half)
-    if options.kind != "room_scan":
-        yaw = yaw + (np.pi if options.reverse else 0.0)
-    height = options.height_m + options.height_swing_m * np.sin(1.7 * turn + start)
-    position = np.concatenate([xy, height[:, None]], axis=1)
-    yaw = yaw + options.look_around_rad * np.sin(2.3 * turn + 5.0 * start)
-    q = so3.exp(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
-    position = position + _shake(time, options.shake_m, rng)
-    q = so3.multiply(q, so3.exp(_shake(time, options.shake_rad, rng)))
-    return PoseSpline(se3.make(so3.normalize(q), position), CONTROL_SPACING_S)
+    entry = _first_entry(options.phases or (options,), world)
+    if not options.phases:
+        poses, _ = _piece(options, world, entry, time, rng, is_alone=True)
+        return PoseSpline(poses, CONTROL_SPACING_S)
+    begin, parts = 0.0, []
+    for number, phase in enumerate(options.phases):
+        end = begin + phase.duration_s
+        first = -np.inf if number == 0 else begin
+        last = np.inf if number + 1 == len(options.phases) else end
+        own = (time >= first) & (time < last)
+        poses, entry = _piece(phase, world, entry, time[own] - begin, rng, is_alone=False)
+        parts.append(poses)
+        begin = end
+    return PoseSpline(np.concatenate(parts), CONTROL_SPACING_S)
 
 
-def _room_scan(turn: F64, half: F64) -> tuple[F64, F64]:
-    """Walk along an ellipse and look at the walls."""
-    xy = np.stack([half[0] * np.cos(turn), half[1] * np.sin(turn)], axis=1)
-    return xy, np.unwrap(np.arctan2(xy[:, 1] / half[1], xy[:, 0] / half[0]))
+def check_free_way(spline: PoseSpline, world: World, key: str) -> None:
+    """Check that a motion stays inside the world and goes through no wall.
+
+    Raises:
+        UserError: It does not; the message begins with `key`.
+    """
+    way = spline.control[:, 4:]
+    low, high = world.bounds
+    outside = np.any((way < low + _BODY_RADIUS_M) | (way > high - _BODY_RADIUS_M), axis=1)
+    blocked = np.append(is_hidden(world.boxes, way[:-1], way[1:]), False)
+    inside = np.zeros(len(way), dtype=np.bool_)
+    for box in world.boxes:
+        inside |= np.all((way > box[0]) & (way < box[1]), axis=1)
+    wrong = outside | blocked | inside
+    if np.any(wrong):
+        row = int(np.flatnonzero(wrong)[0])
+        place = ", ".join(f"{value:.1f}" for value in way[row])
+        what = "out of the world" if outside[row] else "through a wall or furniture"
+        when = max(row - 1, 0) * spline.spacing_s
+        raise UserError(
+            f"{key}: the motion leads {what} at {when:.1f} s, ({place}) m; change kind, "
+            "wall_distance_m, height_m, duration_s or speed_mps"
+        )
 
 
-def _figure_8(turn: F64, half: F64) -> tuple[F64, F64]:
-    """Walk a lemniscate and look ahead."""
-    xy = np.stack([half[0] * np.sin(turn), half[1] * np.sin(2.0 * turn)], axis=1)
-    ahead = np.stack([half[0] * np.cos(turn), 2.0 * half[1] * np.cos(2.0 * turn)], axis=1)
-    return xy, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+def _piece(
+    motion: MotionOptions,
+    world: WorldOptions,
+    entry: _Entry,
+    time: F64,
+    rng: np.random.Generator,
+    *,
+    is_alone: bool,
+) -> tuple[F64, _Entry]:
+    """Return the poses (N, 7) of one piece at times since its begin, and where it ends."""
+    jitter = rng.uniform(-0.02, 0.02)
+    duration = motion.duration_s
+    # the end of the piece rides along as the last time
+    at = np.append(time, duration)
+    progress = at / duration if is_alone else _eased(at, duration)
+    turns = dict(entry.turns)
+    if motion.kind in PATH_KINDS:
+        position, yaw, turns[motion.kind] = _path_piece(motion, world, entry, progress, jitter)
+        if not entry.is_first:
+            position, yaw = _bridge(entry, position, yaw, at)
+    else:
+        position, yaw = _free_piece(motion, entry, progress)
+    window = np.ones(len(at)) if is_alone else _window(at, duration)
+    look = _nodding(motion, progress) * window[:, None]
+    q = so3.multiply(so3.exp(_about_z(yaw)), so3.exp(look))
+    shaken_p, shaken_q = _shaking(motion, at, rng)
+    position = position + window[:, None] * shaken_p
+    q = so3.multiply(q, so3.exp(window[:, None] * shaken_q))
+    end = _Entry(position[-1], float(yaw[-1]), turns, is_first=False)
+    return se3.make(so3.normalize(q), position)[:-1], end
 
 
-def _loop(turn: F64, half: F64) -> tuple[F64, F64]:
-    """Walk a rounded rectangle along the walls and look ahead."""
-    # the superellipse |x|^4 + |y|^4 = 1
-    c, s = np.cos(turn), np.sin(turn)
-    radius = (c**4 + s**4) ** -0.25
-    xy = np.stack([half[0] * radius * c, half[1] * radius * s], axis=1)
-    ahead = np.gradient(xy, axis=0) * np.sign(turn[-1] - turn[0])
-    return xy, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+def _path_piece(
+    motion: MotionOptions, world: WorldOptions, entry: _Entry, progress: F64, jitter: float
+) -> tuple[F64, F64, float]:
+    """Return positions (N, 3) and yaw (N,) along a path, and the turn at its end."""
+    known = entry.turns.get(motion.kind)
+    start = motion.start_turn + (jitter if known is None else known)
+    sign = -1.0 if motion.reverse else 1.0
+    turn = 2.0 * np.pi * (start + sign * motion.turns * progress)
+    position, yaw = follow(turn, motion, world)
+    position[:, 2] += motion.height_m
+    if motion.kind != "vehicle":
+        position[:, 2] += motion.height_swing_m * np.sin(1.7 * turn + start)
+        yaw = yaw + motion.look_around_rad * np.sin(2.3 * turn + 5.0 * start)
+    return position, yaw, start + sign * motion.turns
 
 
-_PATHS: dict[str, PathOfTurn] = {"room_scan": _room_scan, "figure_8": _figure_8, "loop": _loop}
+def _free_piece(motion: MotionOptions, entry: _Entry, progress: F64) -> tuple[F64, F64]:
+    """Return positions (N, 3) and yaw (N,) of a piece that begins where the body is."""
+    sign = -1.0 if motion.reverse else 1.0
+    turned = 2.0 * np.pi * sign * motion.turns * progress if motion.kind == "rotation" else 0.0
+    yaw = entry.yaw + turned + np.zeros_like(progress)
+    way = sign * motion.speed_mps * motion.duration_s if motion.kind == "straight" else 0.0
+    ahead = np.array([np.cos(entry.yaw), np.sin(entry.yaw), 0.0])
+    return entry.position + way * progress[:, None] * ahead, yaw
 
 
-def _shake(time: F64, amplitude: float, rng: np.random.Generator) -> F64:
-    """Return a sum of sinusoids (N, 3) between 0.4 and 1.6 Hz with random phases."""
-    frequency = rng.uniform(0.4, 1.6, (_SHAKES, 3))
+def _nodding(motion: MotionOptions, progress: F64) -> F64:
+    """Return roll and pitch (N, 3) of somebody who turns on the spot and looks around."""
+    look = np.zeros((len(progress), 3))
+    if motion.kind == "rotation":
+        angle = 2.0 * np.pi * max(abs(motion.turns), 1.0) * progress
+        look[:, 0] = motion.look_around_rad * np.sin(2.0 * angle)
+        look[:, 1] = motion.look_around_rad * np.sin(3.0 * angle)
+    return look
+
+
+def _first_entry(pieces: tuple[MotionOptions, ...], world: WorldOptions) -> _Entry:
+    """Return where the body is at first: where the first path begins, if there is one.
+
+    Otherwise the middle of the room, its wall for `straight`, or the first corridor.
+    """
+    for piece in pieces:
+        if piece.kind in PATH_KINDS:
+            turn = np.array([2.0 * np.pi * piece.start_turn])
+            position, yaw = follow(turn, piece, world)
+            position[:, 2] += piece.height_m
+            return _Entry(position[0], float(yaw[0]), {}, is_first=True)
+    motion, size = pieces[0], np.asarray(world.room_size_m)
+    heading = 2.0 * np.pi * motion.start_turn
+    xy = np.array([motion.room * size[0], 0.0])
+    if world.layout == "corridor":
+        xy = np.array([0.0, 0.5 * (world.corridor_width_m - size[1])])
+    elif motion.kind == "straight":
+        back = -1.0 if motion.reverse else 1.0
+        reach = 0.5 * size[:2] - motion.wall_distance_m
+        xy = xy - back * reach * np.array([np.cos(heading), np.sin(heading)])
+    return _Entry(np.append(xy, motion.height_m), heading, {}, is_first=True)
+
+
+def _bridge(entry: _Entry, position: F64, yaw: F64, time: F64) -> tuple[F64, F64]:
+    """Begin at the entry and glide onto the path; return positions and yaw."""
+    now = int(np.argmin(np.abs(time)))
+    gap = float(np.linalg.norm(position[now] - entry.position))
+    behind = entry.yaw - yaw[now]
+    turn = behind - 2.0 * np.pi * np.round(behind / (2.0 * np.pi))
+    yaw = yaw + (behind - turn)
+    if gap < 1e-3 and abs(turn) < 1e-3:
+        return position, yaw
+    lasts = max(_RAMP_S, 2.0 * gap / _BRIDGE_SPEED_MPS, 2.0 * abs(turn) / _BRIDGE_RATE_RADPS)
+    left = 1.0 - _level_rise(np.clip(time / lasts, 0.0, 1.0))
+    back = entry.position - position
+    return position + left[:, None] * back, yaw + left * (entry.yaw - yaw)
+
+
+def _eased(time: F64, duration: float) -> F64:
+    """Return progress 0 .. 1 at even speed but for soft ramps from and to rest."""
+    ramp = min(_RAMP_S, 0.5 * duration)
+    t = np.clip(time, 0.0, duration)
+
+    def ramped(s: F64) -> F64:
+        # integral of the raised cosine (1 - cos(pi s / ramp)) / 2
+        return 0.5 * s - 0.5 * ramp / np.pi * np.sin(np.pi * s / ramp)
+
+    rest = duration - t
+    way = np.where(t < ramp, ramped(np.minimum(t, ramp)), t - 0.5 * ramp)
+    way = np.where(rest < ramp, duration - ramp - ramped(np.minimum(rest, ramp)), way)
+    return np.asarray(way / (duration - ramp))
+
+
+def _window(time: F64, duration: float) -> F64:
+    """Return a weight that rises from 0 at the begin of a piece to 1 and falls to 0 at its end."""
+    settle = min(_SETTLE_S, 0.5 * duration)
+    return _level_rise(np.clip(time / settle, 0.0, 1.0)) * _level_rise(
+        np.clip((duration - time) / settle, 0.0, 1.0)
+    )
+
+
+def _level_rise(s: F64) -> F64:
+    """Return a rise from 0 to 1 whose first and second derivatives vanish at both ends."""
+    return np.asarray(s**3 * (10.0 + s * (6.0 * s - 15.0)))
+
+
+def _about_z(yaw: F64) -> F64:
+    return np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1)
+
+
+def _shaking(motion: MotionOptions, time: F64, rng: np.random.Generator) -> tuple[F64, F64]:
+    """Return how a hand shakes position (N, 3) and rotation vector (N, 3)."""
+    hertz = _HOVER_HZ if motion.kind == "hover" else motion.shake_hz
+    shake_p = _shake(time, motion.shake_m, hertz, rng)
+    shake_q = _shake(time, motion.shake_rad, hertz, rng)
+    if motion.kind in ("straight", "stationary", "vehicle"):
+        return 0.0 * shake_p, 0.0 * shake_q
+    return (0.0 * shake_p, 0.0 * shake_q) if motion.kind == "rotation" else (shake_p, shake_q)
+
+
+def _shake(time: F64, amplitude: float, hertz: float, rng: np.random.Generator) -> F64:
+    """Return a sum of sinusoids (N, 3) about a frequency, with random phases."""
+    frequency = hertz * rng.uniform(0.4, 1.6, (_SHAKES, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, (_SHAKES, 3))
     waves = np.sin(2.0 * np.pi * frequency * time[:, None, None] + phase)
     return np.asarray(amplitude / np.sqrt(_SHAKES) * waves.sum(axis=1))

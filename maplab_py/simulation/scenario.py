@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-MOTION_KINDS = ("room_scan", "figure_8", "loop")
+PATH_KINDS = ("room_scan", "figure_8", "loop", "corridor", "vehicle")
+"""Motions along a path that the world lays down; the others start wherever the body is."""
+MOTION_KINDS = (*PATH_KINDS, "straight", "rotation", "stationary", "hover", "shake")
+LAYOUTS = ("rooms", "corridor")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,13 +22,26 @@ class Seeds:
 
 @dataclasses.dataclass(frozen=True)
 class WorldOptions:
-    """Rooms in a row, joined by open doorways, with landmarks on their surfaces and furniture."""
+    """Surfaces with landmarks on them.
 
+    `rooms`: rooms in a row along x, joined by open doorways. `corridor`: a ring of corridors around
+    a solid block, `floors` above each other, joined by stairs in the two short sides.
+    """
+
+    layout: str = "rooms"  # or corridor
     rooms: int = 1
-    room_size_m: tuple[float, float, float] = (10.0, 8.0, 3.5)
-    landmarks_per_room: int = 2500
+    floors: int = 1  # of a corridor
+    room_size_m: tuple[float, float, float] = (10.0, 8.0, 3.5)  # corridor: of one floor
+    corridor_width_m: float = 2.5
+    landmarks_per_room: int = 2500  # corridor: per floor
     furniture_per_room: int = 4
     patchiness: float = 0.6  # 0 = even density, 1 = all landmarks in clusters
+    bare_share: float = 0.0  # of the surfaces: carry a tenth of the landmarks that others do
+    identical_rooms: bool = False  # all rooms look alike
+    distinct_share: float = 0.03  # of the landmarks of identical rooms: the room's own
+    moving_objects: int = 0
+    landmarks_per_object: int = 60
+    object_speed_mps: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,11 +56,21 @@ class ImuOptions:
     gyro_bias_sigma: float = 0.01  # initial [rad/s]
     accel_bias_sigma: float = 0.1  # initial [m/s^2]
     gravity_mps2: float = 9.81
+    saturation_accel_mps2: float = 150.0
+    saturation_gyro_radps: float = 7.5
+    dropped_share: float = 0.0  # of the samples
+    time_jitter_s: float = 0.0  # standard deviation of the time stamps
     gyro_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     accel_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gyro_misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)  # T_g [01, 02, 12]
     accel_misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)  # T_a [01, 02, 12]
     accel_rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # log R_A_I
+    # what no model in the map knows of
+    g_sensitivity: float = 0.0  # of the gyroscope, along each axis [rad/s per m/s^2]
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the accelerometer, in I
+    warming_scale: float = 0.0  # by which both scales grow while the device warms up
+    warming_time_s: float = 120.0
+    time_offset_s: float = 0.0  # IMU time stamps are late by this against the cameras'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +85,7 @@ class CameraOptions:
     height_px: int = 480
     position_m: tuple[float, float, float] = (0.05, 0.02, 0.01)  # of C in I
     turn_rad: tuple[float, float, float] = (0.01, -0.02, 0.015)  # rotation vector, in I
+    line_delay_s: float = 0.0  # between two rows of a rolling shutter; 0 = global shutter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +93,8 @@ class MeasurementOptions:
     """What the cameras see and what a tracker makes of it."""
 
     frame_rate_hz: float = 10.0
-    keypoint_sigma_px: float = 0.8
+    keypoint_sigma_px: float = 0.8  # in the lowest octave
+    octaves: int = 1  # of the image pyramid; sigma grows by 1.4 with each
     max_keypoints: int = 500  # with landmark, per frame
     min_distance_m: float = 0.4
     max_distance_m: float = 12.0
@@ -74,6 +102,8 @@ class MeasurementOptions:
     detection_probability: float = 0.9
     track_break_probability: float = 0.02  # per frame
     identity_swap_share: float = 0.03  # of tracks
+    track_drift_share: float = 0.0  # of tracks: slide off their point
+    track_drift_px: float = 0.5  # per frame, a random walk
     clutter_share: float = 0.2  # of keypoints, without landmark
     min_track_length: int = 3
 
@@ -108,20 +138,103 @@ class DriftOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class MotionOptions:
-    """The motion of one session."""
+class CalibrationOptions:
+    """How far a device is from the calibration that its maps carry; only the truth file knows.
 
-    kind: str = "room_scan"  # figure_8, loop
+    `imu` and `cameras` of the scenario are what the maps say. Deviations are drawn per device.
+    """
+
+    focal_sigma_px: float = 0.0
+    centre_sigma_px: float = 0.0
+    distortion_sigma: float = 0.0  # of every distortion parameter
+    camera_rotation_sigma_deg: float = 0.0
+    camera_position_sigma_m: float = 0.0
+    gyro_scale_sigma: float = 0.0
+    accel_scale_sigma: float = 0.0
+    gyro_misalignment_sigma: float = 0.0
+    accel_misalignment_sigma: float = 0.0
+    accel_rotation_sigma_deg: float = 0.0
+    session_share: float = 0.0  # of all of these: drawn anew for every session
+    imu_noise_factor: float = 1.0  # noise densities in the map / true ones
+    keypoint_noise_factor: float = 1.0  # keypoint sigma in the map / true one
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherSensorOptions:
+    """Sensors beside cameras and IMU; errors are white and as large as their covariances say."""
+
+    absolute_pose_every_s: float = 0.0  # 0 = none; of S in the frame of the world
+    absolute_pose_sigma_m: float = 0.05
+    absolute_pose_sigma_deg: float = 0.5
+    odometry: bool = False  # an edge of S between neighbouring vertices
+    wheel_odometry: bool = False  # likewise, of the IMU
+    odometry_sigma_m: float = 0.005  # per edge, both kinds
+    odometry_sigma_deg: float = 0.05
+    wheel_scale: float = 1.0  # of the way that the wheels report; nobody is told
+    sensor_position_m: tuple[float, float, float] = (0.1, 0.0, 0.2)  # of S in I
+    sensor_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
+    loop_edges: int = 0  # per session
+    loop_edge_false_share: float = 0.0
+    loop_edge_sigma_m: float = 0.03
+    loop_edge_sigma_deg: float = 0.5
+    loop_edge_min_gap_s: float = 15.0
+    loop_edge_max_distance_m: float = 2.0  # false edges join places twice as far apart or more
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageOptions:
+    """Rendered images; they show the world's surfaces through the true cameras."""
+
+    render: bool = False
+    depth: bool = True  # beside the truth
+    texel_m: float = 0.005  # of the finest texture
+    exposure_s: float = 0.004
+    blur_samples: int = 3  # moments within the exposure; 1 = no motion blur
+    gain_swing: float = 0.15  # by which brightness comes and goes
+    vignette: float = 0.3  # that the corners are darker
+    noise_sigma: float = 2.0  # grey values of 255
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionOptions:
+    """A piece of motion.
+
+    Along a path: `room_scan` looks at the walls of a room, `figure_8` crosses it, `loop` goes round
+    all rooms through their doorways, `vehicle` does so on wheels, `corridor` walks the corridors and
+    stairs. From where the body is: `straight` (constant velocity), `rotation` (position kept),
+    `stationary`, `hover`, `shake`.
+    """
+
+    kind: str = "room_scan"
     duration_s: float = 30.0
     turns: float = 1.2
-    start_turn: float = 0.0
+    start_turn: float = 0.0  # counted from where the last piece of the same kind ended
     reverse: bool = False
+    room: int = 0  # of room_scan and figure_8
     height_m: float = 1.5
     height_swing_m: float = 0.2
     wall_distance_m: float = 2.2
     look_around_rad: float = 0.3
     shake_m: float = 0.03
     shake_rad: float = 0.06
+    shake_hz: float = 1.0
+    speed_mps: float = 0.4  # of straight
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionOptions(MotionOptions):
+    """One recording: a single piece of motion, several of them one after the other, or a file."""
+
+    phases: tuple[MotionOptions, ...] = ()  # where there are any, they are the motion
+    trajectory: str = ""  # EuRoC or TUM file; where there is one, it is the motion
+    device: int = 0  # devices of other numbers have other deviations and ids
+
+    @property
+    def total_s(self) -> float:
+        """Length [s]; of a trajectory file the most that is used of it."""
+        if self.phases and not self.trajectory:
+            return sum(phase.duration_s for phase in self.phases)
+        return self.duration_s
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +250,10 @@ class Scenario:
     measurement: MeasurementOptions = MeasurementOptions()
     appearance: AppearanceOptions = AppearanceOptions()
     drift: DriftOptions = DriftOptions()
-    sessions: tuple[MotionOptions, ...] = (MotionOptions(),)
+    calibration: CalibrationOptions = CalibrationOptions()
+    other_sensors: OtherSensorOptions = OtherSensorOptions()
+    images: ImageOptions = ImageOptions()
+    sessions: tuple[SessionOptions, ...] = (SessionOptions(),)
 
     def with_seed(self, seed: int) -> Scenario:
         """Return the scenario with all four seeds exchanged."""
@@ -154,11 +270,17 @@ class Scenario:
                 accel_noise_density=zero,
                 gyro_bias_walk=zero,
                 accel_bias_walk=zero,
+                g_sensitivity=zero,
+                lever_arm_m=(zero, zero, zero),
+                warming_scale=zero,
+                time_offset_s=zero,
+                time_jitter_s=zero,
             ),
             measurement=dataclasses.replace(
                 self.measurement,
                 keypoint_sigma_px=zero,
                 identity_swap_share=zero,
+                track_drift_share=zero,
                 clutter_share=zero,
             ),
             drift=dataclasses.replace(
@@ -171,4 +293,5 @@ class Scenario:
                 gyro_bias_sigma=zero,
                 accel_bias_sigma=zero,
             ),
+            calibration=CalibrationOptions(),
         )

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from maplab_py.errors import UserError
+from maplab_py.errors import MapError, UserError
+from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.simulation.limits import check_scenario
 from maplab_py.simulation.scenario import Scenario
 
@@ -37,7 +38,12 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         raise UserError(
             f"there is no scenario '{name_or_path}': give a YAML file or one of {known}"
         )
-    return parse_scenario(path.read_text(encoding="utf-8"), path.name)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise UserError(f"cannot read {path}: {reason}") from None
+    return _with_absolute_paths(parse_scenario(text, path.name), path.parent)
 
 
 def parse_scenario(text: str, source: str) -> Scenario:
@@ -50,20 +56,36 @@ def parse_scenario(text: str, source: str) -> Scenario:
     Raises:
         UserError: The text has a mistake; names source and key.
     """
-    import yaml
-
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise UserError(f"{source}{where}: this is not YAML") from None
+        content = parse_yaml(text, source)
+    except MapError as error:
+        raise UserError(_syntax_error(source, error)) from None
     try:
         scenario: Scenario = _read(Scenario, content, "")
         check_scenario(scenario)
     except UserError as error:
         raise UserError(f"{source}: {error}") from None
     return scenario
+
+
+def _syntax_error(source: str, error: MapError) -> str:
+    """Say in a few words where the text ceases to be YAML."""
+    cause = error.__cause__
+    problem = getattr(cause, "problem", None) or "it cannot be read"
+    mark = getattr(cause, "problem_mark", None)
+    where = f", line {mark.line + 1}" if mark else ""
+    return f"{source}{where}: this is not YAML: {problem}"
+
+
+def _with_absolute_paths(scenario: Scenario, folder: Path) -> Scenario:
+    """Return the scenario with its trajectory files looked up beside the scenario file."""
+    sessions = tuple(
+        dataclasses.replace(session, trajectory=str(folder / session.trajectory))
+        if session.trajectory
+        else session
+        for session in scenario.sessions
+    )
+    return dataclasses.replace(scenario, sessions=sessions)
 
 
 def _read(kind: Any, value: Any, key: str) -> Any:

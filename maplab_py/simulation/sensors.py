@@ -1,52 +1,59 @@
-"""The sensors of a scenario as the map's sensor set."""
+"""Devices: the sensor set that the maps carry, and the true calibration, which differs."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
-from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, Projection, SensorSet
+from maplab_py.sensors import (
+    Camera,
+    CameraRig,
+    Distortion,
+    Imu,
+    ImuIntrinsics,
+    Projection,
+    SensorSet,
+)
 from maplab_py.sensors.sensor_set import Extrinsics
 from maplab_py.simulation.imu import intrinsics_of
 from maplab_py.simulation.scenario import CameraOptions, Scenario
 from maplab_py.vimap.ids import random_ids, to_hex
 
+F64 = NDArray[np.float64]
+
 # C looks along x of I: x_C = -y_I, y_C = -z_I, z_C = x_I
 _R_I_C_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_ID_STREAM, _DEVIATION_STREAM = 11, 13
+_SMALL_DENSITY = 1e-6
+"""An estimator needs some noise to weigh by, even where there is none."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SimulatedSensors:
-    """The sensor set and the ids in it; every session carries the same device."""
+class Device:
+    """What one device is believed to be, and what it truly is in one session."""
 
-    sensor_set: SensorSet
+    sensor_set: SensorSet  # as the map stores it
     imu_id: str
-    rig: CameraRig
+    rig: CameraRig  # as the map stores it
+    true_rig: CameraRig
+    true_imu: ImuIntrinsics
 
 
-def make_sensors(scenario: Scenario) -> SimulatedSensors:
-    """Build IMU and camera rig.
+def make_device(scenario: Scenario, number: int, session: int) -> Device:
+    """Build IMU and camera rig of a device as they are in a session.
 
-    Raises:
-        UserError: A camera model is unknown or has the wrong number of parameters.
+    Args:
+        scenario: Its `imu` and `cameras` are what the maps say.
+        number: Which device: ids and deviations depend on it.
+        session: Deviations depend on it by the calibration's session_share.
     """
-    rng = np.random.default_rng([scenario.seeds.world, _ID_STREAM])
+    seed = [scenario.seeds.world, _ID_STREAM, *([number] if number else [])]
+    rng = np.random.default_rng(seed)
     imu_id, rig_id, *camera_ids = (
         to_hex(words) for words in random_ids(2 + len(scenario.cameras), rng)
-    )
-    options = scenario.imu
-    imu = Imu(
-        imu_id,
-        acc_noise_density=options.accel_noise_density or _SMALL_DENSITY,
-        acc_bias_random_walk_noise_density=options.accel_bias_walk or _SMALL_DENSITY,
-        gyro_noise_density=options.gyro_noise_density or _SMALL_DENSITY,
-        gyro_bias_random_walk_noise_density=options.gyro_bias_walk or _SMALL_DENSITY,
-        gravity_magnitude_mps2=options.gravity_mps2,
-        intrinsics=intrinsics_of(options),
-        description="simulated IMU",
     )
     cameras = tuple(
         _camera(camera_id, row, camera)
@@ -54,35 +61,100 @@ def make_sensors(scenario: Scenario) -> SimulatedSensors:
     )
     T_I_C = np.stack([_mounting(camera) for camera in scenario.cameras])
     rig = CameraRig(rig_id, cameras, T_I_C, description="simulated camera rig")
+    imu = _stored_imu(scenario, imu_id)
     mounts = {
         imu_id: Extrinsics(imu_id, se3.identity()),
         rig_id: Extrinsics(imu_id, se3.identity()),
     }
-    return SimulatedSensors(SensorSet({imu_id: imu, rig_id: rig}, mounts), imu_id, rig)
+    deviation = _Deviation(scenario, number, session)
+    return Device(
+        SensorSet({imu_id: imu, rig_id: rig}, mounts),
+        imu_id,
+        rig,
+        deviation.of_rig(rig),
+        deviation.of_imu(imu.intrinsics or ImuIntrinsics()),
+    )
 
 
-_ID_STREAM = 11
-_SMALL_DENSITY = 1e-6
-"""An estimator needs some noise to weigh by, even where there is none."""
+class _Deviation:
+    """Draws how the true values differ, always in the same order."""
+
+    def __init__(self, scenario: Scenario, device: int, session: int) -> None:
+        """Seed by device and by session."""
+        self._options = scenario.calibration
+        base = [scenario.seeds.world, _DEVIATION_STREAM, device]
+        self._of_device = np.random.default_rng(base)
+        self._of_session = np.random.default_rng([*base, session + 1])
+
+    def _draw(self, size: int) -> F64:
+        lasting, passing = (
+            rng.standard_normal(size) for rng in (self._of_device, self._of_session)
+        )
+        return np.asarray(lasting + self._options.session_share * passing)
+
+    def of_rig(self, rig: CameraRig) -> CameraRig:
+        """Return the true cameras and where they truly sit."""
+        options = self._options
+        cameras, poses = [], []
+        for camera, T_I_C in zip(rig.cameras, rig.T_B_C, strict=True):
+            intrinsics = np.array(camera.intrinsics)
+            intrinsics[-4:-2] += options.focal_sigma_px * self._draw(2)
+            intrinsics[-2:] += options.centre_sigma_px * self._draw(2)
+            shape = len(camera.distortion_parameters)
+            distortion = camera.distortion_parameters + options.distortion_sigma * self._draw(shape)
+            cameras.append(
+                dataclasses.replace(camera, intrinsics=intrinsics, distortion_parameters=distortion)
+            )
+            turn = np.deg2rad(options.camera_rotation_sigma_deg) * self._draw(3)
+            move = options.camera_position_sigma_m * self._draw(3)
+            poses.append(se3.retract(T_I_C, np.concatenate([move, turn])))
+        return dataclasses.replace(rig, cameras=tuple(cameras), T_B_C=np.stack(poses))
+
+    def of_imu(self, stored: ImuIntrinsics) -> ImuIntrinsics:
+        """Return true scale, misalignment and rotation of the accelerometer."""
+        options = self._options
+        T_g = stored.T_g + self._triangle(options.gyro_scale_sigma, options.gyro_misalignment_sigma)
+        T_a = stored.T_a + self._triangle(
+            options.accel_scale_sigma, options.accel_misalignment_sigma
+        )
+        turn = np.deg2rad(options.accel_rotation_sigma_deg) * self._draw(3)
+        return ImuIntrinsics(T_g, T_a, stored.R_A_I @ so3.to_matrix(so3.exp(turn)))
+
+    def _triangle(self, scale_sigma: float, misalignment_sigma: float) -> F64:
+        matrix = np.diag(scale_sigma * self._draw(3))
+        matrix[[0, 0, 1], [1, 2, 2]] = misalignment_sigma * self._draw(3)
+        return matrix
+
+
+def _stored_imu(scenario: Scenario, imu_id: str) -> Imu:
+    options = scenario.imu
+    factor = scenario.calibration.imu_noise_factor
+    return Imu(
+        imu_id,
+        acc_noise_density=factor * options.accel_noise_density or _SMALL_DENSITY,
+        acc_bias_random_walk_noise_density=factor * options.accel_bias_walk or _SMALL_DENSITY,
+        gyro_noise_density=factor * options.gyro_noise_density or _SMALL_DENSITY,
+        gyro_bias_random_walk_noise_density=factor * options.gyro_bias_walk or _SMALL_DENSITY,
+        gravity_magnitude_mps2=options.gravity_mps2,
+        intrinsics=intrinsics_of(options),
+        description="simulated IMU",
+    )
 
 
 def _camera(camera_id: str, row: int, options: CameraOptions) -> Camera:
-    try:
-        return Camera(
-            camera_id,
-            Projection(options.projection),
-            Distortion(options.distortion),
-            np.asarray(options.intrinsics, dtype=np.float64),
-            np.asarray(options.distortion_parameters, dtype=np.float64),
-            options.width_px,
-            options.height_px,
-            topic=f"cam{row}",
-            description="simulated camera",
-        )
-    except ValueError as error:
-        raise UserError(f"scenario: cameras[{row}]: {error}") from None
+    return Camera(
+        camera_id,
+        Projection(options.projection),
+        Distortion(options.distortion),
+        np.asarray(options.intrinsics, dtype=np.float64),
+        np.asarray(options.distortion_parameters, dtype=np.float64),
+        options.width_px,
+        options.height_px,
+        topic=f"cam{row}",
+        description="simulated camera",
+    )
 
 
-def _mounting(options: CameraOptions) -> np.ndarray:
+def _mounting(options: CameraOptions) -> F64:
     q = so3.multiply(so3.exp(options.turn_rad), so3.from_matrix(_R_I_C_LEVEL))
     return se3.make(q, np.asarray(options.position_m, dtype=np.float64))

@@ -8,15 +8,24 @@ import numpy as np
 
 from maplab_py.progress import SILENT, Progress
 from maplab_py.simulation.appearance import make_appearance, make_session_appearance
+from maplab_py.simulation.recording import Recording, SessionSeeds, record
 from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.sensors import make_sensors
-from maplab_py.simulation.session import SessionSeeds, simulate_session
+from maplab_py.simulation.sensors import Device, make_device
+from maplab_py.simulation.session import session_map
 from maplab_py.simulation.truth import Truth
-from maplab_py.simulation.world import make_world
+from maplab_py.simulation.world import World, make_world
 from maplab_py.vimap import VIMap
 
-_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS = range(5)
+_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER = range(6)
 """Streams of random numbers; a session's number selects within a stream."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordedSession:
+    """What one session recorded, and with what."""
+
+    device: Device
+    recording: Recording
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,6 +34,8 @@ class SimulatedData:
 
     maps: list[VIMap]
     truth: Truth
+    world: World
+    recordings: list[RecordedSession]
 
 
 def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedData:
@@ -36,26 +47,29 @@ def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedDat
     """
     seeds = scenario.seeds
     world = make_world(scenario.world, _generator(seeds.world, _WORLD))
-    sensors = make_sensors(scenario)
     appearance = make_appearance(
-        scenario.appearance, len(world.p_G), _generator(seeds.appearance, _APPEARANCE)
+        scenario.appearance, world.look, _generator(seeds.appearance, _APPEARANCE)
     )
-    maps, truths = [], []
+    maps, truths, recordings = [], [], []
     for number in range(len(scenario.sessions)):
         progress.step(number, len(scenario.sessions), f"session {number + 1}")
         of_session = SessionSeeds(
             motion=_generator(seeds.motion, _MOTION, number),
             measurement=_generator(seeds.measurement, _MEASUREMENT, number),
             appearance=_generator(seeds.appearance, _APPEARANCE, number),
+            other=_generator(seeds.measurement, _OTHER, number),
             ids=np.random.default_rng(
                 [_IDS, number, *(int(seed) for seed in dataclasses.astuple(seeds))]
             ),
         )
         look = make_session_appearance(appearance, of_session.appearance)
-        vi_map, truth = simulate_session(scenario, number, world, sensors, look, of_session)
+        device = make_device(scenario, scenario.sessions[number].device, number)
+        recording = record(scenario, number, world, device, look, of_session)
+        vi_map, truth = session_map(scenario, world, device, recording, of_session)
         maps.append(vi_map)
         truths.append(truth)
-    return SimulatedData(maps, Truth.concatenate(truths))
+        recordings.append(RecordedSession(device, recording))
+    return SimulatedData(maps, Truth.concatenate(truths), world, recordings)
 
 
 def _generator(seed: int, stream: int, *session: int) -> np.random.Generator:

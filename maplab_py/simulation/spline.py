@@ -30,6 +30,12 @@ class MotionState:
     w_I: F64  # (N, 3) angular velocity in I [rad/s]
     alpha_I: F64  # (N, 3) angular acceleration in I [rad/s^2]
 
+    def take(self, rows: NDArray[np.int64]) -> MotionState:
+        """Return the motion at some of the times."""
+        return MotionState(
+            self.T_G_I[rows], self.v_G[rows], self.a_G[rows], self.w_I[rows], self.alpha_I[rows]
+        )
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseSpline:

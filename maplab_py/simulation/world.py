@@ -1,4 +1,4 @@
-"""Worlds: rooms in a row with landmarks on walls, floor, ceiling and furniture."""
+"""Worlds: rooms in a row or corridors around a block, with landmarks on their surfaces."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.simulation.moving_objects import MovingObject, make_moving_objects
 from maplab_py.simulation.scenario import WorldOptions
+from maplab_py.simulation.surfaces import Surfaces, box_surfaces, join, scatter
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 _DOOR_WIDTH_M = 2.0
 _DOOR_HEIGHT_M = 2.4
-_CLUSTER_SIZE_M = 0.5
-_CLUSTERS_PER_LANDMARK = 1.0 / 40.0
-_SURFACE_OFFSET_M = 1e-6
-"""Landmarks float this far off their surface, so that the surface does not hide them."""
+_THIN_M = 1e-7
+"""Half the thickness of walls and slabs that landmarks float in front of."""
+_STAIR_MARGIN_M = 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,39 +27,103 @@ class World:
 
     p_G: F64  # (L, 3)
     normal_G: F64  # (L, 3) unit, into the free space
+    look: I64  # (L,) landmarks of equal number look alike
     boxes: F64  # (B, 2, 3) lower and upper corners
-    extent_m: F64  # (3,) of all rooms together
-    centre_xy: F64  # (2,) of all rooms together
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Faces:
-    """Rectangles: corner + a * side_u + b * side_v with a, b in [0, 1]."""
-
-    corner: F64  # (F, 3)
-    side_u: F64  # (F, 3)
-    side_v: F64  # (F, 3)
-    normal: F64  # (F, 3)
+    bounds: F64  # (2, 3) lower and upper corner of everything
+    moving: I64  # (L,) number of the object that carries the landmark, -1 = none
+    objects: tuple[MovingObject, ...] = ()
 
 
 def make_world(options: WorldOptions, rng: np.random.Generator) -> World:
-    """Build the rooms and scatter landmarks on their surfaces."""
+    """Build the walls, scatter landmarks on their surfaces, and let objects move."""
+    if options.layout == "corridor":
+        world = _corridor(options, rng)
+    elif options.identical_rooms:
+        world = _identical_rooms(options, rng)
+    else:
+        world = _rooms(options, rng)
+    return _with_moving_objects(world, options, rng) if options.moving_objects else world
+
+
+def _with_moving_objects(world: World, options: WorldOptions, rng: np.random.Generator) -> World:
+    count = options.moving_objects
+    objects, p_G, normal_G = make_moving_objects(
+        count, options.landmarks_per_object, options.object_speed_mps, world.bounds, rng
+    )
+    first = int(world.look.max(initial=-1)) + 1
+    return World(
+        np.concatenate([world.p_G, p_G]),
+        np.concatenate([world.normal_G, normal_G]),
+        np.concatenate([world.look, first + np.arange(len(p_G))]),
+        world.boxes,
+        world.bounds,
+        np.concatenate([world.moving, np.repeat(np.arange(count), options.landmarks_per_object)]),
+        objects,
+    )
+
+
+def _standing(p_G: F64) -> I64:
+    return np.full(len(p_G), -1, dtype=np.int64)
+
+
+# -- rooms ----------------------------------------------------------------------------------------
+
+
+def _rooms(options: WorldOptions, rng: np.random.Generator) -> World:
     size = np.asarray(options.room_size_m, dtype=np.float64)
     points, normals, boxes = [], [], []
     for room in range(options.rooms):
-        low = np.array([(room - 0.5) * size[0], -0.5 * size[1], 0.0])
+        low = _corner_of_room(room, size)
         furniture = _furniture(options.furniture_per_room, low, size, rng)
-        p, n = _scatter(options, low, size, furniture, rng)
+        surfaces = _room_surfaces(low, size, furniture)
+        p, n = scatter(surfaces, options, options.landmarks_per_room, rng)
         keep = ~_in_doorway(p, room, options.rooms, size)
         points.append(p[keep])
         normals.append(n[keep])
         boxes.append(furniture)
-    boxes += [_dividing_walls(room, size) for room in range(1, options.rooms)]
-    extent = size * np.array([options.rooms, 1, 1])
-    centre = np.array([0.5 * (options.rooms - 1) * size[0], 0.0])
-    return World(
-        np.concatenate(points), np.concatenate(normals), np.concatenate(boxes), extent, centre
+    p_G = np.concatenate(points)
+    return _world_of_rooms(options, p_G, np.concatenate(normals), np.arange(len(p_G)), boxes)
+
+
+def _identical_rooms(options: WorldOptions, rng: np.random.Generator) -> World:
+    """Build one room, repeat it, and give each a few landmarks of its own."""
+    size = np.asarray(options.room_size_m, dtype=np.float64)
+    low = _corner_of_room(0, size)
+    furniture = _furniture(options.furniture_per_room, low, size, rng)
+    surfaces = _room_surfaces(low, size, furniture)
+    own = round(options.distinct_share * options.landmarks_per_room)
+    common_p, common_n = scatter(surfaces, options, options.landmarks_per_room - own, rng)
+    points, normals, looks, boxes = [], [], [], []
+    for room in range(options.rooms):
+        shift = np.array([room * size[0], 0.0, 0.0])
+        own_p, own_n = scatter(surfaces, options, own, rng)
+        p = np.concatenate([common_p, own_p]) + shift
+        first_own = len(common_p) + room * own
+        look = np.concatenate([np.arange(len(common_p)), np.arange(first_own, first_own + own)])
+        keep = ~_in_doorway(p, room, options.rooms, size)
+        points.append(p[keep])
+        normals.append(np.concatenate([common_n, own_n])[keep])
+        looks.append(look[keep])
+        boxes.append(furniture + shift)
+    return _world_of_rooms(
+        options, np.concatenate(points), np.concatenate(normals), np.concatenate(looks), boxes
     )
+
+
+def _world_of_rooms(
+    options: WorldOptions, p_G: F64, normal_G: F64, look: I64, boxes: list[F64]
+) -> World:
+    size = np.asarray(options.room_size_m, dtype=np.float64)
+    walls = [_dividing_walls(room, size) for room in range(1, options.rooms)]
+    low = _corner_of_room(0, size)
+    high = _corner_of_room(options.rooms - 1, size) + size
+    return World(
+        p_G, normal_G, look, np.concatenate([*boxes, *walls]), np.stack([low, high]), _standing(p_G)
+    )
+
+
+def _corner_of_room(room: int, size: F64) -> F64:
+    return np.array([(room - 0.5) * size[0], -0.5 * size[1], 0.0])
 
 
 def _furniture(count: int, low: F64, size: F64, rng: np.random.Generator) -> F64:
@@ -71,57 +137,9 @@ def _furniture(count: int, low: F64, size: F64, rng: np.random.Generator) -> F64
     return np.stack([corner, corner + np.stack([width, depth, height], axis=1)], axis=1)
 
 
-def _scatter(
-    options: WorldOptions, low: F64, size: F64, furniture: F64, rng: np.random.Generator
-) -> tuple[F64, F64]:
-    """Draw landmarks: a share of them in clusters, the others evenly over all surfaces."""
-    inside = _box_faces(low, low + size, inwards=True)
-    faces = _join([inside, *(_box_faces(b[0], b[1], inwards=False) for b in furniture)])
-    area = np.linalg.norm(np.cross(faces.side_u, faces.side_v), axis=1)
-    count = options.landmarks_per_room
-    face = rng.choice(len(area), count, p=area / area.sum())
-    place = rng.uniform(0.0, 1.0, (count, 2))
-    clusters = max(1, int(count * _CLUSTERS_PER_LANDMARK))
-    cluster = rng.integers(0, clusters, count)
-    clustered = rng.uniform(size=count) < options.patchiness
-    spread = rng.normal(0.0, _CLUSTER_SIZE_M, (count, 2))
-    face = np.where(clustered, face[cluster], face)
-    lengths = np.stack(
-        [np.linalg.norm(faces.side_u[face], axis=1), np.linalg.norm(faces.side_v[face], axis=1)],
-        axis=1,
-    )
-    near = place[cluster] + spread / lengths
-    place = np.where(
-        clustered[:, None] & np.all((near > 0.0) & (near < 1.0), axis=1)[:, None], near, place
-    )
-    points = (
-        faces.corner[face]
-        + place[:, :1] * faces.side_u[face]
-        + place[:, 1:] * faces.side_v[face]
-        + _SURFACE_OFFSET_M * faces.normal[face]
-    )
-    return points, faces.normal[face]
-
-
-def _box_faces(low: F64, high: F64, *, inwards: bool) -> _Faces:
-    """Return the six faces of a box with normals that look in or out."""
-    size = high - low
-    corners, sides_u, sides_v, normals = [], [], [], []
-    for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        for upper in (False, True):
-            corner = low.copy()
-            corner[axis] = high[axis] if upper else low[axis]
-            corners.append(corner)
-            sides_u.append(np.eye(3)[u] * size[u])
-            sides_v.append(np.eye(3)[v] * size[v])
-            normals.append(np.eye(3)[axis] * (1.0 if upper != inwards else -1.0))
-    return _Faces(np.array(corners), np.array(sides_u), np.array(sides_v), np.array(normals))
-
-
-def _join(parts: list[_Faces]) -> _Faces:
-    names = [field.name for field in dataclasses.fields(_Faces)]
-    return _Faces(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+def _room_surfaces(low: F64, size: F64, furniture: F64) -> Surfaces:
+    inside = box_surfaces(low, low + size, inwards=True)
+    return join([inside, *(box_surfaces(box[0], box[1], inwards=False) for box in furniture)])
 
 
 def _in_doorway(p: F64, room: int, rooms: int, size: F64) -> NDArray[np.bool_]:
@@ -138,29 +156,82 @@ def _in_doorway(p: F64, room: int, rooms: int, size: F64) -> NDArray[np.bool_]:
 
 def _dividing_walls(room: int, size: F64) -> F64:
     """Return the wall between two rooms as boxes (3, 2, 3) around its doorway."""
-    x, half, thin = (room - 0.5) * size[0], 0.5 * size[1], 1e-7
+    x, half = (room - 0.5) * size[0], 0.5 * size[1]
     door = 0.5 * _DOOR_WIDTH_M
     return np.array(
         [
-            [[x - thin, -half, 0.0], [x + thin, -door, size[2]]],
-            [[x - thin, door, 0.0], [x + thin, half, size[2]]],
-            [[x - thin, -door, _DOOR_HEIGHT_M], [x + thin, door, size[2]]],
+            [[x - _THIN_M, -half, 0.0], [x + _THIN_M, -door, size[2]]],
+            [[x - _THIN_M, door, 0.0], [x + _THIN_M, half, size[2]]],
+            [[x - _THIN_M, -door, _DOOR_HEIGHT_M], [x + _THIN_M, door, size[2]]],
         ]
     )
 
 
-def is_hidden(boxes: F64, eye: F64, point: F64) -> NDArray[np.bool_]:
-    """Tell which lines of sight from eyes (N, 3) to points (N, 3) cross a box.
+# -- corridors ------------------------------------------------------------------------------------
 
-    The slab test of Kay and Kajiya (1986), one box at a time.
-    """
-    hidden = np.zeros(len(eye), dtype=np.bool_)
-    direction = point - eye
-    direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    inverse = 1.0 / direction
-    for low, high in boxes:
-        a, b = (low - eye) * inverse, (high - eye) * inverse
-        enters = np.minimum(a, b).max(axis=1)
-        leaves = np.maximum(a, b).min(axis=1)
-        hidden |= (enters < leaves) & (leaves > 0.0) & (enters < 1.0 - 1e-9)
-    return hidden
+
+def stair_half_length(options: WorldOptions) -> float:
+    """Return half the length [m] of the stairs in the two sides of a corridor along y."""
+    return 0.5 * (options.room_size_m[1] - 3.0 * options.corridor_width_m)
+
+
+def _corridor(options: WorldOptions, rng: np.random.Generator) -> World:
+    size = np.asarray(options.room_size_m, dtype=np.float64)
+    half, width = 0.5 * size[:2], options.corridor_width_m
+    top = options.floors * size[2]
+    block = np.array([[*(width - half), 0.0], [*(half - width), top]])
+    points, normals = [], []
+    for floor in range(options.floors):
+        low = np.array([-half[0], -half[1], floor * size[2]])
+        high = np.array([half[0], half[1], (floor + 1) * size[2]])
+        outer = box_surfaces(low, high, inwards=True)
+        inner = box_surfaces(
+            np.array([*block[0, :2], low[2]]), np.array([*block[1, :2], high[2]]), inwards=False
+        )
+        walls = join([outer, _first(inner, 4)])
+        p, n = scatter(walls, options, options.landmarks_per_room, rng)
+        keep = ~_in_block(p, block) & ~_in_stairwell(p, n, floor, options)
+        points.append(p[keep])
+        normals.append(n[keep])
+    p_G = np.concatenate(points)
+    slabs = [_slab(floor * size[2], options) for floor in range(1, options.floors)]
+    bounds = np.array([[-half[0], -half[1], 0.0], [half[0], half[1], top]])
+    boxes = np.concatenate([block[None], *slabs])
+    return World(p_G, np.concatenate(normals), np.arange(len(p_G)), boxes, bounds, _standing(p_G))
+
+
+def _first(surfaces: Surfaces, count: int) -> Surfaces:
+    return Surfaces(
+        surfaces.corner[:count],
+        surfaces.side_u[:count],
+        surfaces.side_v[:count],
+        surfaces.normal[:count],
+    )
+
+
+def _in_block(p: F64, block: F64) -> NDArray[np.bool_]:
+    """Tell which points of floor and ceiling lie inside the block."""
+    return np.asarray(np.all((p[:, :2] > block[0, :2]) & (p[:, :2] < block[1, :2]), axis=1))
+
+
+def _in_stairwell(p: F64, normal: F64, floor: int, options: WorldOptions) -> NDArray[np.bool_]:
+    """Tell which points hang in an opening between two floors."""
+    in_well = np.abs(p[:, 1]) < stair_half_length(options) + _STAIR_MARGIN_M
+    in_well &= np.abs(p[:, 0]) > 0.5 * options.room_size_m[0] - options.corridor_width_m
+    open_below = (normal[:, 2] > 0.5) & (floor > 0)
+    open_above = (normal[:, 2] < -0.5) & (floor + 1 < options.floors)
+    return np.asarray(in_well & (open_below | open_above))
+
+
+def _slab(z: float, options: WorldOptions) -> F64:
+    """Return the ceiling between two floors of the corridor as boxes (6, 2, 3)."""
+    x, y = 0.5 * options.room_size_m[0], 0.5 * options.room_size_m[1]
+    width = options.corridor_width_m
+    well = stair_half_length(options) + _STAIR_MARGIN_M
+    rectangles = [[-x, -y, x, width - y], [-x, y - width, x, y]]
+    for side in (-1.0, 1.0):
+        low, high = sorted((side * x, side * (x - width)))
+        rectangles += [[low, width - y, high, -well], [low, well, high, y - width]]
+    low_high = np.array(rectangles).reshape(-1, 2, 2)
+    heights = np.broadcast_to(np.array([z - _THIN_M, z + _THIN_M]), (len(low_high), 2))
+    return np.concatenate([low_high, heights[:, :, None]], axis=2)

@@ -27,16 +27,22 @@ def evaluate_trajectory(
     """Compare the vertices with a ground-truth trajectory: APE, Sim(3) APE and scale, RPE.
 
     Args:
-        ground_truth: TUM, EuRoC or CSV file with stamped poses.
+        ground_truth: TUM, EuRoC or CSV file with stamped poses, or the truth.npz of `simulate`.
         map_mission: Mission id or unambiguous prefix; empty = all missions together.
         map_mission_list: Several missions, separated by commas.
     """
     from maplab_py.algorithms.evaluation import trajectory_evaluation
     from maplab_py.interop.trajectories import read_trajectory
 
+    if ground_truth.suffix == ".npz":
+        from maplab_py.simulation.truth import Truth
+
+        truth = Truth.load(ground_truth).trajectory(str(ground_truth))
+    else:
+        truth = read_trajectory(ground_truth)
     return trajectory_evaluation.evaluate_trajectory(
         context.vi_map,
-        read_trajectory(ground_truth),
+        truth,
         options,
         missions=context.mission_rows(map_mission, map_mission_list),
         progress=context.progress,

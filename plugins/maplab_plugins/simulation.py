@@ -56,6 +56,7 @@ class SimulatedMaps(Report):
 
     maps: tuple[SimulatedMap, ...]
     truth: Path
+    raw_data: tuple[Path, ...]  # EuRoC folders
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +115,7 @@ def list_scenarios(context: CommandContext) -> ScenarioList:  # noqa: ARG001
     lines = []
     for name in scenario_names():
         scenario = load_scenario(name)
-        seconds = sum(session.duration_s for session in scenario.sessions)
+        seconds = sum(session.total_s for session in scenario.sessions)
         lines.append(ScenarioLine(name, len(scenario.sessions), seconds, scenario.description))
     return ScenarioList(tuple(lines))
 
@@ -123,6 +124,7 @@ def list_scenarios(context: CommandContext) -> ScenarioList:  # noqa: ARG001
     "simulate",
     example="simulate --scenario=three_sessions --seed=7 --map_folder=simulated",
     needs_map=False,
+    acts_outside=True,
     see_also=("list_scenarios", "evaluate_map", "load_merge_all_maps"),
 )
 def simulate(
@@ -131,6 +133,7 @@ def simulate(
     map_folder: Path,
     scenario: str = _DEMO_SCENARIO,
     seed: int | None = None,
+    raw_data: bool = False,
     overwrite: bool = False,
 ) -> SimulatedMaps:
     """Simulate sessions with known truth and write one map per session.
@@ -139,6 +142,8 @@ def simulate(
         map_folder: Folder that gets the maps session_1, session_2, ... and the file truth.npz.
         scenario: Name of a scenario (see list_scenarios), or a YAML file.
         seed: Seed of everything random; empty = the scenario's own.
+        raw_data: Also write EuRoC folders, raw/session_1/mav0, ... with IMU, cameras and, if the
+            scenario has `images: {render: true}`, images; their truth goes to the folder truth.
         overwrite: Replace maps that are there already.
     """
     from maplab_py.simulation.scenario_file import load_scenario
@@ -157,7 +162,14 @@ def simulate(
         counts = len(vi_map.vertices), len(vi_map.keypoints), len(vi_map.landmarks)
         lines.append(SimulatedMap(folder, *counts))
     data.truth.save(map_folder / TRUTH_FILE)
-    return SimulatedMaps(tuple(lines), map_folder / TRUTH_FILE)
+    folders: list[Path] = []
+    if raw_data:
+        from maplab_py.simulation.raw_data import write_raw_data
+
+        folders = write_raw_data(
+            description, data, map_folder, overwrite=overwrite, progress=context.progress
+        )
+    return SimulatedMaps(tuple(lines), map_folder / TRUTH_FILE, tuple(folders))
 
 
 @command("evaluate_map", example="evaluate_map --truth=simulated/truth.npz", see_also=("simulate",))
@@ -173,7 +185,13 @@ def evaluate_map(context: CommandContext, *, truth: Path) -> MapErrors:
     return evaluate(context.vi_map, Truth.load(truth))
 
 
-@command("demo", example="demo --map_folder=maplab_demo", needs_map=False, see_also=("simulate",))
+@command(
+    "demo",
+    example="demo --map_folder=maplab_demo",
+    needs_map=False,
+    acts_outside=True,
+    see_also=("simulate",),
+)
 def demo(
     context: CommandContext,
     *,

@@ -48,6 +48,17 @@ def test_simulated_maps_are_evaluated_against_their_truth(tmp_path: Path, scenar
     assert errors.ate_m > errors.ate_each_m > 0.0
 
 
+def test_trajectories_are_evaluated_against_the_truth_file(tmp_path: Path, scenario: Path) -> None:
+    session = Session()
+    report = session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "out")
+    session.run("load", map_folder=tmp_path / "out" / "session_2")
+    errors = session.run("evaluate_map", truth=report.truth)
+    trajectory = session.run("evaluate_trajectory", ground_truth=report.truth)
+    assert trajectory.matched == 13
+    assert trajectory.ape_m.rmse == pytest.approx(errors.ate_m, rel=1e-6)
+    assert trajectory.scale is not None
+
+
 def test_seed_changes_the_data_and_repeats_it(tmp_path: Path, scenario: Path) -> None:
     session = Session()
     maps = []

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from maplab_py.simulation.appearance import describe, make_appearance, make_session_appearance
 from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions
-from tests.simulation.small import simulated
+from tests.simulation.small import docs_script, simulated
+from tests.support.data import REPOSITORY, shared_data
 
 COUNT = 400
 
@@ -23,6 +25,7 @@ def _detections(view: list[float], distance: float) -> Detections:
         uv_px=np.zeros((COUNT, 2)),
         view_G=np.tile(direction, (COUNT, 1)),
         distance_m=np.full(COUNT, distance),
+        octave=np.zeros(COUNT, dtype=np.int64),
     )
 
 
@@ -31,7 +34,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_distances_grow_with_view_scale_and_session() -> None:
-    world = make_appearance(AppearanceOptions(), COUNT, np.random.default_rng(0))
+    world = make_appearance(AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     other = make_session_appearance(world, np.random.default_rng(2))
     rng = np.random.default_rng(3)
@@ -51,7 +54,7 @@ def test_distances_grow_with_view_scale_and_session() -> None:
 
 
 def test_bits_are_correlated() -> None:
-    world = make_appearance(AppearanceOptions(), COUNT, np.random.default_rng(0))
+    world = make_appearance(AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
     bits = np.unpackbits(found, axis=1).astype(np.float64)
@@ -62,14 +65,16 @@ def test_bits_are_correlated() -> None:
 
 
 def test_share_that_vanishes() -> None:
-    world = make_appearance(AppearanceOptions(vanish_share=0.3), 5000, np.random.default_rng(0))
+    world = make_appearance(
+        AppearanceOptions(vanish_share=0.3), np.arange(5000), np.random.default_rng(0)
+    )
     session = make_session_appearance(world, np.random.default_rng(1))
     assert abs(np.mean(session.is_there) - 0.7) < 0.03
 
 
 def test_length_of_the_descriptor() -> None:
     options = AppearanceOptions(descriptor_bytes=64)
-    world = make_appearance(options, COUNT, np.random.default_rng(0))
+    world = make_appearance(options, np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
     assert found.shape == (COUNT, 64)
@@ -93,3 +98,21 @@ def test_distances_are_those_of_recorded_maps() -> None:
     assert 165 < np.median(different) < 190
     assert 110 < np.percentile(different, 1) < 140
     assert np.percentile(same, 99) > np.percentile(different, 1)
+
+
+@pytest.mark.slow
+def test_distances_share_their_histograms_with_those_of_recorded_maps() -> None:
+    folders = [
+        shared_data("maplab_maps/tango_handheld"),
+        *sorted(shared_data("maplab_maps/euroc_v1_01").iterdir()),
+    ]
+    script = docs_script("compare_descriptors")
+    recorded, simulated_bits = script.recorded_distances(folders), script.simulated_distances()
+    for kind in ("same", "different"):
+        common = script.overlap(
+            script.histogram(recorded[kind]), script.histogram(simulated_bits[kind])
+        )
+        # the recorded maps share 0.88 and 0.90 with each other
+        assert common > 0.88
+    figure = (REPOSITORY / "docs/images/descriptor_distances.svg").read_text()
+    assert figure == script.drawing(recorded, simulated_bits)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
 from maplab_py.errors import UserError
+from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario, parse_scenario, scenario_names
 
 
@@ -18,7 +20,10 @@ def test_named_scenarios_load(name: str) -> None:
 
 
 def test_there_are_the_promised_scenarios() -> None:
-    assert {"single_session", "three_sessions", "four_sessions"} <= set(scenario_names())
+    wanted = {"single_session", "three_sessions", "four_sessions", "aliased_rooms", "ar_room"}
+    wanted |= {"navigation", "degenerate", "large", "false_loop_edges"}
+    wanted |= {"stereo_room"}
+    assert wanted <= set(scenario_names())
 
 
 def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
@@ -37,7 +42,7 @@ def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
         ("imu: {rate_hz: fast}", "imu.rate_hz: a number is wanted, not 'fast'"),
         ("imu: {rate_hz: true}", "imu.rate_hz: a number is wanted, not True"),
         ("imu: {rate_hz: -1}", "imu.rate_hz: must be greater than 0, not -1"),
-        ("imu: {rate_hz: .nan}", "imu.rate_hz: must be greater than 0, not nan"),
+        ("imu: {rate_hz: .nan}", "imu.rate_hz: must be a number up to 1e.06, not nan"),
         ("imu: 3", "imu: a mapping of keys is wanted, not 3"),
         ("[1, 2]", "the file: a mapping of keys is wanted"),
         ("", "the file: a mapping of keys is wanted, not None"),
@@ -55,9 +60,42 @@ def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
         ("sessions: [{wall_distance_m: 5}]", r"sessions\[0\].wall_distance_m: leaves no room"),
         ("cameras: [{distortion: fish}]", r"cameras\[0\].distortion: must be one of none"),
         ("cameras: [{intrinsics: [1]}]", r"cameras\[0\].intrinsics: 4 values are wanted, not 1"),
+        ("world: {layout: tower}", "world.layout: must be one of rooms, corridor, not 'tower'"),
+        ("world: {layout: corridor, corridor_width_m: 3}", "world.corridor_width_m: must not"),
+        (
+            "world: {layout: corridor, corridor_width_m: 2}",
+            r"sessions\[0\].kind: the corridor layout has no room for",
+        ),
+        ("sessions: [{kind: corridor}]", r"sessions\[0\].kind: corridor needs world.layout"),
+        ("sessions: [{room: 1}]", r"sessions\[0\].room: must be from 0 to 0"),
+        ("sessions: [{device: -1}]", r"sessions\[0\].device: must be 0 or greater"),
+        ("sessions: [{shake_hz: 0}]", r"sessions\[0\].shake_hz: must be greater than 0"),
+        (
+            "sessions: [{phases: [{}, {duraton_s: 1}]}]",
+            r"sessions\[0\].phases\[1\].duraton_s: unknown key; did you mean",
+        ),
+        ("sessions: [{phases: [{turns: 0}]}]", r"sessions\[0\].phases\[0\].turns: must not be 0"),
+        ("calibration: {focal_sigma_px: -1}", "calibration.focal_sigma_px: must be 0 or greater"),
+        ("drift: {baseframe_offset_m: -1}", "drift.baseframe_offset_m: must be 0 or greater"),
+        ("drift: {tilt_sigma_deg: .inf}", "drift.tilt_sigma_deg: must be a number up to"),
+        (
+            "cameras: [{position_m: [0, .nan, 0]}]",
+            r"cameras\[0\].position_m\[1\]: must be a number",
+        ),
+        ("sessions: [{duration_s: 900000}]", r"sessions\[0\].duration_s: gives more than 10000000"),
+        (
+            "measurement: {max_view_angle_deg: 91}",
+            "measurement.max_view_angle_deg: must be greater",
+        ),
+        ("measurement: {min_track_length: 1}", "measurement.min_track_length: must be at least 2"),
+        ("imu: {time_offset_s: 0.06}", "imu.time_offset_s: must lie between"),
+        ("imu: {time_jitter_s: 0.01}", "imu.time_jitter_s: must not exceed a tenth"),
+        ("cameras: [{line_delay_s: 0.001}]", r"cameras\[0\].line_delay_s: reads longer than"),
         ("appearance: {vanish_share: 2}", "appearance.vanish_share: must be between 0 and 1"),
         ("measurement: {frame_rate_hz: 500}", "measurement.frame_rate_hz: must not exceed"),
-        ("name: [", "line 1: this is not YAML"),
+        ("name: [", "line 1: this is not YAML: expected the node content"),
+        ("imu: {rate_hz: 1, rate_hz: 2}", "this is not YAML: key 'rate_hz' twice, line 1"),
+        ("world:\n\trooms: 1", "line 2: this is not YAML: found character"),
     ],
 )
 def test_mistakes_name_the_key(text: str, message: str) -> None:
@@ -69,3 +107,35 @@ def test_mistakes_name_the_key(text: str, message: str) -> None:
 def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(UserError, match=r"no scenario 'nowhere'.*three_sessions"):
         load_scenario("nowhere")
+
+
+def test_small_numbers_may_be_written_with_an_exponent() -> None:
+    scenario = parse_scenario("imu: {gyro_noise_density: 1e-4}", "here.yaml")
+    assert scenario.imu.gyro_noise_density == 1e-4
+
+
+def _numbers(kind: type, prefix: str = "") -> list[str]:
+    """Return the keys of all numbers of a scenario outside lists."""
+    keys = []
+    for field in dataclasses.fields(kind):
+        value = getattr(kind(), field.name)
+        if dataclasses.is_dataclass(value):
+            keys += _numbers(type(value), f"{prefix}{field.name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            keys.append(prefix + field.name)
+    return keys
+
+
+@pytest.mark.parametrize("key", _numbers(Scenario))
+@pytest.mark.parametrize("value", ["some", "null", "true", "[]", "{}", ".nan", ".inf", "1.0e+300"])
+def test_no_number_takes_what_is_none(key: str, value: str) -> None:
+    group, name = key.split(".")
+    with pytest.raises(UserError, match=rf"^here\.yaml: {group}\.{name}: ") as caught:
+        parse_scenario(f"{group}: {{{name}: {value}}}", "here.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_bytes(b"name: \xff\xfe")
+    with pytest.raises(UserError, match=r"cannot read .*bad\.yaml: it is not UTF-8 text"):
+        load_scenario(tmp_path / "bad.yaml")

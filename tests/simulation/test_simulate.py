@@ -10,7 +10,7 @@ import pytest
 
 from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
-from maplab_py.simulation.scenario import CameraOptions, MotionOptions, Scenario, Seeds
+from maplab_py.simulation.scenario import CameraOptions, Scenario, Seeds, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.vimap import VIMap
@@ -181,9 +181,10 @@ def test_clutter_and_broken_tracks() -> None:
 @pytest.mark.slow
 def test_long_session_takes_at_most_20_seconds() -> None:
     scenario = load_scenario("single_session")
-    start = time.perf_counter()
+    # processor time: others may be at work on the machine
+    start = time.process_time()
     data = simulate(scenario)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     vi_map = data.maps[0]
     assert len(vi_map.vertices) == 1201
     assert np.mean(vi_map.frames.keypoint_count) > 500
@@ -191,7 +192,7 @@ def test_long_session_takes_at_most_20_seconds() -> None:
 
 
 def test_straight_turns_in_both_directions() -> None:
-    forward = MotionOptions(duration_s=4.0, turns=0.3)
+    forward = SessionOptions(duration_s=4.0, turns=0.3)
     scenario = Scenario(sessions=(forward, dataclasses.replace(forward, reverse=True)))
     truth = simulate(dataclasses.replace(SMALL, sessions=scenario.sessions)).truth
     angle = [

@@ -8,7 +8,7 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.simulation.motion import motion_spline
-from maplab_py.simulation.scenario import MOTION_KINDS, MotionOptions
+from maplab_py.simulation.scenario import MOTION_KINDS, SessionOptions, WorldOptions
 from maplab_py.simulation.spline import PoseSpline
 
 STEP_S = 1e-3
@@ -22,8 +22,9 @@ def _random_spline(seed: int) -> PoseSpline:
 
 
 def _room_spline(kind: str) -> PoseSpline:
-    room = np.array([10.0, 8.0, 3.5])
-    return motion_spline(MotionOptions(kind=kind), room, np.random.default_rng(3))
+    layout = "corridor" if kind == "corridor" else "rooms"
+    world = WorldOptions(layout=layout, floors=2, room_size_m=(20.0, 16.0, 3.5))
+    return motion_spline(SessionOptions(kind=kind), world, np.random.default_rng(3))
 
 
 SPLINES = [_random_spline(0), _random_spline(1), *(_room_spline(kind) for kind in MOTION_KINDS)]

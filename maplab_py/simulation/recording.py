@@ -1,0 +1,176 @@
+"""What the sensors of one session record."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3
+from maplab_py.simulation.appearance import SessionAppearance, describe
+from maplab_py.simulation.detection import CameraPoses, Detections, detect
+from maplab_py.simulation.drift import DriftedStates, drift
+from maplab_py.simulation.imu import ImuRecording, measure
+from maplab_py.simulation.motion import check_free_way, motion_spline
+from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.sensors import Device
+from maplab_py.simulation.spline import MotionState, PoseSpline
+from maplab_py.simulation.world import World
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_EPOCH_NS = 1_600_000_000_000_000_000
+_SESSION_GAP_NS = 3_600_000_000_000
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SessionSeeds:
+    """One generator per kind of chance."""
+
+    motion: np.random.Generator
+    measurement: np.random.Generator
+    appearance: np.random.Generator
+    other: np.random.Generator
+    ids: np.random.Generator
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recording:
+    """Everything that was recorded, at the V vertices unless said otherwise."""
+
+    time_ns: I64  # (V,)
+    motion: MotionState
+    states: DriftedStates
+    imu_time_ns: I64  # (S,) of all samples
+    imu_motion: MotionState  # at all samples
+    imu: ImuRecording  # of all samples
+    imu_row: I64  # (V,) sample at the vertex
+    keypoints: Detections  # of all cameras; `frame` counts vertex * cameras + camera
+    descriptors: NDArray[np.uint8]
+    spline: PoseSpline  # the true motion
+    frame_s: F64  # (V,) time of the images on the spline
+
+
+def record(
+    scenario: Scenario,
+    number: int,
+    world: World,
+    device: Device,
+    appearance: SessionAppearance,
+    seeds: SessionSeeds,
+) -> Recording:
+    """Move the device through the world and record what it measures.
+
+    Args:
+        scenario: The whole scenario.
+        number: Which of its sessions.
+        world: The world that all sessions share.
+        device: What the session is recorded with.
+        appearance: How the world looks in this session.
+        seeds: Generators of this session.
+
+    Raises:
+        UserError: The motion leads out of the world or through a wall.
+    """
+    options = scenario.sessions[number]
+    spline = motion_spline(options, scenario.world, seeds.motion)
+    check_free_way(spline, world, f"sessions[{number}]")
+    clock = _Clock.of(scenario, options.total_s)
+    imu_motion = spline.evaluate(clock.sample_s + clock.lead_s)
+    felt = imu_motion
+    if scenario.imu.time_offset_s != 0.0:
+        felt = spline.evaluate(clock.sample_s + clock.lead_s - scenario.imu.time_offset_s)
+    imu = measure(scenario.imu, device.true_imu, felt, seeds.measurement)
+    motion = spline.evaluate(clock.sample_s[clock.frame_row] + clock.lead_s)
+    states = drift(scenario.drift, motion, clock.sample_s[clock.frame_row], seeds.measurement)
+    found = _detect_all(scenario, world, device, spline, clock, appearance, seeds)
+    kept, stamp_ns = _stamps(scenario, clock, seeds.other)
+    begin_ns = _EPOCH_NS + number * _SESSION_GAP_NS
+    return Recording(
+        begin_ns + stamp_ns[clock.frame_row],
+        motion,
+        states,
+        begin_ns + stamp_ns[kept],
+        imu_motion.take(kept),
+        imu.take(kept),
+        np.searchsorted(kept, clock.frame_row),
+        found,
+        describe(appearance, found, seeds.appearance),
+        spline,
+        clock.sample_s[clock.frame_row] + clock.lead_s,
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Clock:
+    """When samples and images are taken, counted from the session's begin."""
+
+    sample_s: F64  # (S,)
+    frame_row: I64  # (V,) sample at each image
+    lead_s: float  # motion before the begin, for what is measured late
+
+    @classmethod
+    def of(cls, scenario: Scenario, seconds: float) -> _Clock:
+        rate, frame_rate = scenario.imu.rate_hz, scenario.measurement.frame_rate_hz
+        readout = max(abs(c.line_delay_s) * c.height_px for c in scenario.cameras)
+        lead = max(abs(scenario.imu.time_offset_s), readout)
+        samples = int(np.floor((seconds - 2.0 * lead) * rate + 1e-6)) + 1
+        frames = int(np.floor((seconds - 2.0 * lead) * frame_rate + 1e-6)) + 1
+        row = np.unique(np.minimum(np.round(np.arange(frames) * rate / frame_rate), samples - 1))
+        return cls(np.arange(samples) / rate, row.astype(np.int64), lead)
+
+
+def _stamps(scenario: Scenario, clock: _Clock, rng: np.random.Generator) -> tuple[I64, I64]:
+    """Return the samples (S',) that are not lost, and the time stamps (S,) [ns] of all.
+
+    Those at the images are neither lost nor stamped wrongly: a map has one at each vertex.
+    """
+    options = scenario.imu
+    count = len(clock.sample_s)
+    stamp_ns = np.round(clock.sample_s * 1e9).astype(np.int64)
+    is_kept = np.ones(count, dtype=np.bool_)
+    if options.dropped_share > 0.0:
+        is_kept = rng.uniform(size=count) >= options.dropped_share
+    if options.time_jitter_s > 0.0:
+        jitter = np.clip(rng.standard_normal(count), -3.0, 3.0) * options.time_jitter_s * 1e9
+        jitter[clock.frame_row] = 0.0
+        stamp_ns = stamp_ns + np.round(jitter).astype(np.int64)
+    is_kept[clock.frame_row] = True
+    return np.flatnonzero(is_kept), stamp_ns
+
+
+def _detect_all(
+    scenario: Scenario,
+    world: World,
+    device: Device,
+    spline: PoseSpline,
+    clock: _Clock,
+    appearance: SessionAppearance,
+    seeds: SessionSeeds,
+) -> Detections:
+    """Detect with every camera; images and tracks are numbered over all cameras."""
+    cameras = device.true_rig.cameras
+    time_s = clock.sample_s[clock.frame_row] + clock.lead_s
+    T_G_I = spline.evaluate(time_s).T_G_I
+    parts, tracks = [], 0
+    for row, camera in enumerate(cameras):
+        T_I_C = device.true_rig.T_B_C[row]
+
+        def at_time(time: F64, T_I_C: F64 = T_I_C) -> F64:
+            return se3.compose(spline.evaluate(time).T_G_I, T_I_C)
+
+        delay = scenario.cameras[row].line_delay_s
+        poses = CameraPoses(time_s, se3.compose(T_G_I, T_I_C), delay, at_time)
+        found = detect(
+            camera, poses, world, appearance.is_there, scenario.measurement, seeds.measurement
+        )
+        track = np.where(found.track >= 0, found.track + tracks, -1)
+        tracks = max(tracks, int(track.max(initial=-1)) + 1)
+        frame = found.frame * len(cameras) + row
+        parts.append(dataclasses.replace(found, frame=frame, track=track))
+    names = [field.name for field in dataclasses.fields(Detections)]
+    joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
+    order = np.argsort(joined["frame"], kind="stable")
+    return Detections(**{n: column[order] for n, column in joined.items()})

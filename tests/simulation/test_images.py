@@ -1,0 +1,269 @@
+"""Rendered images agree with depth, geometry and OpenCV; raw data are EuRoC folders."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from maplab_py.console.session import Session
+from maplab_py.errors import UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.imu_csv import read_imu_csv
+from maplab_py.interop.trajectories import read_trajectory
+from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.sensors.projection import back_project
+from maplab_py.simulation.cameras import pixels_of
+from maplab_py.simulation.imaging import Imager
+from maplab_py.simulation.mesh import write_mesh
+from maplab_py.simulation.raw_data import write_raw_data
+from maplab_py.simulation.rendering import Scene, make_scene, pixel_rays
+from maplab_py.simulation.scenario import (
+    CalibrationOptions,
+    CameraOptions,
+    ImageOptions,
+    MeasurementOptions,
+    Scenario,
+    SessionOptions,
+    WorldOptions,
+)
+from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.simulate import SimulatedData, simulate
+
+SMALL_CAMERA = CameraOptions(
+    intrinsics=(190.0, 190.0, 188.0, 120.0), width_px=376, height_px=240, position_m=(0.05, 0.06, 0.0)
+)  # fmt: skip
+STEREO = Scenario(
+    world=WorldOptions(rooms=2, landmarks_per_room=1500),
+    cameras=(SMALL_CAMERA, dataclasses.replace(SMALL_CAMERA, position_m=(0.05, -0.06, 0.0))),
+    measurement=MeasurementOptions(
+        frame_rate_hz=2.0, keypoint_sigma_px=0.0, clutter_share=0.0, identity_swap_share=0.0
+    ),
+    calibration=CalibrationOptions(focal_sigma_px=3.0, camera_rotation_sigma_deg=1.0),
+    images=ImageOptions(render=True, blur_samples=1, noise_sigma=0.0, gain_swing=0.0, vignette=0.0),
+    sessions=(SessionOptions(kind="loop", duration_s=2.0, turns=0.05),),
+)
+
+
+@cache
+def data() -> SimulatedData:
+    return simulate(STEREO)
+
+
+@cache
+def scene() -> Scene:
+    world = data().world
+    return make_scene(world.bounds, world.boxes, 0.01, np.random.default_rng(0))
+
+
+def _imager(row: int, **changes: float) -> Imager:
+    session = data().recordings[0]
+    T_I_C = session.device.true_rig.T_B_C[row]
+    options = dataclasses.replace(STEREO.images, **changes)
+
+    def at_time(time_s: np.ndarray) -> np.ndarray:
+        return se3.compose(session.recording.spline.evaluate(time_s).T_G_I, T_I_C)
+
+    return Imager.of(scene(), session.device.true_rig.cameras[row], options, 0.0, at_time)
+
+
+def _image(row: int, time_s: float = 1.0, **changes: float) -> tuple[np.ndarray, np.ndarray]:
+    return _imager(row, **changes).image(time_s, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("distortion", "parameters"),
+    [
+        (Distortion.NONE, []),
+        (Distortion.RADTAN, [-0.28, 0.07, 2e-4, 2e-5]),
+        (Distortion.EQUIDISTANT, [-0.02, 0.01, -0.006, 0.001]),
+        (Distortion.FOV, [0.92]),
+    ],
+)
+def test_rays_of_pixels_meet_their_pixels(distortion: Distortion, parameters: list[float]) -> None:
+    camera = Camera(
+        "0" * 32, Projection.PINHOLE, distortion, np.array([95.0, 95.0, 94.0, 60.0]),
+        np.array(parameters), 188, 120,
+    )  # fmt: skip
+    rays = pixel_rays(camera)
+    seen = np.isfinite(rays[..., 0])
+    assert seen.mean() > 0.95
+    v, u = np.nonzero(seen)
+    points = np.concatenate([rays[seen], np.ones((len(u), 1))], axis=1)
+    np.testing.assert_allclose(pixels_of(camera, points), np.stack([u, v], axis=1), atol=1e-6)
+    expected, valid = back_project(camera, np.stack([u, v], axis=1))
+    turned = np.cross(points, expected)[valid] / np.linalg.norm(points[valid], axis=1)[:, None]
+    assert np.abs(turned).max() < 1e-7
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_depth_is_that_of_the_landmarks(row: int) -> None:
+    truth, session = data().truth, data().recordings[0]
+    found = session.recording.keypoints
+    frame = 2
+    own = found.frame == 2 * frame + row
+    time_s = float(session.recording.frame_s[frame])
+    _, depth = _image(row, time_s)
+    T_G_C = se3.compose(truth.T_G_I[frame], session.device.true_rig.T_B_C[row])
+    p_C = se3.transform(se3.inverse(T_G_C), truth.point_G[found.point[own]])
+    uv = np.round(found.uv_true_px[own]).astype(int)
+    assert len(uv) > 80
+    ratio = depth[uv[:, 1], uv[:, 0]] / p_C[:, 2]
+    # half a pixel away the surface is a little nearer or farther, or there is an edge
+    assert np.median(np.abs(ratio - 1.0)) < 0.005
+    assert np.mean(np.abs(ratio - 1.0) < 0.03) > 0.95
+
+
+def test_both_images_show_the_same_surfaces() -> None:
+    left, depth = _image(0)
+    right, right_depth = _image(1)
+    session = data().recordings[0]
+    T_I_C = session.device.true_rig.T_B_C
+    rays = pixel_rays(session.device.true_rig.cameras[0])
+    v, u = (index.ravel() for index in np.mgrid[20:220:3, 20:350:3])
+    p_L = np.concatenate([rays[v, u], np.ones((len(u), 1))], axis=1) * depth[v, u, None]
+    p_R = se3.transform(se3.relative(T_I_C[1], T_I_C[0]), p_L)
+    uv = pixels_of(session.device.true_rig.cameras[1], p_R)
+    inside = np.all((uv > 2) & (uv < [372, 236]), axis=1)
+    uv = uv[inside].astype(np.float32)
+    there = cv2.remap(right.astype(np.float32), uv[:, :1], uv[:, 1:], cv2.INTER_LINEAR)[:, 0]
+    far = cv2.remap(right_depth, uv[:, :1], uv[:, 1:], cv2.INTER_NEAREST)[:, 0]
+    # what one camera sees and the other does not lies at another depth
+    visible = np.abs(far / p_R[inside, 2] - 1.0) < 0.02
+    assert visible.mean() > 0.8
+    difference = np.abs(there - left[v, u][inside])[visible]
+    assert np.median(difference) < 3.0
+    assert np.corrcoef(there[visible], left[v, u][inside][visible])[0, 1] > 0.95
+
+
+def test_features_are_found_and_tracked_through_the_images() -> None:
+    one, two = _image(0, 1.0)[0], _image(0, 1.05)[0]
+    corners = cv2.goodFeaturesToTrack(one, 300, 0.02, 6)
+    assert len(corners) > 150
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, None)
+    assert status.mean() > 0.9
+    session = data().recordings[0]
+    imager = _imager(0)
+    T = imager.at_time(np.array([1.0, 1.05]))
+    depth = _image(0, 1.0)[1]
+    uv = np.round(corners[:, 0]).astype(int)
+    ray = np.concatenate([imager.rays[uv[:, 1], uv[:, 0]], np.ones((len(uv), 1))], axis=1)
+    p = se3.transform(se3.relative(T[1], T[0]), ray * depth[uv[:, 1], uv[:, 0], None])
+    expected = pixels_of(session.device.true_rig.cameras[0], p) - uv
+    flow = (moved - corners)[:, 0]
+    error = np.linalg.norm(flow - expected, axis=1)[status[:, 0] == 1]
+    assert np.linalg.norm(expected, axis=1).mean() > 1.0
+    assert np.median(error) < 0.3
+
+
+def test_exposure_blur_vignette_and_noise() -> None:
+    plain = _image(0)[0].astype(float)
+    dark = _image(0, vignette=0.5)[0].astype(float)
+    assert dark[:20, :20].mean() < 0.6 * plain[:20, :20].mean()
+    assert dark[110:130, 178:198].mean() == pytest.approx(plain[110:130, 178:198].mean(), rel=0.02)
+    noisy = _image(0, noise_sigma=4.0)[0].astype(float)
+    usable = (plain > 20) & (plain < 235)
+    assert np.std((noisy - plain)[usable]) == pytest.approx(4.0, rel=0.03)
+    bright = _image(0, time_s=1.75, gain_swing=0.2)[0].astype(float)
+    assert bright.mean() == pytest.approx(1.2 * _image(0, time_s=1.75)[0].mean(), rel=0.03)
+    blurred = _image(0, blur_samples=5, exposure_s=0.05)[0].astype(float)
+    sharpness = [np.abs(np.diff(image, axis=1)).mean() for image in (plain, blurred)]
+    assert sharpness[1] < 0.9 * sharpness[0]
+
+
+@cache
+def _raw_scenario() -> Scenario:
+    return dataclasses.replace(
+        STEREO,
+        images=ImageOptions(render=True, texel_m=0.02, blur_samples=1),
+        sessions=(dataclasses.replace(STEREO.sessions[0], duration_s=1.0, turns=0.02),),
+    )
+
+
+def test_raw_data_are_euroc_folders(tmp_path: Path) -> None:
+    data = simulate(_raw_scenario())
+    folders = write_raw_data(_raw_scenario(), data, tmp_path)
+    assert folders == [tmp_path / "raw" / "session_1"]
+    mav = folders[0] / "mav0"
+    imu = read_imu_csv(mav / "imu0" / "data.csv")
+    np.testing.assert_array_equal(imu.accel_gyro, data.recordings[0].recording.imu.accel_gyro)
+    for row in (0, 1):
+        lines = (mav / f"cam{row}" / "data.csv").read_text().splitlines()[1:]
+        assert len(lines) == 3
+        stamp, name = lines[1].split(",")
+        image = cv2.imread(str(mav / f"cam{row}" / "data" / name), cv2.IMREAD_UNCHANGED)
+        assert image.shape == (240, 376)
+        assert image.dtype == np.uint8
+        depth_name = tmp_path / "truth" / "session_1" / f"depth{row}" / f"{stamp}.png"
+        depth = cv2.imread(str(depth_name), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.uint16
+        assert 300 < np.median(depth) < 20_000
+        sensor = yaml.safe_load((mav / f"cam{row}" / "sensor.yaml").read_text())
+        assert sensor["distortion_model"] == "radial-tangential"
+        assert sensor["resolution"] == [376, 240]
+        stored = data.recordings[0].device.rig
+        np.testing.assert_allclose(
+            np.array(sensor["T_BS"]["data"]).reshape(4, 4), se3.to_matrix(stored.T_B_C[row])
+        )
+        assert sensor["intrinsics"] == stored.cameras[row].intrinsics.tolist()
+    truth = read_trajectory(tmp_path / "truth" / "session_1" / "ground_truth.csv")
+    np.testing.assert_allclose(truth.T_R_B, data.truth.sample_T_G_I)
+    with pytest.raises(UserError, match="exists"):
+        write_raw_data(_raw_scenario(), data, tmp_path)
+
+
+def test_same_images_again(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_raw_data(_raw_scenario(), simulate(_raw_scenario()), tmp_path / name)
+    files = sorted(path for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(files) > 12
+    for path in files:
+        other = tmp_path / "b" / path.relative_to(tmp_path / "a")
+        assert path.read_bytes() == other.read_bytes()
+
+
+def test_mesh_has_its_normals_in_the_free_space(tmp_path: Path) -> None:
+    surfaces = scene().surfaces
+    write_mesh(surfaces, tmp_path / "mesh.ply")
+    content = (tmp_path / "mesh.ply").read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    corners = 4 * len(surfaces.normal)
+    assert f"element vertex {corners}".encode() in header
+    points = np.frombuffer(body, "<f4", 3 * corners).reshape(-1, 3).astype(float)
+    faces = np.frombuffer(body[12 * corners :], [("count", "u1"), ("corner", "<i4", 3)])
+    assert np.all(faces["count"] == 3)
+    a, b, c = points[faces["corner"]].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    wanted = np.tile(surfaces.normal, (2, 1))
+    large = np.linalg.norm(normal, axis=1) > 1e-3
+    normal = normal[large] / np.linalg.norm(normal[large], axis=1)[:, None]
+    np.testing.assert_allclose(np.sum(normal * wanted[large], axis=1), 1.0, atol=1e-4)
+
+
+def test_the_command_writes_raw_data_when_asked(tmp_path: Path) -> None:
+    scenario = tmp_path / "tiny.yaml"
+    scenario.write_text(
+        "world: {landmarks_per_room: 500}\nmeasurement: {frame_rate_hz: 2}\n"
+        "sessions: [{duration_s: 2, turns: 0.1}]\n"
+    )
+    session = Session()
+    plain = session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "a")
+    assert plain.raw_data == ()
+    assert not (tmp_path / "a" / "raw").exists()
+    report = session.run(
+        "simulate", scenario=str(scenario), map_folder=tmp_path / "b", raw_data=True
+    )
+    assert (report.raw_data[0] / "mav0" / "imu0" / "data.csv").is_file()
+    # this scenario renders no images
+    assert not (report.raw_data[0] / "mav0" / "cam0" / "data").exists()
+
+
+def test_the_scenario_of_images_renders() -> None:
+    scenario = load_scenario("stereo_room")
+    assert scenario.images.render
+    assert len(scenario.cameras) == 2
