@@ -13,7 +13,7 @@ U64 = NDArray[np.uint64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-INDEX_ENGINES = ("imi", "hamming")
+INDEX_ENGINES = ("imi", "kd", "hamming")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,6 +39,20 @@ class DescriptorSet:
             self.time_ns[rows],
         )
 
+    @classmethod
+    def concatenate(cls, first: DescriptorSet, second: DescriptorSet) -> DescriptorSet:
+        """Return the descriptors of both.
+
+        Raises:
+            ValueError: Their lengths or dimensions differ.
+        """
+        return cls(
+            *(
+                np.concatenate([getattr(first, field.name), getattr(second, field.name)])
+                for field in dataclasses.fields(cls)
+            )
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class MatchRule:
@@ -57,10 +71,20 @@ class Neighbours:
 
 
 class DescriptorIndex(Protocol):
-    """A search structure over a database of descriptors."""
+    """A search structure over a database of descriptors.
+
+    Rows of the result count the descriptors in the order in which they came in; removing some does
+    not renumber the others.
+    """
 
     def nearest(self, queries: DescriptorSet, k: int, rule: MatchRule) -> Neighbours:
         """Return the nearest database descriptors that the rule allows, one per label."""
+
+    def added(self, more: DescriptorSet) -> DescriptorIndex:
+        """Return an index that holds more descriptors."""
+
+    def without_session(self, session: int) -> DescriptorIndex:
+        """Return an index that holds no descriptor of a session any more."""
 
 
 def make_index(
@@ -69,8 +93,8 @@ def make_index(
     """Build an index.
 
     Args:
-        engine: One of INDEX_ENGINES: "imi" (inverted multi-index over projected descriptors) or
-            "hamming" (exhaustive, exact).
+        engine: One of INDEX_ENGINES: "imi" (inverted multi-index over projected descriptors),
+            "kd" (KD-tree, exact in the projected space) or "hamming" (exhaustive, exact).
         database: What to search in.
         seed: Seed of the vocabulary.
         words_per_query: Cells of the multi-index that are searched per query.
@@ -79,6 +103,10 @@ def make_index(
         from maplab_py.vision.hamming_index import HammingIndex
 
         return HammingIndex(database)
+    if engine == "kd":
+        from maplab_py.vision.tree_index import TreeIndex
+
+        return TreeIndex(database)
     from maplab_py.vision.multi_index import InvertedMultiIndex
 
     return InvertedMultiIndex(database, seed=seed, cells_per_query=words_per_query)

@@ -24,9 +24,9 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return numba.njit(cache=True, **settings)(function)  # type: ignore[no-any-return]
+            return numba.njit(cache=True, nogil=True, **settings)(function)  # type: ignore[no-any-return]
         except RuntimeError:  # numba: "cannot cache function: no locator available"
-            return numba.njit(**settings)(function)  # type: ignore[no-any-return]
+            return numba.njit(nogil=True, **settings)(function)  # type: ignore[no-any-return]
 
     return decorate
 

@@ -15,10 +15,12 @@ ITERATIONS = 12
 
 
 def kmeans(points: F32, count: int, *, seed: int = 0) -> F32:
-    """Return `count` centres (count, D) of points (N, D), N >= count.
+    """Return `count` centres (count, D) of points (N, D), N >= count; zeros when there are none.
 
     Starts from distinct random points; a centre that loses all its points stays where it is.
     """
+    if len(points) == 0:
+        return np.zeros((count, points.shape[1]), dtype=np.float32)
     rng = np.random.default_rng(seed)
     if len(points) > MAX_TRAINING_POINTS:
         points = points[np.sort(rng.choice(len(points), MAX_TRAINING_POINTS, replace=False))]

@@ -8,11 +8,16 @@ Source: Babenko and Lempitsky, The inverted multi-index, CVPR 2012.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
+from numpy.typing import NDArray
 
 from maplab_py.vision.index import DescriptorSet, MatchRule, Neighbours
 from maplab_py.vision.kmeans import kmeans, nearest_centre
 from maplab_py.vision.search_kernels import search_cells
+
+I64 = NDArray[np.int64]
 
 _DESCRIPTORS_PER_CELL = 40
 _MIN_WORDS, _MAX_WORDS = 4, 256
@@ -45,17 +50,38 @@ class InvertedMultiIndex:
         words = int(np.clip(words, _MIN_WORDS, _MAX_WORDS))
         words = max(min(words, len(points)), 1)
         self._centres = tuple(kmeans(half, words, seed=seed + i) for i, half in enumerate(halves))
+        self._cells_per_query = cells_per_query
+        self._rank_by_bits = rank_by_bits
+        self._next = len(points)
+        self._fill(database, np.arange(len(points)))
+
+    def _fill(self, database: DescriptorSet, rows: I64) -> None:
+        """Make the cell lists; `rows` are the numbers (N,) that the descriptors have in results."""
         first, second = (
-            nearest_centre(half, centre) for half, centre in zip(halves, self._centres, strict=True)
+            nearest_centre(np.ascontiguousarray(database.projected[:, half::2]), centre)
+            for half, centre in enumerate(self._centres)
         )
         cell = first.astype(np.int64) * len(self._centres[1]) + second
         order = np.argsort(cell, kind="stable")
         cells = len(self._centres[0]) * len(self._centres[1])
         self._start = np.searchsorted(cell[order], np.arange(cells + 1))
-        self._rows = order
+        self._rows = rows[order]
         self._sorted = database.take(order)
-        self._cells_per_query = cells_per_query
-        self._rank_by_bits = rank_by_bits
+
+    def added(self, more: DescriptorSet) -> InvertedMultiIndex:
+        """Return an index that holds more descriptors; the vocabularies stay as they are."""
+        index = copy.copy(self)
+        index._next = self._next + len(more)
+        rows = np.concatenate([self._rows, self._next + np.arange(len(more))])
+        index._fill(DescriptorSet.concatenate(self._sorted, more), rows)
+        return index
+
+    def without_session(self, session: int) -> InvertedMultiIndex:
+        """Return an index that holds no descriptor of a session any more."""
+        index = copy.copy(self)
+        kept = np.flatnonzero(self._sorted.session != session)
+        index._fill(self._sorted.take(kept), self._rows[kept])
+        return index
 
     def nearest(self, queries: DescriptorSet, k: int, rule: MatchRule) -> Neighbours:
         """Return the nearest database descriptors that the rule allows, one per label."""

@@ -103,38 +103,67 @@ def _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, best_m
     return cost, inliers
 
 
+@compiled(inline="always")
+def _across(ray, first, second):  # type: ignore[no-untyped-def]
+    """Fill in two unit vectors across a unit ray (Duff et al., Building an Orthonormal Basis)."""
+    sign = 1.0 if ray[2] >= 0.0 else -1.0
+    a = -1.0 / (sign + ray[2])
+    b = ray[0] * ray[1] * a
+    first[0], first[1], first[2] = 1.0 + sign * ray[0] * ray[0] * a, sign * b, -sign * ray[0]
+    second[0], second[1], second[2] = b, sign + ray[1] * ray[1] * a, -ray[1]
+
+
+@compiled(inline="always")
+def _add_row(row, e, H, g):  # type: ignore[no-untyped-def]
+    """Add a row of the Jacobian to the upper triangle of H and to g."""
+    for i in range(6):
+        g[i] += row[i] * e
+        for k in range(i, 6):
+            H[i, k] += row[i] * row[k]
+
+
 @compiled()
 def _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g):  # type: ignore[no-untyped-def]
-    """Fill in the normal equations of the bearing errors in [dp (M), dtheta (W)]."""
+    """Fill in the normal equations of the bearing errors in [dp (M), dtheta (W)].
+
+    The error is the unit vector d to the point along two directions b across the ray; with
+    c = b - d (d . b) over the distance, it changes by -R c with the position and c x q with theta.
+    """
     H[:] = 0.0
     g[:] = 0.0
-    J = np.empty((3, 6))
+    row, q, d, c = np.empty(6), np.empty(3), np.empty(3), np.empty(3)
+    directions = np.empty((2, 3))
     for j in range(begin, end):
         if not used[j]:
             continue
-        q = R.T @ (point[j] - t)
-        c = q - origin[j]
-        length = np.sqrt(c @ c)
-        d = c / length
+        x, y, z = point[j, 0] - t[0], point[j, 1] - t[1], point[j, 2] - t[2]
+        square = 0.0
+        for i in range(3):
+            q[i] = R[0, i] * x + R[1, i] * y + R[2, i] * z
+            d[i] = q[i] - origin[j, i]
+            square += d[i] * d[i]
+        length = np.sqrt(square)
         w = inverse_sigma[j]
-        # error: component of d across the ray; projecting out the ray keeps two dimensions
-        P = np.eye(3) - np.outer(ray[j], ray[j])
-        D = P @ (np.eye(3) - np.outer(d, d)) * (w / length)
-        K = np.array([[0.0, -q[2], q[1]], [q[2], 0.0, -q[0]], [-q[1], q[0], 0.0]])
-        J[:, :3] = -(D @ R.T)
-        J[:, 3:] = D @ K
-        e = P @ d * w
-        H += J.T @ J
-        g += J.T @ e
-    # prior: the z axis of W stays up in M
+        _across(ray[j], directions[0], directions[1])
+        for b in directions:
+            along = (d[0] * b[0] + d[1] * b[1] + d[2] * b[2]) / length
+            for i in range(3):
+                c[i] = (b[i] - d[i] / length * along) * (w / length)
+            for i in range(3):
+                row[i] = -(R[i, 0] * c[0] + R[i, 1] * c[1] + R[i, 2] * c[2])
+            row[3] = c[1] * q[2] - c[2] * q[1]
+            row[4] = c[2] * q[0] - c[0] * q[2]
+            row[5] = c[0] * q[1] - c[1] * q[0]
+            _add_row(row, w * along, H, g)
+    # prior: the z axis of W stays up in M, d(R e_z)/dtheta = -R [e_z]x
     for i in range(2):
-        row = np.zeros(6)
-        # d(R e_z)/dtheta = -R [e_z]x
+        row[:] = 0.0
         row[3] = -R[i, 1] * inverse_tilt
         row[4] = R[i, 0] * inverse_tilt
-        e = R[i, 2] * inverse_tilt
-        H += np.outer(row, row)
-        g += row * e
+        _add_row(row, R[i, 2] * inverse_tilt, H, g)
+    for i in range(6):
+        for k in range(i):
+            H[i, k] = H[k, i]
 
 
 @compiled()

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.loop_closure.closure_report import (
+    ClosureReport,
+    RemovalReport,
+    TrainingReport,
+)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.report import LoopClosureReport
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
@@ -51,7 +58,7 @@ class RelaxMissionsReport(Report):
     "loopclosure_all_missions",
     "lc",
     example="lc --lc_min_inlier_count=15",
-    see_also=("relax", "optimize_visual_inertial", "delete_loopclosure_edges"),
+    see_also=("relax", "lc_report", "optimize_visual_inertial", "delete_loopclosure_edges"),
 )
 def loopclosure_all_missions(
     context: CommandContext,
@@ -96,6 +103,111 @@ def delete_loopclosure_edges(context: CommandContext) -> Message:
     count = len(context.vi_map.loop_closure_edges)
     context.commit(remove_loop_closure_edges(context.vi_map, np.ones(count, dtype=np.bool_)))
     return Message(f"removed {count} loop closure edges")
+
+
+@command(
+    "train_projection_matrix",
+    example="train_projection_matrix projection.npz",
+    see_also=("loopclosure_all_missions",),
+    acts_outside=True,
+)
+def train_projection_matrix(
+    context: CommandContext,
+    file: Path,
+    *,
+    lc_target_dimensionality: int = _LOOPS.target_dimensionality,
+    map_mission_list: str = "",
+    overwrite: bool = False,
+) -> TrainingReport:
+    """Learn from the map's tracks which differences between descriptors matter, and write that.
+
+    Args:
+        file: File to write; --lc_projection_matrix_filename takes it.
+        lc_target_dimensionality: Dimensions of the projected descriptors.
+        map_mission_list: Missions to learn from, separated by commas; empty = all.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.algorithms.loop_closure.features import train_projection
+    from maplab_py.vision.projection_file import save_projection
+
+    missions = context.mission_rows("", map_mission_list)
+    projection, report = train_projection(context.vi_map, missions, lc_target_dimensionality)
+    save_projection(projection, file, overwrite=overwrite)
+    return dataclasses.replace(report, file=str(file))
+
+
+@command(
+    "lc_report",
+    example="lc_report --sort_by=gap --limit=10",
+    see_also=("remove_loopclosure", "loopclosure_all_missions"),
+)
+def lc_report(
+    context: CommandContext,
+    *,
+    which: Literal["accepted", "refused", "all"] = "accepted",
+    sort_by: Literal["time", "gap", "correction", "inliers"] = "time",
+    limit: int = 50,
+    file: Path | None = None,
+    map_mission_list: str = "",
+    overwrite: bool = False,
+) -> ClosureReport:
+    """List the loop closures that the map remembers, with verdicts and the reasons for refusals.
+
+    Args:
+        which: accepted, refused or all of them.
+        sort_by: time of the query; gap = distance of the map's present poses from the closure,
+            largest first; correction = what it wanted to move the query by when it was found,
+            largest first; inliers, fewest first.
+        limit: Most closures to list; 0 = all.
+        file: Write all chosen closures to this file, JSON or CSV by its ending.
+        map_mission_list: Only closures with an end in these missions, separated by commas.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.algorithms.loop_closure.listing import list_closures, write_closures
+
+    missions = context.mission_rows("", map_mission_list)
+    report = list_closures(context.vi_map, which=which, missions=missions, sort_by=sort_by)
+    if file is not None:
+        write_closures(report, file, overwrite=overwrite)
+    lines = report.closures if limit <= 0 else report.closures[:limit]
+    return dataclasses.replace(
+        report, closures=lines, shown=len(lines), file="" if file is None else str(file)
+    )
+
+
+@command(
+    "remove_loopclosure",
+    "rlc",
+    example="remove_loopclosure 59f0a1b2 --neighbors_s=2",
+    see_also=("lc_report", "delete_loopclosure_edges"),
+)
+def remove_loopclosure(
+    context: CommandContext, closures: str, *, neighbors_s: float = 0.0
+) -> RemovalReport:
+    """Take back loop closures: their edges, and merges that too few others speak for.
+
+    Later searches refuse them, until the record is dropped.
+
+    Args:
+        closures: Beginnings of the closures' ids as lc_report shows them, separated by commas.
+        neighbors_s: Also take back accepted closures both of whose ends are as near in time.
+    """
+    from maplab_py.algorithms.loop_closure.listing import find_closures
+    from maplab_py.algorithms.loop_closure.removal import remove_closures
+
+    ids = find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
+    result, report = remove_closures(context.vi_map, ids)
+    context.commit(result)
+    return report
+
+
+@command("delete_loopclosure_record", example="delete_loopclosure_record")
+def delete_loopclosure_record(context: CommandContext) -> Message:
+    """Forget all recorded loop closures; landmarks, edges and poses stay as they are."""
+    from maplab_py.algorithms.loop_closure.record import drop_record
+
+    context.commit(drop_record(context.vi_map))
+    return Message("the record of loop closures is empty")
 
 
 @command(
@@ -172,18 +284,11 @@ def _relax(
     *,
     merge: bool,
 ) -> RelaxReport:
-    from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
-    from maplab_py.algorithms.relaxation import relaxation
+    from maplab_py.algorithms.loop_closure.closing import close_loops
+    from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 
-    edges, found = find_loop_closures(
-        context.vi_map, loop_options, missions=missions, progress=context.progress
-    )
-    result, relaxed = relaxation.relax(
-        context.vi_map,
-        options,
-        loop_closures=edges,
-        missions=missions,
-        progress=context.progress,
+    result, found, relaxed = relax_over_loops(
+        context.vi_map, options, loop_options, missions=missions, progress=context.progress
     )
     merging = None
     if merge and not relaxed.failure:

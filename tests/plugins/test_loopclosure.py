@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,53 @@ def test_seed_and_gates_are_flags() -> None:
     session = session_of(TWICE)
     report = session.run("lc", lc_seed=7, lc_min_inlier_count=1000)
     assert "wanted 1000" in report.failure
+
+
+def test_closures_are_listed_removed_and_forgotten(tmp_path: Path) -> None:
+    session = session_of(TWICE)
+    assert "lc" in session.run("lc_report").notes[0]
+    report = session.run("lc")
+    listed = session.run("lc_report", limit=5, file=tmp_path / "closures.csv")
+    assert listed.recorded == report.candidates
+    assert len(listed.closures) == listed.shown == 5
+    assert len((tmp_path / "closures.csv").read_text().splitlines()) == 1 + report.accepted
+    before = len(session.vi_map.landmarks)
+    name = listed.closures[0].id
+    removed = session.run("remove_loopclosure", closures=name, neighbors_s=60.0)
+    assert name in removed.closures
+    assert len(session.vi_map.landmarks) == before + removed.landmarks_restored > before
+    session.run("undo")
+    assert len(session.vi_map.landmarks) == before
+    session.run("delete_loopclosure_record")
+    assert session.run("lc_report").recorded == 0
+
+
+def test_a_projection_is_trained_and_used(tmp_path: Path) -> None:
+    session = session_of(TWICE)
+    report = session.run("train_projection_matrix", file=tmp_path / "projection.npz")
+    assert (report.descriptor_size, report.dimensions) == (48, 10)
+    assert report.same_distance < 0.5 * report.other_distance
+    plain = session.run("lc", lc_insert_lc_edge_instead_of_merging=True)
+    trained = session.run(
+        "lc",
+        lc_insert_lc_edge_instead_of_merging=True,
+        lc_projection_matrix_filename=str(tmp_path / "projection.npz"),
+    )
+    assert trained.accepted == plain.accepted
+    session.run("train_projection_matrix", file=tmp_path / "6.npz", lc_target_dimensionality=6)
+    coarse = session.run("lc", lc_projection_matrix_filename=str(tmp_path / "6.npz"))
+    assert coarse.accepted > 0.8 * plain.accepted
+
+
+def test_a_projection_for_other_descriptors_is_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "short.npz", matrix=np.ones((10, 64)))
+    session = session_of(TWICE)
+    report = session.run("lc", lc_projection_matrix_filename=str(tmp_path / "short.npz"))
+    assert report.accepted > 0
+    assert "learned a projection from the map" in report.notes[0]
+
+
+@pytest.mark.parametrize("engine", ["kd", "hamming"])
+def test_other_engines_find_the_same_places(engine: str) -> None:
+    report = session_of(TWICE).run("lc", lc_detector_engine=engine)
+    assert report.accepted >= 22

@@ -6,7 +6,7 @@ import pytest
 
 from maplab_py.vision.descriptors import hamming, pack_words
 from maplab_py.vision.hamming_index import HammingIndex
-from maplab_py.vision.index import INDEX_ENGINES, MatchRule, make_index
+from maplab_py.vision.index import INDEX_ENGINES, DescriptorSet, MatchRule, make_index
 from maplab_py.vision.multi_index import InvertedMultiIndex
 from tests.vision.synthetic import descriptor_set, tracks
 
@@ -108,3 +108,65 @@ def test_empty_database_has_no_neighbours(features):
     nothing = database.take(np.zeros(0, dtype=np.int64))
     found = HammingIndex(nothing).nearest(database.take(np.arange(5)), 2, MatchRule())
     assert np.all(found.row == -1)
+
+
+def sessions_of(features, count=3):
+    _, database = features
+    session = (database.label % count).astype(np.int32)
+    return DescriptorSet(
+        database.projected, database.words, database.label, session, database.time_ns
+    )
+
+
+@pytest.mark.parametrize("engine", INDEX_ENGINES)
+def test_added_and_removed_sessions_are_as_if_never_indexed_otherwise(features, engine):
+    database = sessions_of(features)
+    parts = [np.flatnonzero(database.session == s) for s in range(3)]
+    queries = database.take(np.arange(0, len(database), 53))
+
+    def build(rows):
+        return make_index(engine, database.take(rows), seed=0, words_per_query=64)
+
+    grown = build(parts[0]).added(database.take(parts[1])).added(database.take(parts[2]))
+    shrunk = grown.without_session(1)
+    order = np.concatenate(parts)
+    for index, wanted in ((grown, [0, 1, 2]), (shrunk, [0, 2])):
+        found = index.nearest(queries, 3, MatchRule())
+        row = order[found.row]
+        assert np.isin(database.session[row[found.row >= 0]], wanted).all()
+        # every result is named by the number it came in with: its distance is the one reported
+        if engine == "hamming":
+            q, k = np.nonzero(found.row >= 0)
+            bits = hamming(queries.words, q, database.words, row[q, k])
+            np.testing.assert_array_equal(bits, found.distance[q, k])
+        whole = make_index("hamming", database, seed=0, words_per_query=64)
+        if engine != "hamming":
+            continue
+        for session in sorted({0, 1, 2} - set(wanted)):
+            whole = whole.without_session(session)
+        expected = whole.nearest(queries, 3, MatchRule()).distance
+        np.testing.assert_array_equal(found.distance, expected)
+    again = shrunk.added(database.take(parts[1][:5])).nearest(queries, 1, MatchRule()).row
+    assert again.max() < len(database) + 5
+    assert len(make_index(engine, database.take(parts[0][:0]), seed=0, words_per_query=8).nearest(
+        queries, 2, MatchRule()).row) == len(queries)  # fmt: skip
+
+
+def test_tree_finds_the_exact_neighbours_that_the_rule_allows(features):
+    database = sessions_of(features)
+    queries = np.arange(0, len(database), 101)
+    index = make_index("kd", database, seed=0, words_per_query=0)
+    for rule in (MatchRule(), MatchRule(other_sessions_only=True)):
+        found = index.nearest(database.take(queries), 3, rule)
+        for query, row, distance in zip(queries, found.row, found.distance, strict=True):
+            gap = np.sum((database.projected - database.projected[query]) ** 2, axis=1)
+            gap[database.label == database.label[query]] = np.inf
+            if rule.other_sessions_only:
+                gap[database.session == database.session[query]] = np.inf
+            best = {}
+            for i in np.argsort(gap, kind="stable"):
+                best.setdefault(int(database.label[i]), float(gap[i]))
+                if len(best) == 3:
+                    break
+            np.testing.assert_allclose(distance, list(best.values()), rtol=1e-4)
+            assert len(set(database.label[row].tolist())) == 3

@@ -18,8 +18,11 @@ from maplab_py.algorithms.anchoring.options import (
     MissionAlignment,
 )
 from maplab_py.algorithms.loop_closure.closing import describe, with_quality
+from maplab_py.algorithms.loop_closure.closures import VERDICTS
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.recording import with_closures
+from maplab_py.algorithms.loop_closure.report import Verdict
 from maplab_py.geometry import yaw
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
@@ -100,7 +103,8 @@ def anchor_missions(
         alignments=tuple(alignments),
         notes=notes,
     )
-    return _with_base_frames(vi_map, T_G_M, anchored), report
+    result = _with_base_frames(vi_map, T_G_M, anchored)
+    return with_closures(result, detection.closures, "anchor"), report
 
 
 def _nothing_to_do(
@@ -127,6 +131,7 @@ def _aligned_pairs(
 ) -> tuple[list[_Pair], list[MissionAlignment]]:
     """Align every pair of missions that closures join."""
     all_ = _sightings(vi_map, detection)
+    unclear = _ambiguous_counts(vi_map, detection)
     pairs: list[_Pair] = []
     alignments: list[MissionAlignment] = []
     for a, b in np.unique(np.stack([all_.mission_A, all_.mission_B], axis=1), axis=0).tolist():
@@ -141,7 +146,13 @@ def _aligned_pairs(
         gap = yaw.transform(T_B_A, good.T_A_I[:, 4:]) - good.T_B_I[:, 4:]
         count, agreed = len(agree), int(np.count_nonzero(agree))
         verdict = "used"
-        if agreed < options.min_inlier_count:
+        if unclear[a, b] > options.max_ambiguous_ratio * agreed:
+            verdict = (
+                f"{unclear[a, b]} closures with places that look like other places, {agreed} "
+                f"without; more than --anchor_transform_max_ambiguous_ratio="
+                f"{options.max_ambiguous_ratio:g}"
+            )
+        elif agreed < options.min_inlier_count:
             verdict = f"{agreed} closures agree, {options.min_inlier_count} are wanted"
         elif agreed < options.min_inlier_ratio * count:
             verdict = f"only {agreed} of {count} closures agree"
@@ -157,6 +168,17 @@ def _aligned_pairs(
             )
         )
     return pairs, alignments
+
+
+def _ambiguous_counts(vi_map: VIMap, detection: Detection) -> I64:
+    """Count closures (M, M) between missions that were refused since places look alike."""
+    c = detection.closures
+    rows = np.flatnonzero(c.verdict == VERDICTS.index(Verdict.AMBIGUOUS))
+    ends = np.stack([c.query_vertex[rows], c.place_vertex[rows]])
+    pair = np.sort(vi_map.vertices.mission[ends], axis=0)
+    count = np.zeros((len(vi_map.missions),) * 2, dtype=np.int64)
+    np.add.at(count, (pair[0], pair[1]), 1)
+    return count
 
 
 def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:

@@ -14,14 +14,23 @@ from maplab_py.algorithms.loop_closure.closures import Closures
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.edges import closure_edges
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.recording import with_closures
 from maplab_py.algorithms.loop_closure.report import LoopClosureReport
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, LoopClosureEdges, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import IdIndex, to_hex
 
 I64 = NDArray[np.int64]
 
 _DEFAULT = LoopClosureOptions()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """Closures of a map, accepted and refused, and the edges of the accepted ones."""
+
+    closures: Closures
+    edges: LoopClosureEdges
 
 
 def close_loops(
@@ -32,6 +41,8 @@ def close_loops(
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LoopClosureReport]:
     """Find loop closures and merge the landmarks that are one point.
+
+    The map's record gets every closure with its verdict, and every merge.
 
     Args:
         vi_map: The map; landmarks of unknown quality are judged first.
@@ -44,24 +55,55 @@ def close_loops(
     """
     judged, notes = with_quality(vi_map, progress)
     detection = _detect(judged, options, missions, progress)
-    merged, result = merging.merge_verified_landmarks(judged, detection.closures, options)
+    closures = detection.closures
+    merged, result = merging.merge_verified_landmarks(judged, closures, options)
+    used = np.zeros(len(closures), dtype=np.bool_)
+    used[result.closure] = True
+    recorded = with_closures(merged, closures, "merge", used=used, merges=result, before=judged)
     report = dataclasses.replace(
         describe(judged, detection, options, notes),
         landmarks_merged=result.landmarks_merged,
         observations_moved=result.observations_moved,
         merges_refused=result.refused,
     )
+    if merging.GAP in result.refused:
+        open_ = closures.accepted & (closures.correction_m > options.max_merge_gap_m)
+        remedy = (
+            f"{np.count_nonzero(open_)} closures correct up to {report.largest_correction_m:.2f} "
+            f"m, more than --lc_max_merge_gap_m={options.max_merge_gap_m:g}; run relax first"
+        )
+        report = dataclasses.replace(report, notes=(*report.notes, remedy))
     if not report.reason and result.landmarks_merged == 0 and result.refused:
-        if merging.GAP in result.refused:
-            reason = (
-                f"no landmarks merged: the closures correct up to {report.largest_correction_m:.2f} "
-                f"m, more than --lc_max_merge_gap_m={options.max_merge_gap_m:g}; run relax first"
-            )
-        else:
-            reasons = "; ".join(f"{why} ({n})" for why, n in result.refused.items())
-            reason = f"no landmarks merged: {reasons}"
-        report = dataclasses.replace(report, reason=reason)
-    return merged, report
+        reasons = "; ".join(f"{why} ({n})" for why, n in result.refused.items())
+        reason = report.notes[-1] if merging.GAP in result.refused else reasons
+        report = dataclasses.replace(report, reason=f"no landmarks merged: {reason}")
+    return recorded, report
+
+
+def search_loops(
+    vi_map: VIMap,
+    options: LoopClosureOptions = _DEFAULT,
+    *,
+    missions: I64 | None = None,
+    progress: Progress = SILENT,
+) -> tuple[LoopSearch, LoopClosureReport]:
+    """Find loop closures; change nothing.
+
+    Raises:
+        EstimationError: No descriptors, or too few tracks to learn their projection.
+    """
+    judged, notes = with_quality(vi_map, progress)
+    detection = _detect(judged, options, missions, progress)
+    edges = closure_edges(detection.closures, options)
+    report = describe(judged, detection, options, notes)
+    report = dataclasses.replace(report, edges_added=len(edges))
+    if not report.reason and len(edges) == 0:
+        report = dataclasses.replace(
+            report,
+            reason=f"no edges: the closures correct at most {report.largest_correction_m:.3f} m, "
+            f"less than --lc_edge_min_distance_meters={options.edge_min_distance_meters:g}",
+        )
+    return LoopSearch(detection.closures, edges), report
 
 
 def find_loop_closures(
@@ -76,18 +118,8 @@ def find_loop_closures(
     Raises:
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
-    judged, notes = with_quality(vi_map, progress)
-    detection = _detect(judged, options, missions, progress)
-    edges = closure_edges(judged, detection.closures, options)
-    report = describe(judged, detection, options, notes)
-    report = dataclasses.replace(report, edges_added=len(edges))
-    if not report.reason and len(edges) == 0:
-        report = dataclasses.replace(
-            report,
-            reason=f"no edges: the closures correct at most {report.largest_correction_m:.3f} m, "
-            f"less than --lc_edge_min_distance_meters={options.edge_min_distance_meters:g}",
-        )
-    return edges, report
+    search, report = search_loops(vi_map, options, missions=missions, progress=progress)
+    return search.edges, report
 
 
 def insert_edges(
@@ -97,10 +129,19 @@ def insert_edges(
     missions: I64 | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LoopClosureReport]:
-    """Find loop closures and append them to the map as edges; landmarks stay as they are."""
-    edges, report = find_loop_closures(vi_map, options, missions=missions, progress=progress)
-    table = LoopClosureEdges.concatenate([vi_map.loop_closure_edges, edges])
-    return vi_map.replace(loop_closure_edges=table), report
+    """Find loop closures and append them to the map as edges; landmarks stay as they are.
+
+    An edge between the same two vertices that an earlier search made is replaced.
+    """
+    search, report = search_loops(vi_map, options, missions=missions, progress=progress)
+    edges = search.edges
+    old = vi_map.loop_closure_edges
+    kept = IdIndex(edges.id).rows(old.id) < 0
+    table = LoopClosureEdges.concatenate([old.take(kept), edges])
+    used = IdIndex(edges.id).rows(search.closures.id) >= 0
+    result = vi_map.replace(loop_closure_edges=table)
+    result = with_closures(result, search.closures, "edge", used=used & search.closures.accepted)
+    return result, report
 
 
 def with_quality(vi_map: VIMap, progress: Progress = SILENT) -> tuple[VIMap, tuple[str, ...]]:
@@ -147,7 +188,7 @@ def describe(
         missions_joined=_joined(vi_map, closures),
         largest_correction_m=float(correction.max(initial=0.0)),
         median_correction_m=float(np.median(correction)) if len(correction) else 0.0,
-        notes=notes,
+        notes=(*notes, *detection.notes),
         reason="" if accepted.any() else _explanation(detection, options),
     )
 

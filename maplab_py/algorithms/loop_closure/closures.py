@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -21,14 +22,17 @@ VERDICTS = tuple(Verdict)
 class Closures:
     """Query vertices located in places of a mission; M is the frame of the place's mission."""
 
+    id: NDArray[np.uint64]  # (N, 2)
     query_vertex: I64  # (N,)
     place_vertex: I64  # (N,)
     T_M_I: F64  # (N, 7) of the query, as verified
+    T_A_B: F64  # (N, 7) the place's vertex (B) as the query (A) sees it
     covariance: F64  # (N, 6, 6) of T_M_I, [dp, dtheta]
     match_count: I64  # (N,) keypoints with a match in the place
     inlier_count: I64  # (N,)
     tilt_deg: F64  # (N,)
     correction_m: F64  # (N,) change of the query's position, in G
+    correction_deg: F64  # (N,) change of its attitude
     verdict: NDArray[np.int8]  # (N,) index into VERDICTS
     support: I64  # (N,) other query vertices whose closures agree
     start: I64  # (N + 1,) inlier matches of closure i are rows start[i] .. start[i + 1] - 1
@@ -38,6 +42,17 @@ class Closures:
 
     def __len__(self) -> int:
         return len(self.query_vertex)
+
+    def take(self, rows: I64) -> Closures:
+        """Return some of the closures."""
+        inliers = ragged_rows(self.start, rows)
+        per_match = ("keypoint", "landmark", "bits")
+        columns = {
+            field.name: getattr(self, field.name)[inliers if field.name in per_match else rows]
+            for field in dataclasses.fields(self)
+            if field.name != "start"
+        }
+        return Closures(**columns, start=starts_of_counts(np.diff(self.start)[rows]))
 
     @property
     def accepted(self) -> Mask:

@@ -31,8 +31,9 @@ class ConsensusRule:
     """When two closures agree, and how many must."""
 
     position_tolerance_m: float = 0.15
-    yaw_tolerance_rad: float = 0.04
+    yaw_tolerance_rad: float = 0.025
     drift_ratio: float = 0.02  # of the way between the queries plus that between the places
+    yaw_drift_rad_per_m: float = 4e-4  # over the same way
     min_support: int = 2
     lone_inliers: int = 50  # a closure without any neighbour needs as many inliers
 
@@ -99,10 +100,11 @@ def _votes(
             between_places = np.abs(way[place[i]] - way[place[j]])
             # where closure j would put query i
             p = yaw.transform(E[j], T_A_I[i, 4:])
-            drift = rule.drift_ratio * (between + np.minimum(between_places, between + _REACH_M))
-            agrees = (
-                np.linalg.norm(p - T_B_I[i, 4:], axis=1) < rule.position_tolerance_m + drift
-            ) & (np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.yaw_tolerance_rad + 0.1 * drift)
+            both_ways = between + np.minimum(between_places, between + _REACH_M)
+            largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways
+            largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
+            agrees = np.linalg.norm(p - T_B_I[i, 4:], axis=1) < largest_m
+            agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < largest_rad
             other = query[i] != query[j]
             support[i] += near & agrees & other
             for_[i] += np.where(near & agrees, inliers[j], 0)

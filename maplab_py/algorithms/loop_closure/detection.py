@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +14,11 @@ from maplab_py.algorithms.loop_closure.candidates import (
     Matches,
     find_candidates,
 )
-from maplab_py.algorithms.loop_closure.closures import VERDICTS, Closures
-from maplab_py.algorithms.loop_closure.consensus import (
-    ConsensusRule,
-    check_consensus,
-    path_lengths,
-)
+from maplab_py.algorithms.loop_closure.closures import Closures
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
+from maplab_py.algorithms.loop_closure.gates import judge
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.loop_closure.recording import closure_ids
 from maplab_py.algorithms.loop_closure.verification import PoseSearch, search_poses
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
@@ -29,12 +26,13 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import hamming
 from maplab_py.vision.index import MatchRule, make_index
+from maplab_py.vision.projection import DescriptorProjection
+from maplab_py.vision.projection_file import load_projection
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 _NEIGHBOURS = 3
-_DRIFT_OFFSET_M = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,6 +44,7 @@ class Detection:
     database_landmarks: int
     descriptor_matches: int
     best_votes: int  # most matches of a query vertex with one place, where no candidate came of it
+    notes: tuple[str, ...] = ()
 
 
 def detect(
@@ -71,10 +70,16 @@ def detect(
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
     progress.step(0, 4, "features")
-    features, _ = map_features(vi_map, missions)
-    rule = MatchRule(round(options.min_image_time_seconds * 1e9), only_other_missions)
+    given = None
+    if options.projection_matrix_filename:
+        given = load_projection(Path(options.projection_matrix_filename))
+    features, used = map_features(
+        vi_map, missions, projection=given, dimensions=options.target_dimensionality
+    )
+    # the queries' own missions are searched in any case: they tell which places look alike
+    rule = MatchRule(round(options.min_image_time_seconds * 1e9))
     progress.step(1, 4, "descriptor matches")
-    matches, database_landmarks = _match(features, options, rule)
+    matches, database_landmarks = _match(features, options, rule, only_other_missions)
     progress.step(2, 4, "places")
     candidates = find_candidates(
         vi_map,
@@ -82,7 +87,7 @@ def detect(
         matches,
         CandidateRule(
             min_time_ns=rule.min_time_ns,
-            other_missions_only=only_other_missions,
+            other_missions_only=False,
             min_matches=options.min_verify_matches_num,
             fraction_best_scores=options.fraction_best_scores,
         ),
@@ -97,7 +102,11 @@ def detect(
         seed=options.seed,
         max_iterations=options.num_ransac_iters,
     )
-    closures = _judged(vi_map, features, candidates, search, options, known_base_frames)
+    closures = _closures(vi_map, features, candidates, search, options, known_base_frames)
+    if only_other_missions:
+        mission = vi_map.vertices.mission
+        other = mission[closures.query_vertex] != mission[closures.place_vertex]
+        closures = closures.take(np.flatnonzero(other))
     progress.step(4, 4, "loop closures")
     return Detection(
         closures=closures,
@@ -105,13 +114,29 @@ def detect(
         database_landmarks=database_landmarks,
         descriptor_matches=len(matches),
         best_votes=int(candidates.votes.max(initial=0)),
+        notes=_notes(options, given, used),
+    )
+
+
+def _notes(
+    options: LoopClosureOptions, given: DescriptorProjection | None, used: DescriptorProjection
+) -> tuple[str, ...]:
+    if given is None or given is used:
+        return ()
+    return (
+        f"{options.projection_matrix_filename} is for descriptors of {given.descriptor_size} "
+        f"bytes, the map has {used.descriptor_size}: learned a projection from the map",
     )
 
 
 def _match(
-    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule
+    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, apart: bool
 ) -> tuple[Matches, int]:
-    """Match keypoints with the nearest landmarks; also return the number of landmarks searched."""
+    """Match keypoints with the nearest landmarks; also return the number of landmarks searched.
+
+    With `apart` the own mission and the others are searched one by one, as the own one's landmarks
+    would take the others' places among the nearest.
+    """
     query = np.arange(len(features))
     database = np.flatnonzero(features.in_database)
     landmarks = len(np.unique(features.descriptors.label[database]))
@@ -126,7 +151,12 @@ def _match(
         words_per_query=options.num_words_for_nn_search,
     )
     k = options.num_neighbors if options.num_neighbors > 0 else _NEIGHBOURS
-    row = index.nearest(d.take(query), k, rule).row
+    queries = d.take(query)
+    row = index.nearest(queries, k, rule).row
+    if apart:
+        own = (row >= 0) & (d.session[database][row] == d.session[query][:, None])
+        others = index.nearest(queries, k, MatchRule(rule.min_time_ns, True)).row
+        row = np.concatenate([np.where(own, row, -1), others], axis=1)
     i, j = np.nonzero(row >= 0)
     query, found = query[i], database[row[i, j]]
     bits = hamming(d.words, query, d.words, found)
@@ -134,7 +164,7 @@ def _match(
     return matches.take(bits <= options.max_bit_fraction * features.descriptor_bits), landmarks
 
 
-def _judged(
+def _closures(
     vi_map: VIMap,
     features: MapFeatures,
     candidates: Candidates,
@@ -142,59 +172,26 @@ def _judged(
     options: LoopClosureOptions,
     known_base_frames: bool,
 ) -> Closures:
-    """Apply the gates one after the other; the first that fails is the verdict."""
-    s = search.solutions
-    query, place = candidates.query_vertex, candidates.place_vertex
-    vertices = vi_map.vertices
-    mission = vertices.mission[place]
-    same = vertices.mission[query] == mission
-    T_G_I = se3.compose(vi_map.T_G_M[mission], s.T_M_I)
-    change = se3.local(vi_map.T_G_I[query], T_G_I)
-    correction = np.linalg.norm(change[:, :3], axis=1)
-    rotation_deg = np.degrees(np.linalg.norm(change[:, 3:], axis=1))
-    way = path_lengths(vi_map)
-    drift = _DRIFT_OFFSET_M + options.max_drift_ratio * np.abs(way[query] - way[place])
-    implausible = same & (correction > drift)
-    limited = same | known_base_frames
-    if options.max_delta_position_m >= 0.0:
-        implausible |= limited & (correction > options.max_delta_position_m)
-    if options.max_delta_rotation_deg >= 0.0:
-        implausible |= limited & (rotation_deg > options.max_delta_rotation_deg)
-
-    verdict = np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8)
-
-    def refuse(which: NDArray[np.bool_], reason: Verdict) -> None:
-        accepted = verdict == VERDICTS.index(Verdict.ACCEPTED)
-        verdict[accepted & which] = VERDICTS.index(reason)
-
-    refuse(s.inlier_count < options.min_inlier_count, Verdict.FEW_INLIERS)
-    refuse(s.inlier_count < options.min_inlier_ratio * s.keypoint_count, Verdict.LOW_RATIO)
-    tilt_deg = np.degrees(s.tilt_rad)
-    refuse(tilt_deg > options.max_gravity_deviation_deg, Verdict.TILTED)
-    refuse(np.isnan(s.covariance[:, 0, 0]), Verdict.FEW_INLIERS)
-    refuse(implausible, Verdict.IMPLAUSIBLE)
-    support = np.zeros(len(query), dtype=np.int64)
-    left = np.flatnonzero(verdict == VERDICTS.index(Verdict.ACCEPTED))
-    if len(left):
-        rule = ConsensusRule(min_support=options.min_support)
-        support[left], supported, contradicted = check_consensus(
-            vi_map, query[left], place[left], s.T_M_I[left], s.inlier_count[left], rule
-        )
-        verdict[left[contradicted]] = VERDICTS.index(Verdict.CONTRADICTED)
-        verdict[left[~supported & ~contradicted]] = VERDICTS.index(Verdict.NO_SUPPORT)
+    """Make the table of closures, with the verdicts of the gates."""
+    s, query = search.solutions, candidates.query_vertex
+    place = _most_seen(vi_map, search, candidates.place_vertex)
+    judgement = judge(vi_map, query, place, s, options, known_base_frames=known_base_frames)
     inlier = np.flatnonzero(s.is_inlier)
     problem = np.repeat(np.arange(len(query)), np.diff(search.start))[inlier]
     return Closures(
+        id=closure_ids(vi_map, query, place),
         query_vertex=query,
-        place_vertex=_most_seen(vi_map, search, place),
+        place_vertex=place,
         T_M_I=s.T_M_I,
+        T_A_B=se3.relative(s.T_M_I, vi_map.vertices.T_M_I[place]),
         covariance=s.covariance,
         match_count=s.keypoint_count,
         inlier_count=s.inlier_count,
-        tilt_deg=tilt_deg,
-        correction_m=correction,
-        verdict=verdict,
-        support=support,
+        tilt_deg=np.degrees(s.tilt_rad),
+        correction_m=judgement.correction_m,
+        correction_deg=judgement.correction_deg,
+        verdict=judgement.verdict,
+        support=judgement.support,
         start=starts_of_counts(np.bincount(problem, minlength=len(query))),
         keypoint=features.keypoint[search.feature[inlier]],
         landmark=search.landmark[inlier],

@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closures import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.geometry import se3, so3
-from maplab_py.vimap import LoopClosureEdges, VIMap
-from maplab_py.vimap.edits import content_rng
-from maplab_py.vimap.ids import random_ids
+from maplab_py.geometry import so3
+from maplab_py.vimap import LoopClosureEdges
 
 F64 = NDArray[np.float64]
 
@@ -18,22 +16,22 @@ _FLOOR_STD = np.array([0.01, 0.01, 0.01, 0.002, 0.002, 0.002])
 """[m, rad] What points of a map err in common, which their matches do not show."""
 
 
-def closure_edges(
-    vi_map: VIMap, closures: Closures, options: LoopClosureOptions
-) -> LoopClosureEdges:
+def closure_edges(closures: Closures, options: LoopClosureOptions) -> LoopClosureEdges:
     """Return one edge per accepted closure, from the query vertex (A) to the place's vertex (B).
 
     Closures that correct less than `edge_min_distance_meters` get none.
     """
     enough = closures.correction_m >= options.edge_min_distance_meters
     rows = np.flatnonzero(closures.accepted & enough)
+    _, first = np.unique(closures.id[rows], axis=0, return_index=True)
+    rows = rows[np.sort(first)]  # two neighbourhoods may have their best vertex in common
     T_M_A = closures.T_M_I[rows]
-    T_A_B = se3.relative(T_M_A, vi_map.vertices.T_M_I[closures.place_vertex[rows]])
+    T_A_B = closures.T_A_B[rows]
     covariance = _of_relative_pose(closures.covariance[rows], T_M_A, T_A_B)
     covariance += np.diag(_FLOOR_STD**2)
     return LoopClosureEdges.filled(
         len(rows),
-        id=random_ids(len(rows), content_rng(vi_map, "loop closure edges")),
+        id=closures.id[rows],
         from_vertex=closures.query_vertex[rows],
         to_vertex=closures.place_vertex[rows],
         T_A_B=T_A_B,

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.loop_closure.closure_report import TrainingReport
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera
@@ -15,7 +16,7 @@ from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.descriptors import pack_words
 from maplab_py.vision.index import DescriptorSet
-from maplab_py.vision.projection import DescriptorProjection, learn_projection
+from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_projection
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -44,8 +45,11 @@ def map_features(
     missions: I64,
     *,
     projection: DescriptorProjection | None = None,
+    dimensions: int = DIMENSIONS,
 ) -> tuple[MapFeatures, DescriptorProjection]:
     """Collect the features of some missions; learn the projection from their tracks unless given.
+
+    A projection for descriptors of another length is learned anew, too.
 
     Only descriptors of the most frequent length are used. Features of good landmarks that two or
     more keypoints observe form the database.
@@ -56,7 +60,7 @@ def map_features(
     frames = vi_map.frames
     wanted = np.isin(vi_map.vertices.mission[frames.vertex], missions) & frames.is_valid
     sizes = np.where(wanted, frames.descriptor_size, 0)
-    by_size = np.bincount(sizes, weights=frames.keypoint_count)
+    by_size = np.bincount(sizes, weights=frames.keypoint_count, minlength=1)
     by_size[0] = 0.0
     size = int(np.argmax(by_size))
     if size == 0 or by_size[size] == 0:
@@ -66,8 +70,8 @@ def map_features(
     keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
-    if projection is None:
-        projection = learn_projection(raw, landmark)
+    if projection is None or projection.descriptor_size != size:
+        projection = learn_projection(raw, landmark, dimensions=dimensions)
     vertex = vi_map.keypoint_vertex[keypoint].astype(np.int64)
     descriptors = DescriptorSet(
         projected=projection.project(raw),
@@ -87,6 +91,34 @@ def map_features(
         descriptor_bits=8 * size,
     )
     return features, projection
+
+
+def train_projection(
+    vi_map: VIMap, missions: I64 | None, dimensions: int
+) -> tuple[DescriptorProjection, TrainingReport]:
+    """Learn a projection from the tracks of some missions (rows; None = all).
+
+    Raises:
+        EstimationError: There are no descriptors, or too few tracks to learn from.
+    """
+    rows = np.arange(len(vi_map.missions)) if missions is None else missions
+    features, projection = map_features(vi_map, rows, dimensions=dimensions)
+    d = features.descriptors
+    order = np.argsort(d.label, kind="stable")
+    order = order[d.label[order] >= 0]
+    label, points = d.label[order], d.projected[order]
+    pairs = np.flatnonzero(label[1:] == label[:-1])
+    same = np.linalg.norm(points[pairs + 1] - points[pairs], axis=1)
+    shuffled = points[np.random.default_rng(0).permutation(len(points))]
+    other = np.linalg.norm(shuffled - points, axis=1)
+    return projection, TrainingReport(
+        descriptors=len(points),
+        tracks=len(np.unique(label)),
+        descriptor_size=projection.descriptor_size,
+        dimensions=len(projection.matrix),
+        same_distance=float(np.median(same)),
+        other_distance=float(np.median(other)),
+    )
 
 
 def findable_landmarks(vi_map: VIMap) -> Mask:

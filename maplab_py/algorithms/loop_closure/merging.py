@@ -25,13 +25,17 @@ GAP = "the closure corrects too much: relax first"
 UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class MergeResult:
-    """What merging did."""
+    """What merging did, and because of which closures."""
 
-    landmarks_merged: int = 0
-    observations_moved: int = 0
-    refused: dict[str, int] = dataclasses.field(default_factory=dict)  # landmark pairs by reason
+    landmarks_merged: int
+    observations_moved: int
+    refused: dict[str, int]  # landmark pairs by reason
+    first: I64  # (P,) landmark rows of united pairs before, one row per closure that speaks for it
+    second: I64  # (P,)
+    closure: I64  # (P,) row of the closure
+    wanted: int  # closures that had to agree
 
 
 def merge_verified_landmarks(
@@ -62,7 +66,7 @@ def merge_verified_landmarks(
     refuse(TOO_FAR, far)
     rows = rows[distance <= allowed]
 
-    first, second, votes, bits = _pairs(
+    pair, first, second, votes, bits = _pairs(
         source[rows], closures.landmark[rows], closures.query_vertex[closure[rows]],
         closures.bits[rows], len(vi_map.landmarks),
     )  # fmt: skip
@@ -78,10 +82,17 @@ def merge_verified_landmarks(
         refused[SAME_IMAGE] = int(np.count_nonzero(~fits))
     merged = merge_landmarks(vi_map, first[fits], second[fits])
     moved = np.isin(vi_map.keypoints.landmark, first[fits])
+    is_united = np.zeros(len(votes), dtype=np.bool_)
+    is_united[order[fits]] = True
+    speaks = np.flatnonzero(is_united[pair])
     return merged, MergeResult(
         landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
         observations_moved=int(np.count_nonzero(moved)),
         refused=refused,
+        first=source[rows[speaks]],
+        second=closures.landmark[rows[speaks]],
+        closure=closure[rows[speaks]],
+        wanted=options.min_merge_observations,
     )
 
 
@@ -111,20 +122,20 @@ def _distances(
 
 def _pairs(
     source: I64, target: I64, query: I64, bits: NDArray[np.int32], size: int
-) -> tuple[I64, I64, I64, F64]:
+) -> tuple[I64, I64, I64, I64, F64]:
     """Return pairs of landmarks, how many query vertices say so, and their mean bits.
 
     A pair is the same in both directions; the row that is larger merges into the smaller one.
+
+    Returns:
+        The pair of each match (N,); of each pair (P,) the two landmarks, votes and bits.
     """
-    first, second = np.maximum(source, target), np.minimum(source, target)
-    key = first * size + second
-    (
-        key,
-        inverse,
-    ) = np.unique(key, return_inverse=True)
-    seen = np.unique(inverse.astype(np.int64) * (query.max(initial=0) + 1) + query)
-    votes = np.bincount(seen // (query.max(initial=0) + 1), minlength=len(key))
-    mean = np.bincount(inverse, weights=bits, minlength=len(key)) / np.maximum(
-        np.bincount(inverse, minlength=len(key)), 1
+    key = np.maximum(source, target) * size + np.minimum(source, target)
+    key, pair = np.unique(key, return_inverse=True)
+    span = int(query.max(initial=0)) + 1
+    voters = np.unique(pair.astype(np.int64) * span + query)
+    votes = np.bincount(voters // span, minlength=len(key))
+    mean = np.bincount(pair, weights=bits, minlength=len(key)) / np.maximum(
+        np.bincount(pair, minlength=len(key)), 1
     )
-    return key // size, key % size, votes.astype(np.int64), mean
+    return pair, key // size, key % size, votes.astype(np.int64), mean

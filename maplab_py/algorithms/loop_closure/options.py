@@ -16,8 +16,17 @@ class LoopClosureOptions:
 
     detector_engine: str = option(
         "imi",
-        help="Descriptor index: imi (inverted multi-index) or hamming (exhaustive, slow)",
-        choices=("imi", "hamming"),
+        help="Descriptor index: imi (inverted multi-index), kd (KD-tree, exact in the projected "
+        "space) or hamming (exhaustive, slow)",
+        choices=("imi", "kd", "hamming"),
+    )
+    projection_matrix_filename: str = option(
+        "",
+        help="Projection of descriptors that train_projection_matrix wrote; empty, or of another "
+        "length of descriptors = learned from the map's own tracks",
+    )
+    target_dimensionality: int = option(
+        10, help="Dimensions of a projection that is learned from the map"
     )
     num_neighbors: int = option(-1, help="Landmarks to retrieve per keypoint; -1 = 3")
     num_words_for_nn_search: int = option(

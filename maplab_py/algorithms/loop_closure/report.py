@@ -16,8 +16,10 @@ class Verdict(Enum):
     LOW_RATIO = "too low a part of inliers"
     TILTED = "gravity deviates"
     IMPLAUSIBLE = "corrects more than the mission can have drifted"
+    AMBIGUOUS = "looks the same as another place"
     NO_SUPPORT = "no closures nearby agree"
     CONTRADICTED = "closures nearby disagree"
+    REMOVED = "removed by hand"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,8 @@ from maplab_py.algorithms.relaxation.pose_graph import RelativePoses, TiltPriors
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.geometry import se3
+from maplab_py.estimation.relative_pose_kernels import normal_blocks
+from maplab_py.geometry import se3, so3
 from maplab_py.progress import Progress
 
 F64 = NDArray[np.float64]
@@ -54,12 +55,26 @@ class PoseGraphOptimizer:
         self._t = variable[tilt.vertex]
         # each contribution is a block of its own: the solver adds those of equal place; the last
         # ones are the damping of the diagonal
-        diagonal = np.arange(len(self._free))
-        rows = [self._a, self._b, np.maximum(self._a, self._b), self._t, diagonal]
-        cols = [self._a, self._b, np.minimum(self._a, self._b), self._t, diagonal]
-        row, col = np.concatenate(rows), np.concatenate(cols)
-        self._kept = np.flatnonzero(col >= 0)
-        self._solver = BlockCholesky(row[self._kept], col[self._kept], len(self._free), 6)
+        a, b, nodes = self._a, self._b, np.arange(len(self._free))
+        places = [(a, a), (b, b), (np.maximum(a, b), np.minimum(a, b)), (self._t, self._t)]
+        wanted = [col >= 0 for _, col in places]
+        rows = [row[kept] for (row, _), kept in zip(places, wanted, strict=True)]
+        cols = [col[kept] for (_, col), kept in zip(places, wanted, strict=True)]
+        self._slot = np.full((len(a), 3), -1, dtype=np.int64)
+        first = 0
+        for part in range(3):
+            count = int(np.count_nonzero(wanted[part]))
+            self._slot[wanted[part], part] = first + np.arange(count)
+            first += count
+        turned = wanted[2] & (a > b)
+        self._slot[turned, 2] = -2 - self._slot[turned, 2]
+        self._num_edge_blocks = first
+        self._tilt_kept = np.flatnonzero(wanted[3])
+        size = len(self._free)
+        self._blocks = np.zeros((first + len(self._tilt_kept) + size, 6, 6))
+        self._solver = BlockCholesky(
+            np.concatenate([*rows, nodes]), np.concatenate([*cols, nodes]), size, 6
+        )
 
     def cost(self, T_G_I: F64, price: float) -> float:
         """Return the sum that is minimised, for poses (V, 7)."""
@@ -107,39 +122,47 @@ class PoseGraphOptimizer:
         rho, weight = u.copy(), np.ones(len(u))
         closures = slice(self._num_trajectory, None)
         rho[closures], weight[closures] = self._loss(u[closures], price)
-        tilt_error, J_t = self._tilt.linearized(T_G_I)
-        root = np.sqrt(weight)
-        error, J_a, J_b = (
-            error * root[:, None],
-            J_a * root[:, None, None],
-            J_b * root[:, None, None],
+        blocks = self._blocks
+        gradient, diagonal = np.zeros((2, len(self._free), 6))
+        normal_blocks(
+            error, J_a, J_b, weight, self._slot, self._a, self._b, blocks, gradient, diagonal
         )
-        aa, bb, tt = (np.swapaxes(J, 1, 2) @ J for J in (J_a, J_b, J_t))
-        ba = np.swapaxes(J_b, 1, 2) @ J_a
-        lower = np.where((self._a > self._b)[:, None, None], np.swapaxes(ba, 1, 2), ba)
-        gradient = np.zeros((len(self._free) + 1, 6))  # the last row is of poses that do not move
-        np.add.at(gradient, self._a, np.einsum("eij,ei->ej", J_a, error))
-        np.add.at(gradient, self._b, np.einsum("eij,ei->ej", J_b, error))
-        np.add.at(gradient, self._t, np.einsum("eij,ei->ej", J_t, tilt_error))
-        diagonal = np.zeros((len(self._free) + 1, 6))
-        for place, block in ((self._a, aa), (self._b, bb), (self._t, tt)):
-            np.add.at(diagonal, place, np.einsum("eii->ei", block))
-        damping = diagonal[:-1, :, None] * np.eye(6)
+        tilt_error, J_t = self._tilt.linearized(T_G_I)
+        tilt_error_kept, J_t = tilt_error[self._tilt_kept], J_t[self._tilt_kept]
+        tilt_blocks, tilt_node = np.swapaxes(J_t, 1, 2) @ J_t, self._t[self._tilt_kept]
+        np.add.at(gradient, tilt_node, np.einsum("eij,ei->ej", J_t, tilt_error_kept))
+        np.add.at(diagonal, tilt_node, np.einsum("eii->ei", tilt_blocks))
+        tilt_end = self._num_edge_blocks + len(tilt_node)
+        blocks[self._num_edge_blocks : tilt_end] = tilt_blocks
+        blocks[tilt_end:] = diagonal[:, :, None] * np.eye(6)
         return _Linearization(
             cost=float(np.sum(rho) + np.sum(tilt_error**2)),
-            gradient=gradient[:-1].reshape(-1),
-            blocks=np.concatenate([aa, bb, lower, tt, damping])[self._kept],
+            gradient=gradient.reshape(-1),
+            blocks=blocks,
         )
 
     def _step(self, T_G_I: F64, linear: _Linearization, damping: float) -> F64 | None:
         """Return the poses after one damped Gauss-Newton step; None when it has no solution."""
-        blocks = linear.blocks.copy()
-        blocks[-len(self._free) :] *= damping
+        undamped = linear.blocks[-len(self._free) :].copy()
+        linear.blocks[-len(self._free) :] *= damping
         try:
-            self._solver.factor(blocks)
+            self._solver.factor(linear.blocks)
         except NotPositiveDefinite:
             return None
+        finally:
+            linear.blocks[-len(self._free) :] = undamped
         step = self._solver.solve(-linear.gradient).reshape(-1, 6)
         moved = T_G_I.copy()
-        moved[self._free] = se3.retract(T_G_I[self._free], step)
+        moved[self._free] = _moved(T_G_I[self._free], step)
         return moved if bool(np.isfinite(moved).all()) else None
+
+
+def _moved(T_G_I: F64, step: F64) -> F64:
+    """Move poses (N, 7) along screws whose velocities [dp, dtheta] (N, 6) are the steps.
+
+    Equal to adding dp and turning by dtheta to first order. Where half a trajectory turns about a
+    far corner, screws keep its shape and sums stretch it: that saves most of the iterations.
+    """
+    twist = step.copy()
+    twist[:, :3] = so3.rotate(so3.inverse(T_G_I[:, :4]), step[:, :3])
+    return se3.compose(T_G_I, se3.exp(twist))

@@ -2,6 +2,7 @@
 
 Residual of an edge from vertex A to vertex B with measured T_A_B: e = [p_A_B - p_measured,
 Log(R_measured^T R_A_B)], the position part in A, the angular part in B; W e with W^T W = covariance^-1.
+Edges of public pose graphs have e = Log(T_measured^-1 T_A_B) in SE(3) instead.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.estimation import relative_pose_kernels as kernels
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import Backbone, VIMap
 from maplab_py.vimap.tables import LoopClosureEdges
 
 F64 = NDArray[np.float64]
@@ -32,6 +34,14 @@ class RelativePoses:
     to_vertex: I64  # (E,) B
     T_A_B: F64  # (E, 7)
     sqrt_information: F64  # (E, 6, 6) W, columns position, orientation
+    is_log: NDArray[np.bool_] = dataclasses.field(  # (E,) residual is the logarithm in SE(3)
+        default_factory=lambda: np.zeros(0, dtype=np.bool_)
+    )
+
+    def __post_init__(self) -> None:
+        """Take the split residual for all edges when nothing is said."""
+        if len(self.is_log) == 0:
+            object.__setattr__(self, "is_log", np.zeros(len(self.from_vertex), dtype=np.bool_))
 
     def __len__(self) -> int:
         return len(self.from_vertex)
@@ -43,6 +53,7 @@ class RelativePoses:
             self.to_vertex[rows],
             self.T_A_B[rows],
             self.sqrt_information[rows],
+            self.is_log[rows],
         )
 
     @classmethod
@@ -53,11 +64,14 @@ class RelativePoses:
             np.concatenate([first.to_vertex, second.to_vertex]),
             np.concatenate([first.T_A_B, second.T_A_B]),
             np.concatenate([first.sqrt_information, second.sqrt_information]),
+            np.concatenate([first.is_log, second.is_log]),
         )
 
     def errors(self, T_G_I: F64) -> F64:
         """Return the whitened residuals W e (E, 6) for vertex poses (V, 7)."""
-        return self._residuals(T_G_I)[0]
+        error = np.empty((len(self), 6))
+        kernels.relative_pose_errors(*self._arguments(T_G_I), error)
+        return error
 
     def squared_errors(self, T_G_I: F64) -> F64:
         """Return |W e|^2 (E,) for vertex poses (V, 7)."""
@@ -68,22 +82,20 @@ class RelativePoses:
 
         Perturbations as everywhere: p <- p + dp, R <- R exp(dtheta).
         """
-        error, T, angle = self._residuals(T_G_I)
-        R_A_G = so3.to_matrix(so3.inverse(T_G_I[self.from_vertex, :4]))
-        R_B_A = so3.to_matrix(so3.inverse(T[:, :4]))
-        J_angle = so3.right_jacobian_inverse(angle)
-        J_a, J_b = np.zeros((2, len(self), 6, 6))
-        J_a[:, :3, :3], J_a[:, :3, 3:] = -R_A_G, so3.skew(T[:, 4:])
-        J_a[:, 3:, 3:] = -J_angle @ R_B_A
-        J_b[:, :3, :3], J_b[:, 3:, 3:] = R_A_G, J_angle
-        return error, self.sqrt_information @ J_a, self.sqrt_information @ J_b
+        error = np.empty((len(self), 6))
+        J_a, J_b = np.empty((2, len(self), 6, 6))
+        kernels.relative_pose_jacobians(*self._arguments(T_G_I), error, J_a, J_b)
+        return error, J_a, J_b
 
-    def _residuals(self, T_G_I: F64) -> tuple[F64, F64, F64]:
-        """Return W e, T_A_B and the angular part of e."""
-        T = se3.relative(T_G_I[self.from_vertex], T_G_I[self.to_vertex])
-        angle = so3.log(so3.multiply(so3.inverse(self.T_A_B[:, :4]), T[:, :4]))
-        error = np.concatenate([T[:, 4:] - self.T_A_B[:, 4:], angle], axis=1)
-        return np.einsum("eij,ej->ei", self.sqrt_information, error), T, angle
+    def _arguments(self, T_G_I: F64) -> tuple[F64, I64, I64, F64, F64, NDArray[np.bool_]]:
+        return (
+            np.ascontiguousarray(T_G_I),
+            self.from_vertex,
+            self.to_vertex,
+            np.ascontiguousarray(self.T_A_B),
+            np.ascontiguousarray(self.sqrt_information),
+            self.is_log,
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,9 +137,10 @@ class TiltPriors:
 def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses:
     """Return the edges between consecutive vertices: their present relative poses.
 
-    The covariance has the shape of visual-inertial drift. Position errs by a random walk over the
-    distance, heading by one over time; roll and pitch less, since gravity shows them. So the
-    angular error is weighted in G's axes: W = diag(1/s_tilt, 1/s_tilt, 1/s_yaw) R_G_B.
+    Missions whose backbone is odometry keep what it measured, with its covariance, where they have
+    it. Elsewhere the covariance has the shape of visual-inertial drift. Position errs by a random
+    walk over the distance, heading by one over time; roll and pitch less, since gravity shows them.
+    So the angular error is weighted in G's axes: W = diag(1/s_tilt, 1/s_tilt, 1/s_yaw) R_G_B.
     """
     vertices = vi_map.vertices
     first = np.flatnonzero(np.diff(vertices.mission) == 0)
@@ -143,22 +156,62 @@ def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses
     W[:, [0, 1, 2], [0, 1, 2]] = 1.0 / sigma_p[:, None]
     sigma_angle = np.stack([sigma_tilt, sigma_tilt, sigma_yaw], axis=1)
     W[:, 3:, 3:] = so3.to_matrix(B[:, :4]) / sigma_angle[:, :, None]
-    return RelativePoses(first, first + 1, T_A_B, W)
+    edges = RelativePoses(first, first + 1, T_A_B, W)
+    return _with_odometry(vi_map, edges)
 
 
-def loop_edges(edges: LoopClosureEdges, options: RelaxationOptions) -> RelativePoses:
+def has_odometry_backbone(vi_map: VIMap) -> NDArray[np.bool_]:
+    """Tell of every vertex (V,) whether its mission hangs together by odometry, without an IMU."""
+    is_odometry = vi_map.missions.backbone == Backbone.ODOMETRY
+    return np.asarray(is_odometry[vi_map.vertices.mission])
+
+
+def _with_odometry(vi_map: VIMap, edges: RelativePoses) -> RelativePoses:
+    """Replace edges by those that odometry measured."""
+    odometry = vi_map.transformation_edges
+    chosen = has_odometry_backbone(vi_map)[odometry.from_vertex]
+    chosen &= odometry.to_vertex == odometry.from_vertex + 1
+    covariance = _symmetric(odometry.covariance)
+    chosen &= np.linalg.eigvalsh(covariance).min(axis=1, initial=np.inf) > 0.0
+    rows = np.flatnonzero(chosen)
+    edge_of_vertex = np.full(len(vi_map.vertices), -1, dtype=np.int64)
+    edge_of_vertex[edges.from_vertex] = np.arange(len(edges))
+    edge = edge_of_vertex[odometry.from_vertex[rows]]
+    T_A_B, W = edges.T_A_B.copy(), edges.sqrt_information.copy()
+    T_A_B[edge] = odometry.T_A_B[rows]
+    W[edge] = np.linalg.inv(np.linalg.cholesky(covariance[rows]))
+    return RelativePoses(edges.from_vertex, edges.to_vertex, T_A_B, W)
+
+
+def _symmetric(covariance: F64) -> F64:
+    """Return symmetric matrices (N, 6, 6), zero where there is something that is no number."""
+    symmetric = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    symmetric[~np.isfinite(symmetric).all(axis=(1, 2))] = 0.0
+    return np.asarray(symmetric)
+
+
+def loop_edges(
+    edges: LoopClosureEdges,
+    options: RelaxationOptions,
+    *,
+    as_given: NDArray[np.bool_] | None = None,
+) -> RelativePoses:
     """Return loop closures as edges; those without a usable covariance get the options' one.
 
     Every covariance is widened by 3 cm and 0.5 deg: a registration knows nothing of the drift and
     the depth errors of the landmarks that it stands on (and maplab writes 1e-7 I).
+
+    Args:
+        edges: Loop closures (E).
+        options: Fallback covariance.
+        as_given: Edges (E,) whose covariance is not to be widened.
     """
     fallback = np.repeat([options.loop_sigma_m, np.deg2rad(options.loop_sigma_deg)], 3) ** 2
-    covariance = np.array(edges.covariance)
-    symmetric = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    symmetric[~np.isfinite(symmetric).all(axis=(1, 2))] = 0.0
-    positive = np.linalg.eigvalsh(symmetric).min(axis=1) > 0.0
+    symmetric = _symmetric(np.array(edges.covariance))
+    positive = np.linalg.eigvalsh(symmetric).min(axis=1, initial=np.inf) > 0.0
     symmetric[~positive] = np.diag(fallback)
-    widened = symmetric + np.diag(_LOOP_FLOOR)
+    widen = np.ones(len(edges)) if as_given is None else ~as_given * 1.0
+    widened = symmetric + widen[:, None, None] * np.diag(_LOOP_FLOOR)
     W = np.linalg.inv(np.linalg.cholesky(widened))  # covariance = L L^T, so L^-1 whitens
     return RelativePoses(
         edges.from_vertex.astype(np.int64), edges.to_vertex.astype(np.int64), edges.T_A_B, W

@@ -28,6 +28,7 @@ from maplab_py.algorithms.relaxation.pose_graph import (
     RelativePoses,
     TiltPriors,
     clusters,
+    has_odometry_backbone,
     loop_edges,
     trajectory_edges,
     usable_loop_closures,
@@ -42,6 +43,16 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Relaxed:
+    """A relaxed map, and what became of every closure that was used."""
+
+    vi_map: VIMap
+    report: RelaxationReport
+    closures: LoopClosureEdges
+    weight: F64  # (E,) 1 = trusted, 0 = switched off
+
+
 def relax(
     vi_map: VIMap,
     options: RelaxationOptions,
@@ -50,6 +61,25 @@ def relax(
     missions: NDArray[np.int64] | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, RelaxationReport]:
+    """Relax the pose graph of a map; as `relax_graph`, for those who need no switches.
+
+    Raises:
+        EstimationError: The pose graph has no usable solution.
+    """
+    relaxed = relax_graph(
+        vi_map, options, loop_closures=loop_closures, missions=missions, progress=progress
+    )
+    return relaxed.vi_map, relaxed.report
+
+
+def relax_graph(
+    vi_map: VIMap,
+    options: RelaxationOptions,
+    *,
+    loop_closures: LoopClosureEdges | None = None,
+    missions: NDArray[np.int64] | None = None,
+    progress: Progress = SILENT,
+) -> Relaxed:
     """Relax the pose graph of a map.
 
     In each cluster of missions joined by closures the first vertex stays where it is. Missions
@@ -78,20 +108,23 @@ def relax(
     closures, notes = usable_loop_closures(vi_map, offered, missions)
     num_ignored = len(offered) - len(closures)
     if len(closures) == 0:
-        return vi_map, _nothing_done(num_ignored, notes)
+        return Relaxed(vi_map, _nothing_done(num_ignored, notes), closures, np.zeros(0))
     graph = trajectory_edges(vi_map, options)
-    loops = loop_edges(closures, options)
+    odometry = has_odometry_backbone(vi_map)
+    loops = loop_edges(closures, options, as_given=odometry[closures.from_vertex])
     label = clusters(len(vi_map.vertices), [graph, loops])
     is_active = np.isin(label, label[loops.from_vertex])
     graph = graph.take(np.flatnonzero(is_active[graph.from_vertex]))
     anchors = _anchors(label, is_active)
     is_free = is_active.copy()
     is_free[anchors] = False
-    tilt = TiltPriors.of_vertices(np.flatnonzero(is_free), vi_map.T_G_I, options.tilt_sigma_deg)
+    level = np.flatnonzero(is_free & ~odometry)
+    tilt = TiltPriors.of_vertices(level, vi_map.T_G_I, options.tilt_sigma_deg)
     solution = optimize_robustly(vi_map.T_G_I, is_free, graph, loops, tilt, options, progress)
     moved = move_vertices(vi_map, np.flatnonzero(is_free), solution.T_G_I)
     report = _report(vi_map, moved, is_active, len(anchors), loops, solution, num_ignored, notes)
-    return moved, dataclasses.replace(report, seconds=time.perf_counter() - begin)
+    report = dataclasses.replace(report, seconds=time.perf_counter() - begin)
+    return Relaxed(moved, report, closures, solution.weight)
 
 
 def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
-from maplab_py.geometry import se3
+from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.submaps import append_submaps
 from tests.support.data import shared_data
@@ -47,21 +48,31 @@ def test_closures_of_the_flight_agree_with_ground_truth():
     vi_map, _ = append_submaps(submaps)
     edges, report = find_loop_closures(vi_map)
     assert report.accepted_vertices >= 90
-    time_s, position, valid = ground_truth_positions(vi_map)
+    time_s, truth, valid = ground_truth_poses(vi_map)
+    position = truth[:, 4:]
     assert valid.sum() >= 148
     distance = np.linalg.norm(position[edges.from_vertex] - position[edges.to_vertex], axis=1)
     known = valid[edges.from_vertex] & valid[edges.to_vertex]
     error = np.abs(np.linalg.norm(edges.T_A_B[:, 4:], axis=1) - distance)[known]
     assert error.max() < 0.3
     assert np.median(error) < 0.05
+    # the truth's body may be turned against the IMU: angles of rotations do not mind
+    true = se3.relative(truth[edges.from_vertex], truth[edges.to_vertex])
+    angle_error = np.rad2deg(np.abs(angle_rad(edges.T_A_B) - angle_rad(true)))[known]
+    assert angle_error.max() < 3.0
+    assert np.median(angle_error) < 0.7
     assert np.all(np.diff(time_s) > 0)
 
 
-def ground_truth_positions(vi_map: VIMap):
+def angle_rad(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.linalg.norm(so3.log(T[:, :4]), axis=1)
+
+
+def ground_truth_poses(vi_map: VIMap):
     from maplab_py.geometry.interpolation import interpolate_poses
 
     table = np.loadtxt(shared_data("euroc_imu/V101.gt.csv"), delimiter=",", comments="#")
     poses = se3.make(table[:, [5, 6, 7, 4]], table[:, 1:4])
     time_ns = vi_map.vertices.timestamp_ns
     found, valid = interpolate_poses(table[:, 0].astype(np.int64), poses, time_ns)
-    return time_ns * 1e-9, found[:, 4:], valid
+    return time_ns * 1e-9, found, valid

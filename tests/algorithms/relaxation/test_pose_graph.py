@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -94,10 +96,19 @@ def _numeric(function, T, vertex):
     return np.stack(columns, axis=-1)
 
 
-def test_derivatives_match_finite_differences():
+@pytest.mark.parametrize("is_log", [False, True])
+def test_derivatives_match_finite_differences(is_log):
     loop = simulate(1)
     T = loop.vi_map.T_G_I.copy()
     edges = loop_edges(loop.closures.take(np.arange(3)), OPTIONS)
+    # exact, a small and a large error
+    T_A_B = se3.relative(T[edges.from_vertex], T[edges.to_vertex])
+    error = np.array([[0.0] * 6, [0.01, 0.0, 0.02, 0.001, -0.002, 0.0], [1, 2, -1, 0.5, -1.5, 1]])
+    T_A_B = se3.compose(T_A_B, se3.inverse(se3.exp(error)))
+    edges = dataclasses.replace(edges, T_A_B=T_A_B, is_log=np.full(3, is_log))
+    if is_log:
+        whitened = np.einsum("eij,ej->ei", edges.sqrt_information, error)
+        np.testing.assert_allclose(edges.errors(T), whitened, rtol=1e-9, atol=1e-9)
     _, J_a, J_b = edges.linearized(T)
     scale = np.abs(J_b).max()
     for row in range(3):

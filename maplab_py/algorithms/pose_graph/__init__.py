@@ -1,0 +1,1 @@
+"""Manipulation of pose graphs: uncertainties of edges, disturbed vertices, missions laid apart."""

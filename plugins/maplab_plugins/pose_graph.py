@@ -1,0 +1,95 @@
+"""Commands that exchange pose graphs and loop closures with other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
+from maplab_py.plugin import CommandContext, Message, UserError, command
+
+_RELAXATION = RelaxationOptions()
+
+
+@command(
+    "relax_external",
+    example="relax_external --relax_external_loop_closures_file=closures.yaml",
+    see_also=("relax",),
+)
+def relax_external(
+    context: CommandContext,
+    *,
+    options: RelaxationOptions = _RELAXATION,
+    relax_external_loop_closures_file: Path | None = None,
+    map_mission_list: str = "",
+) -> RelaxationReport:
+    """Bend the trajectories until loop closures from a file fit; edges of the map count too.
+
+    Args:
+        relax_external_loop_closures_file: YAML list of loop closures as maplab reads it: times and
+            poses of both ends, T_from_to, covariance, switch variable.
+        map_mission_list: Missions that may move, separated by commas; empty = all.
+    """
+    from maplab_py.algorithms.relaxation.relaxation import relax
+    from maplab_py.interop.external_closures import read_external_closures
+
+    if relax_external_loop_closures_file is None:
+        raise UserError("which closures? give --relax_external_loop_closures_file=FILE.yaml")
+    edges, notes = read_external_closures(context.vi_map, relax_external_loop_closures_file)
+    result, report = relax(
+        context.vi_map,
+        options,
+        loop_closures=edges,
+        missions=context.mission_rows("", map_mission_list),
+        progress=context.progress,
+    )
+    context.commit(result)
+    return dataclasses.replace(report, notes=(*notes, *report.notes))
+
+
+@command("import_g2o", example="import_g2o graph.g2o", needs_map=False, see_also=("export_g2o",))
+def import_g2o(context: CommandContext, file: Path, *, map_key: str = "") -> Message:
+    """Make a map of a pose graph: odometry along each robot, every other edge a loop closure.
+
+    Args:
+        file: Text file in g2o's format, with SE(3) or planar poses and edges.
+        map_key: Name of the map in memory; by default the file's name.
+    """
+    from maplab_py.algorithms.relaxation.graph import map_of_graph
+    from maplab_py.interop.g2o import read_g2o
+
+    vi_map = map_of_graph(read_g2o(file))
+    key = map_key or file.stem
+    context.maps.add(key, vi_map)
+    return Message(
+        f"map '{key}': {len(vi_map.missions)} missions, {len(vi_map.vertices)} vertices, "
+        f"{len(vi_map.transformation_edges)} odometry and {len(vi_map.loop_closure_edges)} loop "
+        "closure edges"
+    )
+
+
+@command(
+    "export_g2o",
+    example="export_g2o graph.g2o",
+    see_also=("import_g2o", "relax"),
+    acts_outside=True,
+)
+def export_g2o(
+    context: CommandContext,
+    file: Path,
+    *,
+    options: RelaxationOptions = _RELAXATION,
+    overwrite: bool = False,
+) -> Message:
+    """Write the pose graph that relax works on: trajectories with their drift, and loop closures.
+
+    Args:
+        file: Text file to write.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.algorithms.relaxation.graph import graph_of_map
+    from maplab_py.interop.g2o import write_g2o
+
+    graph = graph_of_map(context.vi_map, options)
+    write_g2o(graph, file, overwrite=overwrite)
+    return Message(f"{file}: {len(graph.id)} poses and {len(graph.first)} edges")
