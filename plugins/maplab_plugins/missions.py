@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from maplab_py.algorithms.pose_graph.layout import LayoutOptions
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.vimap.ids import to_hex
 
+_LAYOUT = LayoutOptions()
 
-@command("remove_mission", "rm", example="remove_mission --map_mission=59f0")
+
+@command("remove_mission", "rm", example="remove_mission --map_mission=59f0 --yes")
 def remove_mission(
     context: CommandContext, map_mission: str = "", *, map_mission_list: str = "", yes: bool = False
 ) -> Message:
@@ -39,7 +42,10 @@ def set_mission_baseframe_to_known(context: CommandContext, map_mission: str = "
     return _set_one(context, map_mission, is_known=True)
 
 
-@command("set_mission_baseframe_to_unknown")
+@command(
+    "set_mission_baseframe_to_unknown",
+    example="set_mission_baseframe_to_unknown --map_mission=59f0",
+)
 def set_mission_baseframe_to_unknown(context: CommandContext, map_mission: str) -> Message:
     """Declare that a mission's base frame T_G_M is not to be relied on.
 
@@ -80,3 +86,17 @@ def _set_all(context: CommandContext, *, is_known: bool) -> Message:
     context.commit(vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=known)))
     state = "known" if is_known else "unknown"
     return Message(f"base frames of {len(vi_map.missions)} missions are {state} now")
+
+
+@command("spatially_distribute_missions", example="spatially_distribute_missions")
+def spatially_distribute_missions(
+    context: CommandContext, *, options: LayoutOptions = _LAYOUT
+) -> Message:
+    """Shift missions of unknown base frame apart, so that they can be looked at one by one."""
+    from maplab_py.algorithms.pose_graph.layout import distribute_missions
+
+    result, count = distribute_missions(context.vi_map, options)
+    context.commit(result)
+    if count == 0:
+        return Message("the base frames of all missions are known: nothing was moved")
+    return Message(f"{count} missions of unknown base frame were moved")

@@ -1,10 +1,12 @@
-"""The keyframing command, through the session."""
+"""Keyframing and sparsification, through the session."""
+
+from pathlib import Path
 
 import pytest
 
 from maplab_py.console.registry import load_registry
 from maplab_py.console.session import Session
-from maplab_py.errors import FlagError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.vimap.consistency import check_consistency
 from tests.vimap.builders import walk_map
 
@@ -29,3 +31,26 @@ def test_a_dry_run_says_what_keyframing_then_does(session: Session) -> None:
 def test_a_bad_threshold_is_refused(session: Session) -> None:
     with pytest.raises(FlagError, match="kf_every_nth_vertex"):
         session.run("kfh", kf_every_nth_vertex=0)
+
+
+def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: Path) -> None:
+    table = tmp_path / "coverage.csv"
+    before = session.vi_map
+    planned = session.run("lsparsify", num_landmarks_to_keep=15, dry_run=True, coverage_csv=table)
+    assert session.vi_map is before
+    done = session.run("landmark_sparsify", num_landmarks_to_keep=15)
+    assert len(session.vi_map.landmarks) == 15 == planned.landmarks_after == done.landmarks_after
+    assert check_consistency(session.vi_map).errors == ()
+    header, *lines = table.read_text().splitlines()
+    assert header == "vertex,before,after,wanted"
+    assert len(lines) == done.keyframes
+
+
+def test_sparsification_asks_for_a_number(session: Session, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--num_landmarks_to_keep=N"):
+        session.run("landmark_sparsify")
+    table = tmp_path / "coverage.csv"
+    table.write_text("mine")
+    with pytest.raises(UserError, match="overwrite"):
+        session.run("landmark_sparsify", num_landmarks_to_keep=15, coverage_csv=table)
+    assert table.read_text() == "mine"

@@ -1,0 +1,1 @@
+"""Localisation: where in a map was an image taken?"""

@@ -1,0 +1,142 @@
+"""What localisation searches in: landmarks and their descriptors, of a full or a summary map."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.storage.summary_map import SummaryMap
+from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vision.index import DescriptorSet
+from maplab_py.vision.projection import DescriptorProjection
+
+F64 = NDArray[np.float64]
+U64 = NDArray[np.uint64]
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LocalizationMap:
+    """L landmarks seen by K observers in N observations."""
+
+    p_G: F64  # (L, 3)
+    descriptors: DescriptorSet  # (N,) labels are landmark rows; without words in summary maps
+    observer: I64  # (N,)
+    p_G_observer: F64  # (K, 3)
+    observer_id: U64 | None  # (K, 2) ids of the observing vertices
+    projection: DescriptorProjection
+
+    @property
+    def has_bits(self) -> bool:
+        """Tell whether descriptors are there bit by bit, not only projected."""
+        return bool(self.descriptors.words.shape[1] > 0)
+
+    @cached_property
+    def observers_of(self) -> tuple[I64, I64]:
+        """Offsets (L + 1) and observers, by landmark."""
+        return _grouped(self.descriptors.label, self.observer, len(self.p_G))
+
+    @cached_property
+    def landmarks_of(self) -> tuple[I64, I64]:
+        """Offsets (K + 1) and landmarks, by observer."""
+        return _grouped(self.observer, self.descriptors.label, len(self.p_G_observer))
+
+    def place_of(self, observer: int, min_shared: int) -> NDArray[np.bool_]:
+        """Tell which observers (K,) share so many landmarks with one; it is always among them."""
+        start, landmarks = self.landmarks_of
+        mine = landmarks[start[observer] : start[observer + 1]]
+        offset, observers = self.observers_of
+        seen = observers[ragged_rows(offset, mine)]
+        near = np.bincount(seen, minlength=len(self.p_G_observer)) >= min_shared
+        near[observer] = True
+        return np.asarray(near)
+
+
+def database_of_map(
+    vi_map: VIMap, *, missions: I64 | None = None, projection: DescriptorProjection | None = None
+) -> LocalizationMap:
+    """Use the good landmarks that some missions (None = all) observe.
+
+    One observation is enough: keyframing takes the others, but not the place that they gave.
+
+    Raises:
+        EstimationError: There is none with descriptors, or the projection cannot be learned.
+    """
+    judged, _ = with_quality(vi_map)
+    rows = np.arange(len(judged.missions)) if missions is None else missions
+    features, projection = map_features(judged, rows, projection=projection)
+    found = features_of_good_landmarks(judged, features)
+    if len(found) == 0:
+        raise EstimationError("the map has no good landmark with descriptors: run rtl")
+    descriptors = features.descriptors.take(found)
+    landmarks, label = np.unique(descriptors.label, return_inverse=True)
+    vertices, observer = np.unique(features.vertex[found], return_inverse=True)
+    return LocalizationMap(
+        p_G=judged.p_G[landmarks],
+        descriptors=dataclasses.replace(descriptors, label=label.reshape(-1)),
+        observer=observer.reshape(-1),
+        p_G_observer=judged.T_G_I[vertices, 4:],
+        observer_id=judged.vertices.id[vertices],
+        projection=projection,
+    )
+
+
+def features_of_good_landmarks(vi_map: VIMap, features: MapFeatures) -> I64:
+    """Return the rows of features that observe a landmark of good quality."""
+    good = np.append(vi_map.landmarks.quality == LandmarkQuality.GOOD, False)
+    return np.flatnonzero(good[features.descriptors.label])
+
+
+def database_of_summary(
+    summary: SummaryMap, projection: DescriptorProjection | None = None
+) -> LocalizationMap:
+    """Use a summary map.
+
+    Args:
+        summary: The summary map.
+        projection: Projection that its descriptors were made with; by default its own.
+
+    Raises:
+        UserError: It holds no projection and none is given, or it is empty.
+    """
+    if projection is None:
+        if summary.projection is None:
+            raise UserError(
+                "the summary map does not hold the projection of its descriptors: it was written "
+                "by another program"
+            )
+        projection = DescriptorProjection(summary.projection)
+    count = len(summary.descriptors)
+    if count == 0:
+        raise UserError("the summary map has no landmark")
+    order = np.argsort(summary.landmark, kind="stable")
+    descriptors = DescriptorSet(
+        projected=np.ascontiguousarray(summary.descriptors[order]),
+        words=np.zeros((count, 0), dtype=np.uint64),
+        label=summary.landmark[order].astype(np.int64),
+        session=np.zeros(count, dtype=np.int32),
+        time_ns=np.zeros(count, dtype=np.int64),
+    )
+    return LocalizationMap(
+        p_G=summary.p_G.astype(np.float64),
+        descriptors=descriptors,
+        observer=summary.observer[order].astype(np.int64),
+        p_G_observer=summary.p_G_observer.astype(np.float64),
+        observer_id=summary.observer_id,
+        projection=projection,
+    )
+
+
+def _grouped(key: I64, value: I64, groups: int) -> tuple[I64, I64]:
+    """Return offsets (groups + 1) and distinct values, by key."""
+    size = int(value.max(initial=0)) + 1
+    pairs = np.unique(key * size + value)
+    counts = np.bincount(pairs // size, minlength=groups)
+    return starts_of_counts(counts), pairs % size

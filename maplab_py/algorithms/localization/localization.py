@@ -1,0 +1,178 @@
+"""Localise all vertices of some missions in a map, and compare with a reference."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.localization.queries import queries, query_vertices
+from maplab_py.algorithms.localization.report import Distribution, LocalizationReport
+from maplab_py.geometry import se3
+from maplab_py.geometry.alignment import align_yaw_position, umeyama
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_ROUNDS = 15
+_TRUSTED = 3.0
+"""Points further off than as many times the median do not take part in an alignment."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Localizations:
+    """Answers to all queries, one row each."""
+
+    vertex: I64  # (Q,) vertex rows of the query map
+    T_G_I: F64  # (Q, 7), in the G of the map that was searched
+    is_localized: Mask  # (Q,)
+    answers: tuple[Localization, ...]
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reference:
+    """Where the queries really were, in a frame R of its own."""
+
+    name: str
+    T_R_I: F64  # (Q, 7)
+    is_known: Mask  # (Q,)
+
+
+def localize_missions(
+    database: LocalizationMap,
+    vi_map: VIMap,
+    options: LocalizationOptions,
+    *,
+    missions: I64 | None = None,
+    sequence_length: int = 1,
+    progress: Progress = SILENT,
+) -> Localizations:
+    """Localise every vertex of some missions (None = all), one after the other.
+
+    Args:
+        database: Where to localise; it is not changed.
+        vi_map: The map whose vertices are the queries; it is not changed.
+        options: Thresholds.
+        missions: Mission rows of the queries.
+        sequence_length: Vertices whose images make up one query.
+        progress: Progress.
+
+    Raises:
+        EstimationError: The query has no descriptors, or of another length than the map's.
+    """
+    begin = time.perf_counter()
+    rows = np.arange(len(vi_map.missions)) if missions is None else missions
+    source = query_vertices(vi_map, rows, database.projection)
+    localizer = Localizer(database, options)
+    answers = []
+    for number, query in enumerate(queries(source, sequence_length)):
+        progress.step(number, len(source.vertex), "queries")
+        answers.append(localizer.localize(query))
+    return Localizations(
+        vertex=source.vertex,
+        T_G_I=np.array([answer.T_G_I for answer in answers]).reshape(-1, 7),
+        is_localized=np.array([a.outcome is Outcome.LOCALIZED for a in answers], dtype=np.bool_),
+        answers=tuple(answers),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def align_robustly(p_R: F64, p_G: F64, *, level: bool) -> F64:
+    """Return T_R_G (7,) that lays points of G on those of R although some pairs are wrong.
+
+    Pairs that are far off, compared with the median, leave; what remains is aligned again.
+
+    Args:
+        p_R: Points (N, 3).
+        p_G: Points (N, 3).
+        level: Both frames are gravity-aligned: turn about the vertical only.
+    """
+    kept = np.ones(len(p_R), dtype=np.bool_)
+    T_R_G = se3.identity()
+    for _ in range(_ROUNDS):
+        if level:
+            T_R_G = align_yaw_position(p_R[kept], p_G[kept])
+        else:
+            T_R_G, _ = umeyama(p_R[kept], p_G[kept])
+        error = np.linalg.norm(p_R - se3.transform(T_R_G, p_G), axis=1)
+        now = error <= max(_TRUSTED * float(np.median(error)), 1e-6)
+        if np.array_equal(now, kept) or now.sum() < 3:
+            break
+        kept = now
+    return T_R_G
+
+
+def pose_errors(found: Localizations, reference: Reference, T_R_G: F64) -> tuple[F64, F64]:
+    """Return position [m] and orientation errors [deg] (Q,), NaN where there is no answer."""
+    step = se3.local(reference.T_R_I, se3.compose(T_R_G, found.T_G_I))
+    valid = found.is_localized & reference.is_known
+    position = np.where(valid, np.linalg.norm(step[:, :3], axis=1), np.nan)
+    orientation = np.where(valid, np.degrees(np.linalg.norm(step[:, 3:], axis=1)), np.nan)
+    return position, orientation
+
+
+def describe(
+    database: LocalizationMap,
+    found: Localizations,
+    *,
+    reference: Reference | None = None,
+    T_R_G: F64 | None = None,
+    success_error_m: float = 0.5,
+) -> LocalizationReport:
+    """Summarise answers, and their errors if there is a reference."""
+    outcomes = [answer.outcome for answer in found.answers]
+    refused = {
+        outcome.value: outcomes.count(outcome)
+        for outcome in Outcome
+        if outcome is not Outcome.LOCALIZED and outcome in outcomes
+    }
+    position = orientation = np.full(len(outcomes), np.nan)
+    known = np.zeros(len(outcomes), dtype=np.bool_)
+    if reference is not None and T_R_G is not None:
+        position, orientation = pose_errors(found, reference, T_R_G)
+        known = reference.is_known
+    success = int(np.count_nonzero(position < success_error_m))
+    localized = int(found.is_localized.sum())
+    answered = [answer for answer in found.answers if answer.outcome is Outcome.LOCALIZED]
+    return LocalizationReport(
+        map_kind="full" if database.has_bits else "summary",
+        map_landmarks=len(database.p_G),
+        map_observations=len(database.descriptors),
+        queries=len(outcomes),
+        localized=localized,
+        localized_share=localized / max(len(outcomes), 1),
+        refused=refused,
+        reference=reference.name if reference is not None else "",
+        queries_with_reference=int(known.sum()),
+        success=success,
+        success_share=success / max(int(known.sum()), 1),
+        wrong=int(np.count_nonzero(position >= success_error_m)),
+        success_error_m=success_error_m,
+        position_error_m=_distribution(position),
+        orientation_error_deg=_distribution(orientation),
+        inliers=_distribution(np.array([a.inliers for a in answered], dtype=np.float64)),
+        matching_ms=_distribution(1e3 * np.array([a.matching_s for a in found.answers])),
+        ransac_ms=_distribution(1e3 * np.array([a.ransac_s for a in found.answers])),
+        seconds=found.seconds,
+    )
+
+
+def _distribution(values: F64) -> Distribution | None:
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return None
+    return Distribution(
+        median=float(np.median(values)),
+        mean=float(values.mean()),
+        percentile_95=float(np.percentile(values, 95.0)),
+        largest=float(values.max()),
+    )

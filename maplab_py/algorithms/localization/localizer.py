@@ -1,0 +1,202 @@
+"""Localise one query at a time: matches, places, pose. Nothing is learned from query to query."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.vimap.table import ragged_rows
+from maplab_py.vision.absolute_pose import PoseProblems, solve_poses
+from maplab_py.vision.descriptors import pack_words
+from maplab_py.vision.index import DescriptorSet, MatchRule
+from maplab_py.vision.multi_index import InvertedMultiIndex
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+_CERTAIN = 2
+"""As many times the wanted inliers leave no doubt: no further place is tried."""
+
+
+class Outcome(Enum):
+    """What became of a query."""
+
+    LOCALIZED = "localized"
+    FEW_MATCHES = "too few matches with one place"
+    FEW_INLIERS = "too few inliers"
+    TILTED = "gravity deviates"
+    UNCERTAIN = "position too uncertain"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Query:
+    """Keypoints of one image, of a rig's images, or of a short sequence, in one body frame."""
+
+    key: int  # with the seed it decides the random numbers
+    descriptors: NDArray[np.uint8]  # (N, bytes)
+    origin_I: F64  # (N, 3) camera centres in the body frame [m]
+    ray_I: F64  # (N, 3) unit rays in the body frame
+    rad_per_px: F64  # (N,) angle that a pixel covers
+    q_M_I: F64  # (4,) attitude in a gravity-aligned frame; its yaw does not matter
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Localization:
+    """Answer to one query; the pose means something only when localised."""
+
+    outcome: Outcome
+    T_G_I: F64  # (7,)
+    covariance: F64  # (6, 6) of [dp, dtheta], NaN where undetermined
+    keypoints: int
+    matches: int  # keypoints with a match in the best place
+    inliers: int  # landmarks that agree with the pose
+    keypoint: I64  # (inliers,) rows of the query
+    landmark: I64  # (inliers,) rows of the map
+    matching_s: float
+    ransac_s: float
+
+
+class Localizer:
+    """A map, indexed."""
+
+    def __init__(self, database: LocalizationMap, options: LocalizationOptions) -> None:
+        """Build the index.
+
+        Args:
+            database: Where to localise.
+            options: Thresholds.
+        """
+        self._map = database
+        self._options = options
+        self._index = InvertedMultiIndex(
+            database.descriptors,
+            seed=options.seed,
+            cells_per_query=options.num_words_for_nn_search,
+            rank_by_bits=database.has_bits,
+        )
+        bits = 8 * database.projection.descriptor_size
+        self._max_distance = (
+            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+        )
+
+    def localize(self, query: Query) -> Localization:
+        """Find the pose of a query in G."""
+        begin = time.perf_counter()
+        keypoint, landmark = self._match(query)
+        places = self._places(keypoint, landmark)
+        matched = time.perf_counter()
+        answer = self._solve(query, keypoint, landmark, places)
+        return dataclasses.replace(
+            answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
+        )
+
+    def _match(self, query: Query) -> tuple[I64, I64]:
+        """Return keypoints and landmarks of all matches, sorted by keypoint."""
+        count = len(query.descriptors)
+        raw = np.ascontiguousarray(query.descriptors)
+        words = self._map.descriptors.words.shape[1]
+        descriptors = DescriptorSet(
+            projected=self._map.projection.project(raw),
+            words=pack_words(raw) if words else np.zeros((count, 0), dtype=np.uint64),
+            label=np.full(count, -1, dtype=np.int64),
+            session=np.full(count, -1, dtype=np.int32),
+            time_ns=np.zeros(count, dtype=np.int64),
+        )
+        found = self._index.nearest(descriptors, self._options.num_neighbors, MatchRule())
+        keypoint, rank = np.nonzero((found.row >= 0) & (found.distance <= self._max_distance))
+        return keypoint, self._map.descriptors.label[found.row[keypoint, rank]]
+
+    def _places(self, keypoint: I64, landmark: I64) -> list[I64]:
+        """Return the rows of the matches in each of the best places.
+
+        Every matched landmark votes for its observers; the observer with most votes and those
+        that share landmarks with it are a place (Sattler et al., ICCV 2015).
+        """
+        o = self._options
+        found: list[I64] = []
+        distinct, index = np.unique(landmark, return_inverse=True)
+        offset, observers = self._map.observers_of
+        rows = ragged_rows(offset, distinct)
+        owner = np.repeat(np.arange(len(distinct)), np.diff(offset)[distinct])
+        voter = observers[rows]
+        votes = np.bincount(voter, minlength=len(self._map.p_G_observer))
+        for _ in range(o.places):
+            best = int(np.argmax(votes)) if len(votes) else 0
+            if len(distinct) == 0 or votes[best] < 3:
+                break
+            near = self._map.place_of(best, o.min_shared_landmarks)
+            inside = np.bincount(owner, near[voter], minlength=len(distinct)) > 0
+            matches = np.flatnonzero(inside[index.reshape(-1)])
+            if len(np.unique(keypoint[matches])) >= o.min_matches:
+                found.append(matches)
+            votes = np.where(near, 0, votes)
+        return found
+
+    def _solve(self, query: Query, keypoint: I64, landmark: I64, places: list[I64]) -> Localization:
+        """Search the pose place by place; the most inliers win, and many inliers end the search."""
+        best = _failed(Outcome.FEW_MATCHES, len(query.descriptors))
+        for number, rows in enumerate(places):
+            found = self._solve_place(query, number, keypoint[rows], landmark[rows])
+            if best.outcome is Outcome.FEW_MATCHES or found.inliers > best.inliers:
+                best = found
+            enough = _CERTAIN * self._options.min_inlier_count
+            if best.outcome is Outcome.LOCALIZED and best.inliers >= enough:
+                break
+        return best
+
+    def _solve_place(self, query: Query, number: int, keypoint: I64, landmark: I64) -> Localization:
+        """Search the pose from the matches in one place, sorted by keypoint."""
+        o = self._options
+        solutions = solve_poses(
+            PoseProblems(
+                start=np.array([0, len(keypoint)]),
+                key=np.array([query.key * o.places + number]),
+                q_M_I=query.q_M_I[None],
+                origin_I=query.origin_I[keypoint],
+                ray_I=query.ray_I[keypoint],
+                point_M=self._map.p_G[landmark],
+                keypoint=keypoint,
+                tolerance=o.ransac_pixel_sigma * query.rad_per_px[keypoint],
+            ),
+            seed=o.seed,
+            max_iterations=o.num_ransac_iters,
+        )
+        agreeing = np.flatnonzero(solutions.is_inlier)
+        landmarks = len(np.unique(landmark[agreeing]))
+        covariance = solutions.covariance[0]
+        matched, inliers = int(solutions.keypoint_count[0]), int(solutions.inlier_count[0])
+        sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
+        if landmarks < o.min_inlier_count or inliers < o.min_inlier_ratio * matched:
+            outcome = Outcome.FEW_INLIERS
+        elif np.degrees(solutions.tilt_rad[0]) > o.max_gravity_misalignment_deg:
+            outcome = Outcome.TILTED
+        elif not sigma <= o.max_position_sigma_m:
+            outcome = Outcome.UNCERTAIN
+        else:
+            outcome = Outcome.LOCALIZED
+        return Localization(
+            outcome=outcome,
+            T_G_I=solutions.T_M_I[0],
+            covariance=covariance,
+            keypoints=len(query.descriptors),
+            matches=matched,
+            inliers=landmarks,
+            keypoint=keypoint[agreeing],
+            landmark=landmark[agreeing],
+            matching_s=0.0,
+            ransac_s=0.0,
+        )
+
+
+def _failed(outcome: Outcome, keypoints: int) -> Localization:
+    none = np.zeros(0, dtype=np.int64)
+    identity = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    unknown = np.full((6, 6), np.nan)
+    return Localization(outcome, identity, unknown, keypoints, 0, 0, none, none, 0.0, 0.0)

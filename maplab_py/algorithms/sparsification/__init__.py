@@ -1,0 +1,1 @@
+"""Sparsification: which landmarks are worth keeping."""

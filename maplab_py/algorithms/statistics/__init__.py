@@ -1,0 +1,1 @@
+"""What a map consists of, in numbers and in bytes."""

@@ -1,0 +1,1 @@
+"""Summary maps: a map reduced to what localisation needs."""

@@ -1,0 +1,63 @@
+"""Options and reports of summary maps."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+from maplab_py.report import Report
+
+
+@dataclasses.dataclass(frozen=True)
+class SummaryMapOptions:
+    """What a summary map holds."""
+
+    flag_prefix: ClassVar[str] = "summary_map_"
+
+    descriptor_step: float = option(
+        1.0 / 32.0,
+        help="Projected descriptors are rounded to multiples of this, which makes the file half as "
+        "large; noise within a track is about 1; 0 = not rounded.",
+    )
+    max_observations_per_landmark: int = option(
+        0, help="Observations that are kept of a landmark, spread over all of them; 0 = all."
+    )
+    covariances: bool = option(True, help="Write a covariance for every landmark.")
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.descriptor_step < 0.0:
+            raise FlagError("--summary_map_descriptor_step must not be negative")
+        if self.max_observations_per_landmark < 0:
+            raise FlagError("--summary_map_max_observations_per_landmark must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class SummaryMapReport(Report):
+    """What went into a summary map."""
+
+    landmarks: int
+    observations: int
+    observers: int
+    descriptor_dimensions: int
+    megabytes: float  # of the file
+    file: Path
+
+
+@dataclasses.dataclass(frozen=True)
+class SummaryMapContent(Report):
+    """What is in a summary map."""
+
+    landmarks: int
+    observations: int
+    observers: int
+    descriptor_dimensions: int
+    has_ids: bool
+    has_projection: bool
+    cameras: int
+    median_position_sigma_m: float | None  # of landmarks, where the file has covariances
+    extent_m: tuple[float, float, float]  # of the observers
+    megabytes: float

@@ -1,0 +1,117 @@
+"""Make a summary map: good landmarks in G, their projected descriptors, and who saw them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.localization.database import features_of_good_landmarks
+from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.errors import EstimationError
+from maplab_py.geometry import se3, so3
+from maplab_py.progress import SILENT, Progress
+from maplab_py.storage.summary_map import SummaryMap
+from maplab_py.vimap import VIMap
+from maplab_py.vision.projection import DescriptorProjection
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_FLAT_DIRECTION_SIGMA_M = 10.0
+"""Standard deviation that the prior gives a landmark along directions nobody observes."""
+
+
+def make_summary_map(
+    vi_map: VIMap,
+    options: SummaryMapOptions,
+    *,
+    projection: DescriptorProjection | None = None,
+    progress: Progress = SILENT,
+) -> SummaryMap:
+    """Reduce a map to its good landmarks, as seen from G.
+
+    Landmarks of unknown quality are judged first.
+
+    Args:
+        vi_map: The map; its base frames say where its missions are in G.
+        options: What the summary holds.
+        projection: Projection of the descriptors; by default learned from the map's tracks.
+        progress: Progress.
+
+    Raises:
+        EstimationError: No good landmark has descriptors, or too few tracks to learn from.
+    """
+    judged, _ = with_quality(vi_map, progress)
+    missions = np.arange(len(judged.missions))
+    features, projection = map_features(judged, missions, projection=projection)
+    rows = features_of_good_landmarks(judged, features)
+    if len(rows) == 0:
+        raise EstimationError("no good landmark has descriptors: run rtl")
+    rows = rows[np.argsort(features.descriptors.label[rows], kind="stable")]
+    if options.max_observations_per_landmark:
+        rows = _spread(rows, features, options.max_observations_per_landmark)
+    landmarks, landmark = np.unique(features.descriptors.label[rows], return_inverse=True)
+    vertices, observer = np.unique(features.vertex[rows], return_inverse=True)
+    projected = features.descriptors.projected[rows]
+    if options.descriptor_step:
+        step = np.float32(options.descriptor_step)
+        projected = np.round(projected / step) * step
+    covariance = None
+    if options.covariances:
+        covariance = landmark_covariances(judged, features)[landmarks].astype(np.float32)
+    return SummaryMap(
+        p_G=judged.p_G[landmarks].astype(np.float32),
+        p_G_observer=judged.T_G_I[vertices, 4:].astype(np.float32),
+        descriptors=np.ascontiguousarray(projected, dtype=np.float32),
+        landmark=landmark.reshape(-1).astype(np.uint32),
+        observer=observer.reshape(-1).astype(np.uint32),
+        landmark_id=judged.landmarks.id[landmarks],
+        observer_id=judged.vertices.id[vertices],
+        landmark_covariance=covariance,
+        projection=projection.matrix,
+        sensors=judged.sensors,
+    )
+
+
+def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:
+    """Return the covariance (L, 3, 3) of landmarks in G, the poses of their observers given [m^2].
+
+    A ray fixes its landmark across by depth times angle: information (I - d d^T) / (z sigma)^2. A
+    weak prior keeps unobserved directions finite.
+    """
+    mine = np.flatnonzero(features.descriptors.label >= 0)
+    landmark, vertex = features.descriptors.label[mine], features.vertex[mine]
+    T_G_I = vi_map.T_G_I[vertex]
+    offset = vi_map.p_G[landmark] - se3.transform(T_G_I, features.origin_I[mine])
+    ray = so3.rotate(T_G_I[:, :4], features.ray_I[mine])
+    depth = np.linalg.norm(offset, axis=1)
+    sigma_rad = vi_map.keypoints.sigma_px[features.keypoint[mine]] * features.rad_per_px[mine]
+    weight = 1.0 / np.maximum(depth * sigma_rad, 1e-6) ** 2
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    information = np.zeros((len(vi_map.landmarks), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            information[:, i, j] = np.bincount(
+                landmark, weight * across[:, i, j], minlength=len(information)
+            )
+    return np.asarray(np.linalg.inv(information + np.eye(3) / _FLAT_DIRECTION_SIGMA_M**2))
+
+
+def _spread(rows: I64, features: MapFeatures, most: int) -> I64:
+    """Keep at most so many observations of each landmark, evenly over its observers.
+
+    Args:
+        rows: Feature rows sorted by landmark.
+        features: The features.
+        most: Observations to keep.
+    """
+    label = features.descriptors.label[rows]
+    _, first, count = np.unique(label, return_index=True, return_counts=True)
+    rank = np.arange(len(rows)) - np.repeat(first, count)
+    total = np.repeat(count, count)
+    # keep where the rank enters a new one of `most` equal parts
+    part = rank * most // total
+    before = (rank - 1) * most // total
+    return np.asarray(rows[(total <= most) | (rank == 0) | (part != before)])

@@ -1,0 +1,149 @@
+"""From raw sessions to a localisation map: maplab's whole workflow, for any number of missions."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.algorithms.keyframing.heuristic import keyframe
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.landmarks.tracks import init_tracks
+from maplab_py.algorithms.landmarks.triangulation import retriangulate
+from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax
+from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import EstimationError
+from maplab_py.progress import SILENT, Progress
+from maplab_py.report import Report
+from maplab_py.vimap import VIMap
+
+_FIRST_ITERATIONS, _LAST_ITERATIONS = 10, 25
+"""maplab's; its relaxation in between has limits of its own."""
+_MIN_OBSERVERS = 2
+"""Keyframing takes most observations away, so two that are left must do."""
+
+Step = Callable[[VIMap], tuple[VIMap, Report]]
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkflowStep:
+    """What one step left, and how long it took."""
+
+    step: str
+    vertices: int
+    landmarks: int
+    seconds: float
+    note: str
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkflowReport(Report):
+    """All steps of the way to a localisation map."""
+
+    steps: tuple[WorkflowStep, ...]
+    missions: int
+    vertices: int
+    good_landmarks: int
+    summary_map: str = ""  # the file, when one was written
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkflowOptions:
+    """Options of the steps."""
+
+    keyframing: KeyframingOptions = KeyframingOptions()
+    loop_closure: LoopClosureOptions = LoopClosureOptions()
+    sparsification: SparsificationOptions = SparsificationOptions()
+    landmarks_to_keep: int = 0  # 0 = all good ones
+
+
+def make_localization_map(
+    vi_map: VIMap, options: WorkflowOptions, *, progress: Progress = SILENT
+) -> tuple[VIMap, WorkflowReport]:
+    """Triangulate, keyframe, optimise, anchor, relax, close loops, optimise again, sparsify.
+
+    Missions of unknown base frame are anchored; when none is known, the first one gives the frame.
+
+    Raises:
+        EstimationError: Nothing can be optimised, or a mission cannot be anchored.
+    """
+    quality = LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)
+    several = len(vi_map.missions) > 1
+    steps: list[tuple[str, Step]] = [
+        ("init_track_landmarks", lambda m: init_tracks(m, LandmarkQualityOptions())),
+        ("retriangulate_landmarks", lambda m: retriangulate(m, LandmarkQualityOptions())),
+        ("keyframe_heuristic", lambda m: keyframe(m, options.keyframing)),
+        ("evaluate_landmark_quality", lambda m: evaluate_quality(m, quality)),
+        ("optimize_visual_inertial", lambda m: _optimized(m, _FIRST_ITERATIONS, progress)),
+    ]
+    if several:
+        steps.append(
+            ("anchor_all_missions", lambda m: _anchored(m, options.loop_closure, progress))
+        )
+    steps += [
+        ("relax", lambda m: _relaxed(m, options.loop_closure, progress)),
+        (
+            "loopclosure_all_missions",
+            lambda m: close_loops(m, options.loop_closure, progress=progress),
+        ),
+        ("optimize_visual_inertial", lambda m: _optimized(m, _LAST_ITERATIONS, progress)),
+        ("evaluate_landmark_quality", lambda m: evaluate_quality(m, quality)),
+    ]
+    if options.landmarks_to_keep:
+        steps.append(("landmark_sparsify", lambda m: _sparsified(m, options, progress)))
+    lines = []
+    for number, (name, step) in enumerate(steps):
+        progress.step(number, len(steps), name)
+        begin = time.perf_counter()
+        vi_map, report = step(vi_map)
+        seconds = time.perf_counter() - begin
+        counts = len(vi_map.vertices), len(vi_map.landmarks)
+        lines.append(WorkflowStep(name, *counts, seconds, report.failure))
+    good = int(np.count_nonzero(vi_map.landmarks.quality == 2))
+    report = WorkflowReport(tuple(lines), len(vi_map.missions), len(vi_map.vertices), good)
+    return vi_map, report
+
+
+def _optimized(vi_map: VIMap, iterations: int, progress: Progress) -> tuple[VIMap, Report]:
+    options = VIOptimizationOptions(num_iterations=iterations)
+    return optimize(vi_map, options, progress=progress)
+
+
+def _anchored(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
+    frames = vi_map.baseframes
+    known: NDArray[np.bool_] = frames.is_known.copy()
+    if not known[vi_map.missions.baseframe].any():
+        known[vi_map.missions.baseframe[0]] = True
+        vi_map = vi_map.replace(baseframes=frames.replace(is_known=known))
+    result, report = anchor_missions(vi_map, AnchoringOptions(), loops, progress=progress)
+    if report.not_anchored:
+        raise EstimationError(f"{report.failure}; remove what does not belong to this map")
+    return result, report
+
+
+def _relaxed(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
+    edges, found = find_loop_closures(vi_map, loops, progress=progress)
+    if len(edges) == 0:
+        return vi_map, found
+    return relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
+
+
+def _sparsified(
+    vi_map: VIMap, options: WorkflowOptions, progress: Progress
+) -> tuple[VIMap, Report]:
+    keep, how = options.landmarks_to_keep, options.sparsification
+    result, report, _ = sparsify(vi_map, keep, how, progress=progress)
+    return result, report

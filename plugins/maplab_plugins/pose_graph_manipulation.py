@@ -1,0 +1,106 @@
+"""Manipulation of the pose graph: uncertainties, switch variables, disturbed vertices."""
+
+from __future__ import annotations
+
+from maplab_py.algorithms.pose_graph.disturbance import DisturbanceOptions, DisturbanceReport
+from maplab_py.algorithms.pose_graph.edges import EdgeType
+from maplab_py.plugin import CommandContext, Message, command
+
+_DISTURBANCE = DisturbanceOptions()
+
+
+@command(
+    "assign_edge_uncertainties",
+    "aeu",
+    example="aeu --edge_type=loop_closure --translation_std_dev_meters=0.1 "
+    "--orientation_std_dev_degrees=1",
+)
+def assign_edge_uncertainties(
+    context: CommandContext,
+    *,
+    edge_type: EdgeType,
+    translation_std_dev_meters: float = -1.0,
+    orientation_std_dev_degrees: float = -1.0,
+) -> Message:
+    """Give all edges of one type the same covariance.
+
+    Args:
+        edge_type: loop_closure, odometry, wheel_odometry or transformation.
+        translation_std_dev_meters: Standard deviation of the position along each axis in metres.
+        orientation_std_dev_degrees: Standard deviation of the orientation about each axis in
+            degrees.
+    """
+    from maplab_py.algorithms.pose_graph.edges import assign_covariance
+
+    result, count = assign_covariance(
+        context.vi_map,
+        edge_type,
+        position_sigma_m=translation_std_dev_meters,
+        orientation_sigma_deg=orientation_std_dev_degrees,
+    )
+    context.commit(result)
+    return Message(f"{count} {edge_type.value} edges have the new covariance")
+
+
+@command(
+    "assign_switch_variable_values_for_loop-closure_edges",
+    "asvv",
+    example="asvv --lc_switch_variable_value=0.5",
+    see_also=("assign_switch_variable_uncertainties_for_loop-closure_edges", "relax"),
+)
+def assign_switch_variable_values(
+    context: CommandContext, *, lc_switch_variable_value: float = 1.0
+) -> Message:
+    """Set the switch variable of all loop closure edges.
+
+    Args:
+        lc_switch_variable_value: Value between 0 (the edge is off) and 1 (it is trusted).
+    """
+    from maplab_py.algorithms.pose_graph.edges import assign_switch_variables
+
+    result, count = assign_switch_variables(context.vi_map, value=lc_switch_variable_value)
+    context.commit(result)
+    return Message(f"{count} loop closure edges have switch variable {lc_switch_variable_value:g}")
+
+
+@command(
+    "assign_switch_variable_uncertainties_for_loop-closure_edges",
+    "asvuflce",
+    example="asvuflce --lc_switch_variable_variance=1e-2",
+    see_also=("assign_switch_variable_values_for_loop-closure_edges", "relax"),
+)
+def assign_switch_variable_uncertainties(
+    context: CommandContext, *, lc_switch_variable_variance: float = 1e-8
+) -> Message:
+    """Set the variance of the prior that holds the switch variables of loop closure edges.
+
+    Args:
+        lc_switch_variable_variance: The variance.
+    """
+    from maplab_py.algorithms.pose_graph.edges import assign_switch_variables
+
+    result, count = assign_switch_variables(context.vi_map, variance=lc_switch_variable_variance)
+    context.commit(result)
+    return Message(f"{count} loop closure edges have variance {lc_switch_variable_variance:g}")
+
+
+@command("artificially_disturb_vertices", example="artificially_disturb_vertices")
+def artificially_disturb_vertices(
+    context: CommandContext,
+    *,
+    options: DisturbanceOptions = _DISTURBANCE,
+    map_mission: str = "",
+    map_mission_list: str = "",
+) -> DisturbanceReport:
+    """Let all vertices drift by a random walk, to see what mends them again.
+
+    Args:
+        map_mission: Mission id or unambiguous prefix; empty = all missions.
+        map_mission_list: Several missions, separated by commas.
+    """
+    from maplab_py.algorithms.pose_graph.disturbance import disturb_vertices
+
+    missions = context.mission_rows(map_mission, map_mission_list)
+    result, report = disturb_vertices(context.vi_map, options, missions=missions)
+    context.commit(result)
+    return report

@@ -1,0 +1,39 @@
+"""What the selected map consists of: distributions and bytes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.plugin import CommandContext, command
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.statistics.distributions import MapStatistics
+    from maplab_py.algorithms.statistics.size import MapSize
+
+_KEYFRAMING = KeyframingOptions()
+
+
+@command("statistics", "stat", example="statistics", see_also=("map_stats", "map_size"))
+def statistics(context: CommandContext) -> MapStatistics:
+    """Show how tracks, landmarks, distances and samples of the selected map are distributed."""
+    from maplab_py.algorithms.statistics.distributions import map_distributions
+
+    return map_distributions(context.vi_map)
+
+
+@command(
+    "map_size",
+    example="map_size",
+    see_also=("keyframe_heuristic", "landmark_sparsify", "generate_summary_map_and_save_to_disk"),
+)
+def map_size(context: CommandContext, *, keyframing: KeyframingOptions = _KEYFRAMING) -> MapSize:
+    """Show what the map's bytes are spent on and what each maintenance command would save."""
+    from maplab_py.algorithms.statistics.size import map_size as measure
+
+    return measure(
+        context.vi_map,
+        folder=context.map_folder,
+        keyframing=keyframing,
+        progress=context.progress,
+    )

@@ -1,0 +1,205 @@
+"""Localisation in simulated sessions: where the truth says, in full and summary maps alike."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.localization.database import database_of_map, database_of_summary
+from maplab_py.algorithms.localization.localization import (
+    Reference,
+    align_robustly,
+    describe,
+    localize_missions,
+    pose_errors,
+)
+from maplab_py.algorithms.localization.localizer import Localizer, Outcome
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.localization.queries import queries, query_vertices
+from maplab_py.algorithms.localization.reference import ground_truth, own_trajectory
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.summary import make_summary_map
+from maplab_py.errors import EstimationError, FlagError, UserError
+from maplab_py.geometry import se3, so3
+from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
+from maplab_py.simulation.simulate import simulate
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import IdIndex
+
+OPTIONS = LocalizationOptions()
+
+
+@cache
+def sessions() -> tuple[VIMap, VIMap, np.ndarray, np.ndarray]:
+    """A map whose poses are true, a query, and the true poses of both."""
+    scenario = Scenario(
+        world=WorldOptions(landmarks_per_room=1500),
+        measurement=MeasurementOptions(frame_rate_hz=5.0, max_keypoints=120),
+        sessions=(
+            SessionOptions(duration_s=14.0, turns=1.0),
+            SessionOptions(duration_s=5.0, turns=0.3, start_turn=0.2, height_m=1.7),
+        ),
+    )
+    scenario = dataclasses.replace(scenario, drift=scenario.without_noise().drift)
+    data = simulate(scenario)
+    truth = [data.truth.T_G_I[IdIndex(data.truth.vertex_id).rows(m.vertices.id)] for m in data.maps]
+    # the stored base frame means nothing: put the mission where it was
+    first = data.maps[0]
+    T_G_M = data.truth.T_G_M[:1]
+    first = first.replace(baseframes=first.baseframes.replace(T_G_M=T_G_M))
+    quality = LandmarkQualityOptions(min_observers=3, min_observation_angle_deg=2.0)
+    return evaluate_quality(first, quality)[0], data.maps[1], truth[0], truth[1]
+
+
+@cache
+def database(kind: str):
+    vi_map = sessions()[0]
+    if kind == "full":
+        return database_of_map(vi_map)
+    return database_of_summary(make_summary_map(vi_map, SummaryMapOptions()))
+
+
+def test_the_map_is_where_it_really_is():
+    vi_map, _, truth, _ = sessions()
+    np.testing.assert_allclose(vi_map.T_G_I[:, 4:], truth[:, 4:], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["full", "summary"])
+def test_queries_are_found_where_they_were(kind):
+    _, query, _, truth = sessions()
+    found = localize_missions(database(kind), query, OPTIONS)
+    reference = Reference("truth", truth, np.ones(len(truth), dtype=bool))
+    position, orientation = pose_errors(found, reference, se3.identity())
+    assert found.is_localized.mean() >= 0.9
+    assert np.nanmax(position) < 0.2
+    assert np.nanmedian(position) < 0.03
+    assert np.nanmedian(orientation) < 0.5
+    report = describe(database(kind), found, reference=reference, T_R_G=se3.identity())
+    assert report.map_kind == kind
+    assert report.success == report.localized
+    assert report.wrong == 0
+    assert report.failure == ""
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    _, query, _, truth = sessions()
+    found = localize_missions(database("full"), query, OPTIONS)
+    rows = np.flatnonzero(found.is_localized)
+    step = se3.local(found.T_G_I[rows], truth[rows])
+    covariance = np.array([found.answers[row].covariance for row in rows])
+    nees = np.einsum("ni,ni->n", step, np.linalg.solve(covariance, step[..., None])[..., 0]) / 6.0
+    # landmarks err too, which the covariance of the pose does not know
+    assert 0.1 < np.median(nees) < 30.0
+
+
+def test_a_sequence_is_localised_as_one_rig():
+    _, query, _, truth = sessions()
+    alone = localize_missions(database("summary"), query, OPTIONS)
+    together = localize_missions(database("summary"), query, OPTIONS, sequence_length=4)
+    assert together.is_localized.sum() >= alone.is_localized.sum()
+    inliers = [np.median([a.inliers for a in f.answers]) for f in (alone, together)]
+    assert inliers[1] > inliers[0]
+    rows = np.flatnonzero(together.is_localized)
+    error = np.linalg.norm(together.T_G_I[rows, 4:] - truth[rows, 4:], axis=1)
+    assert np.median(error) < 0.03
+
+
+def test_inliers_show_the_landmarks_they_are_matched_with():
+    _, query, _, _ = sessions()
+    source = query_vertices(query, np.array([0]), database("full").projection)
+    one = next(iter(queries(source)))
+    answer = Localizer(database("full"), OPTIONS).localize(one)
+    assert answer.outcome is Outcome.LOCALIZED
+    point_I = se3.transform(se3.inverse(answer.T_G_I), database("full").p_G[answer.landmark])
+    toward = point_I - one.origin_I[answer.keypoint]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    angle_px = np.linalg.norm(np.cross(toward, one.ray_I[answer.keypoint]), axis=1)
+    assert np.all(angle_px <= 2.0 * one.rad_per_px[answer.keypoint] * 1.01)
+    assert len(set(answer.keypoint.tolist())) == len(answer.keypoint)
+
+
+def test_the_answer_does_not_depend_on_the_other_queries():
+    _, query, _, _ = sessions()
+    found = localize_missions(database("full"), query, OPTIONS)
+    source = query_vertices(query, np.array([0]), database("full").projection)
+    last = list(queries(source))[-1]
+    answer = Localizer(database("full"), OPTIONS).localize(last)
+    np.testing.assert_array_equal(answer.T_G_I, found.T_G_I[-1])
+
+
+def test_an_image_of_another_place_is_refused():
+    rng = np.random.default_rng(5)
+    _, query, _, _ = sessions()
+    noise = rng.integers(0, 256, query.keypoints.descriptor.shape)
+    strange = query.replace(keypoints=query.keypoints.replace(descriptor=noise))
+    for kind in ("full", "summary"):
+        found = localize_missions(database(kind), strange, OPTIONS)
+        assert not found.is_localized.any()
+        report = describe(database(kind), found)
+        assert "none of" in report.failure
+        assert sum(report.refused.values()) == len(found.vertex)
+
+
+def test_gravity_must_agree():
+    _, query, _, _ = sessions()
+    source = query_vertices(query, np.array([0]), database("full").projection)
+    one = next(iter(queries(source)))
+    tilted = dataclasses.replace(one, q_M_I=so3.multiply(so3.exp([0.3, 0.0, 0.0]), one.q_M_I))
+    answer = Localizer(database("full"), OPTIONS).localize(tilted)
+    assert answer.outcome is not Outcome.LOCALIZED
+
+
+def test_references_align_the_frames():
+    vi_map, query, map_truth, truth = sessions()
+    found = localize_missions(database("full"), query, OPTIONS)
+    T_R_G = se3.make(so3.exp([0.1, -0.2, 2.0]), [3.0, -1.0, 0.5])
+    times = np.concatenate([vi_map.vertices.timestamp_ns, query.vertices.timestamp_ns])
+    poses = se3.compose(T_R_G, np.concatenate([map_truth, truth]))
+    reference, T = ground_truth("recorded", times, poses, query, found, vi_map)
+    assert T is not None
+    np.testing.assert_allclose(T[4:], T_R_G[4:], atol=1e-3)
+    _, from_answers = ground_truth("recorded", times, poses, query, found, None)
+    assert from_answers is not None
+    assert np.nanmedian(pose_errors(found, reference, from_answers)[0]) < 0.03
+    with pytest.raises(UserError, match="time span"):
+        ground_truth("recorded", times + 10**15, poses, query, found, vi_map)
+
+
+def test_an_unknown_base_frame_is_laid_on_the_answers():
+    _, query, _, _ = sessions()
+    found = localize_missions(database("full"), query, OPTIONS)
+    reference, T_R_G = own_trajectory(query, found)
+    assert not query.baseframes.is_known.any()
+    assert T_R_G is not None
+    assert np.nanmedian(pose_errors(found, reference, T_R_G)[0]) < 0.05
+    known = query.replace(baseframes=query.baseframes.replace(is_known=[True]))
+    _, T_R_G = own_trajectory(known, found)
+    np.testing.assert_array_equal(T_R_G, se3.identity())
+
+
+def test_a_robust_alignment_ignores_wrong_pairs():
+    rng = np.random.default_rng(2)
+    p_G = rng.uniform(-10.0, 10.0, (60, 3))
+    T_R_G = se3.make(so3.exp([0.0, 0.0, 1.1]), [4.0, 5.0, 6.0])
+    p_R = se3.transform(T_R_G, p_G)
+    p_R[:15] += rng.uniform(3.0, 9.0, (15, 3))
+    for level in (True, False):
+        np.testing.assert_allclose(align_robustly(p_R, p_G, level=level), T_R_G, atol=1e-6)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(FlagError, match="min_inlier_count"):
+        LocalizationOptions(min_inlier_count=2)
+    vi_map, query, _, _ = sessions()
+    summary = make_summary_map(vi_map, SummaryMapOptions())
+    with pytest.raises(UserError, match="projection"):
+        database_of_summary(dataclasses.replace(summary, projection=None))
+    short = query.keypoints.replace(descriptor=query.keypoints.descriptor[:, :32])
+    sizes = query.frames.replace(descriptor_size=np.full(len(query.frames), 32))
+    with pytest.raises(EstimationError, match="32"):
+        localize_missions(database("full"), query.replace(keypoints=short, frames=sizes), OPTIONS)
