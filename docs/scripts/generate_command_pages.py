@@ -1,4 +1,4 @@
-"""Write docs/commands from the registry: an index, and one page per plugin.
+"""Write docs/commands from the registry: an index, and one page per plugin; list the decisions.
 
 python docs/scripts/generate_command_pages.py
 """
@@ -12,6 +12,7 @@ from maplab_py.console.flags import Flag
 from maplab_py.console.registry import Plugin, Registry, load_registry
 
 FOLDER = Path(__file__).resolve().parents[1] / "commands"
+DECISIONS = FOLDER.with_name("decisions")
 _NOTE = "<!-- made by docs/scripts/generate_command_pages.py; do not edit -->\n"
 
 
@@ -22,6 +23,16 @@ def pages(registry: Registry) -> dict[str, str]:
     for plugin in plugins:
         texts[f"{plugin.name}.md"] = _page(plugin)
     return texts
+
+
+def decisions() -> str:
+    """Return the list of decision records."""
+    lines = [_NOTE, "# Decisions\n"]
+    lines += ["Choices that would be costly to reverse, each with its context and consequences.\n"]
+    for path in sorted(DECISIONS.glob("0*.md")):
+        title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+        lines.append(f"- [{title}]({path.name})")
+    return "\n".join(lines) + "\n"
 
 
 def _is_built_in(plugin: Plugin) -> bool:
@@ -50,7 +61,7 @@ def _section(command: Command) -> str:
         lines.append(command.description + "\n")
     if command.aliases:
         lines.append("Aliases: " + ", ".join(f"`{alias}`" for alias in command.aliases) + "\n")
-    if command.example:
+    if command.example != command.name:
         lines.append(f"Example: `{command.example}`\n")
     if command.see_also:
         lines.append("See also: " + ", ".join(f"`{name}`" for name in command.see_also) + "\n")
@@ -82,6 +93,7 @@ def main() -> None:
         stale.unlink()
     for name, text in texts.items():
         (FOLDER / name).write_text(text, encoding="utf-8")
+    (DECISIONS / "index.md").write_text(decisions(), encoding="utf-8")
 
 
 if __name__ == "__main__":

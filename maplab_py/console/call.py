@@ -10,7 +10,7 @@ from typing import Any
 from maplab_py.console.command import Command
 from maplab_py.console.flag_types import expand_path
 from maplab_py.console.flagfile import read_flagfile
-from maplab_py.console.flags import COMMON_FLAGS, Given, normalise, parse_words
+from maplab_py.console.flags import Given, normalise, parse_words
 from maplab_py.console.registry import Registry
 from maplab_py.console.settings import Settings
 from maplab_py.console.suggest import did_you_mean
@@ -28,6 +28,7 @@ class Call:
     wants_help: bool = False
     keeps_flags: bool = False
     verbosity: int = 0
+    is_trial: bool = False  # what the command does to the maps is thrown away
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of the command's function."""
@@ -48,7 +49,7 @@ def call_from_words(words: Sequence[str], registry: Registry, settings: Settings
         wants_help = list(words[1:]) == ["--help"]
         return Call(command, {}, () if wants_help else tuple(words[1:]), {}, wants_help)
     given, plain = parse_words(words[1:], command.flags, command.name)
-    common = {g.name: g.text for g in given if g.name in COMMON_FLAGS}
+    common = {g.name: g.text for g in given if g.name not in command.flags}
     texts: dict[str, str] = {}
     for path in (g.text for g in given if g.name == "flagfile"):
         texts.update(_flagfile_texts(path, command, registry))
@@ -69,6 +70,7 @@ def call_from_words(words: Sequence[str], registry: Registry, settings: Settings
         wants_help,
         common.get("keep_gflags") == "true",
         _verbosity(common.get("v", "0"), command),
+        common.get("dry_run") == "true" and _may_be_tried(command),
     )
 
 
@@ -88,7 +90,7 @@ def call_from_keywords(
             values.update(_group_values(command, keyword, value))
     for keyword, value in keywords.items():
         name = normalise(keyword).rstrip("_")
-        if keyword in command.defaults:
+        if keyword in command.defaults or (name == "dry_run" and name not in command.flags):
             continue
         if name not in command.flags:
             known = [*command.flags, *command.defaults]
@@ -96,7 +98,19 @@ def call_from_keywords(
         values[name] = command.flags[name].convert(value)
     placed, rest = _place(list(words), command, {})
     values.update({name: command.flags[name].convert(text) for name, text in placed.items()})
-    return Call(command, values, tuple(rest))
+    is_trial = bool(keywords.get("dry_run")) and "dry_run" not in command.flags
+    return Call(command, values, tuple(rest), is_trial=is_trial and _may_be_tried(command))
+
+
+def _may_be_tried(command: Command) -> bool:
+    """Return True where the console can undo all that a command does by dropping its draft.
+
+    Raises:
+        FlagError: The command acts outside the maps in memory.
+    """
+    if command.acts_outside:
+        raise FlagError(f"{command.name} acts outside the maps in memory: it has no --dry_run")
+    return True
 
 
 def _group_values(command: Command, parameter: str, group: Any) -> dict[str, Any]:

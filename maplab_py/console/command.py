@@ -16,6 +16,8 @@ from maplab_py.errors import FlagError
 
 COMMAND_ATTRIBUTE = "maplab_command"
 
+_RESERVED = tuple(name for name in COMMON_FLAGS if name != "dry_run")
+
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 
@@ -36,6 +38,7 @@ class Command:
     see_also: tuple[str, ...] = ()
     needs_map: bool = True
     raw_arguments: bool = False
+    acts_outside: bool = False  # does something that dropping the draft of the maps does not undo
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,6 +77,7 @@ def command(
     see_also: tuple[str, ...] = (),
     needs_map: bool = True,
     raw_arguments: bool = False,
+    acts_outside: bool = False,
 ) -> Callable[[FunctionT], FunctionT]:
     """Make a function a command of the console; the function itself stays as it is.
 
@@ -89,6 +93,8 @@ def command(
         see_also: Related commands for the help page.
         needs_map: The command is refused while no map is selected.
         raw_arguments: The words behind the command go to `*words` unread, flags included.
+        acts_outside: The command writes files or changes the session. Then it is never left
+            behind half done by Ctrl-C, and has --dry_run only if it defines that flag itself.
 
     Raises:
         TypeError: The signature cannot be a command: a type that no flag can have, or the same
@@ -104,6 +110,7 @@ def command(
             see_also=see_also,
             needs_map=needs_map,
             raw_arguments=raw_arguments,
+            acts_outside=acts_outside,
         )
         setattr(function, COMMAND_ATTRIBUTE, described)
         return function
@@ -131,14 +138,14 @@ def describe(
         if parameter.kind is parameter.VAR_KEYWORD or parameter.name not in hints:
             raise TypeError(f"command {name}: parameter {parameter.name} needs a type")
         for flag in _flags_of(parameter, hints[parameter.name], documentation.arguments):
-            if flag.name in flags or flag.name in COMMON_FLAGS:
+            if flag.name in flags or flag.name in _RESERVED:
                 raise TypeError(f"command {name}: flag --{flag.name} is defined twice")
             flags[flag.name] = flag
         if _is_options(hints[parameter.name]):
             defaults[parameter.name] = _default_group(parameter, hints[parameter.name])
         elif parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
             positional.append(normalise(parameter.name).rstrip("_"))
-    return Command(
+    described = Command(
         name,
         aliases,
         function,
@@ -150,6 +157,9 @@ def describe(
         defaults,
         **settings,
     )
+    if described.example or any(flag.is_required for flag in flags.values()):
+        return described
+    return dataclasses.replace(described, example=name)
 
 
 def _parameter_hints(function: Callable[..., Any]) -> dict[str, Any]:

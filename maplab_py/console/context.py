@@ -27,7 +27,13 @@ class CommandContext:
     """
 
     def __init__(
-        self, session: Session, progress: Progress, terminal: Terminal, command: str = ""
+        self,
+        session: Session,
+        progress: Progress,
+        terminal: Terminal,
+        command: str = "",
+        *,
+        is_trial: bool = False,
     ) -> None:
         """Make the context of one call.
 
@@ -36,11 +42,13 @@ class CommandContext:
             progress: Where to tell progress and learn of cancellation.
             terminal: Where to ask questions.
             command: Name of the command, for messages and the undo history.
+            is_trial: All that the command does will be thrown away (--dry_run).
         """
         self.session = session
         self.progress = progress
         self.terminal = terminal
         self.command = command
+        self.is_trial = is_trial
         self._drafts: dict[str, VIMap] = {}
 
     @property
@@ -123,6 +131,15 @@ class CommandContext:
             return int(find_mission(self.vi_map, map_mission))
         return 0
 
+    def announce(self, topic: str, text: str) -> None:
+        """Show a short text in the toolbar of the prompt until it is announced empty.
+
+        Args:
+            topic: What it is about, such as "viewer"; a later text of the topic replaces it.
+            text: What to show, such as an address; empty = nothing any more.
+        """
+        self.session.marks[topic] = text
+
     def confirm(self, question: str, *, yes: bool) -> None:
         """Ask before something is destroyed.
 
@@ -133,7 +150,7 @@ class CommandContext:
         Raises:
             UserError: The answer is no, or nobody is there to answer.
         """
-        if yes:
+        if yes or self.is_trial:
             return
         if not self.terminal.is_interactive:
             raise UserError(f"{self.command}: nobody can answer '{question}'; give --yes to agree")

@@ -53,8 +53,18 @@ def read_flagfile(path: Path, depth: int = 0) -> list[FileWords]:
         if included is None:
             lines.append(FileWords(tuple(words), origin))
         else:
-            lines += read_flagfile(_relative_to(path, included, origin), depth + 1)
+            lines += _read_included(_relative_to(path, included, origin), depth + 1, origin)
     return lines
+
+
+def _read_included(path: Path, depth: int, origin: str) -> list[FileWords]:
+    """Read an included file; that it cannot be read is an error of the line that includes it."""
+    try:
+        return read_flagfile(path, depth)
+    except FlagError as error:
+        if str(error).startswith("--flagfile="):
+            raise FlagError(f"{origin}: {error}") from None
+        raise
 
 
 def _included(words: list[str]) -> str | None:

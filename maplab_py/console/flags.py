@@ -15,7 +15,7 @@ REQUIRED: Any = object()
 """Default of a flag that must be given."""
 
 _NUMBER = re.compile(r"^-\.?\d")
-COMMON_BOOL_FLAGS = ("help", "keep_gflags")
+COMMON_BOOL_FLAGS = ("help", "keep_gflags", "dry_run")
 """Flags that every command has and that the console itself handles; they take no value."""
 COMMON_FLAGS = (*COMMON_BOOL_FLAGS, "flagfile", "v")
 

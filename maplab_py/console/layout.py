@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.report import Message
+from maplab_py.report import Report
 
 _UNIT_SUFFIXES = {
     "_m": "m",
@@ -57,8 +57,9 @@ Block = Paragraph | Pairs | Table
 
 def blocks_of(report: Any, title: str = "") -> list[Block]:
     """Lay out a report: its single values first, then its lists and nested reports."""
-    if isinstance(report, Message):
-        return [Paragraph(report.text)] if report.text else []
+    text = report.as_text() if isinstance(report, Report) else None
+    if text is not None:
+        return [Paragraph(text)] if text else []
     pairs: list[tuple[str, str]] = []
     following: list[Block] = []
     for field in dataclasses.fields(report):
@@ -72,6 +73,8 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
             following.append(_table(head, value))
         elif isinstance(value, Mapping) and value and all(map(_is_records, value.values())):
             following += [_table(str(key), records) for key, records in value.items()]
+        elif isinstance(value, Mapping) and any(map(_is_record, value.values())):
+            following += [block for key, item in value.items() for block in blocks_of(item, key)]
         elif isinstance(value, Mapping):
             rows = [(str(key), format_cell(item)) for key, item in value.items()]
             following.append(Pairs(rows, head))

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
+from collections.abc import Callable, Mapping
 
 from maplab_py.errors import FlagError
+
+_NAME = re.compile(r"\$(?:(\w+)|\{(\w+)\})")
+_ASSIGNMENT = re.compile(r"^[A-Za-z_]\w*=")
+
+Lookup = Callable[[str], str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,6 +23,26 @@ class Word:
     start: int
     end: int
     is_open: bool = False  # a quote is not closed, or a backslash ends the text
+    is_shell: bool = False  # `!` or `|` with all that goes to the shell
+    is_background: bool = False  # `&`
+
+
+@dataclasses.dataclass(frozen=True)
+class TypedCommand:
+    """One command as it was typed."""
+
+    source: str
+    words: list[str]
+    shell: str = ""  # what `!` or `|` gives to the shell
+    in_background: bool = False
+
+    @property
+    def assignment(self) -> tuple[str, str] | None:
+        """The name and value of a line `NAME=value`; None when it is something else."""
+        if len(self.words) != 1 or not _ASSIGNMENT.match(self.words[0]):
+            return None
+        name, _, value = self.words[0].partition("=")
+        return name, value
 
 
 def split_commands(text: str) -> list[list[str]]:
@@ -27,16 +55,52 @@ def split_commands(text: str) -> list[list[str]]:
     Raises:
         FlagError: A quote is not closed.
     """
+    return [command.words for command in typed_commands(text) if command.words]
+
+
+def typed_commands(text: str, lookup: Lookup | None = None) -> list[TypedCommand]:
+    """Split text into commands with what the console itself makes of them.
+
+    As `split_commands`, and: `!` at the start of a command gives the rest of the line to the
+    shell, `|` as a word of its own pipes the command's output into the rest of the line, `&` ends
+    a command that shall run in the background.
+
+    Args:
+        text: What was typed.
+        lookup: Gives the value of `$NAME` and `${NAME}` outside single quotes; they stay as they
+            are when it is not given.
+
+    Raises:
+        FlagError: A quote is not closed, or a variable is not set.
+    """
     commands = []
-    for words in scan(text):
-        if words and words[-1].is_open:
+    for words in scan(text, lookup):
+        if not words:
+            continue
+        if words[-1].is_open:
             raise FlagError(f"unclosed quote or backslash in: {words[-1].text}")
-        if words:
-            commands.append([word.text for word in words])
+        plain = [w.text for w in words if not (w.is_shell or w.is_background)]
+        shell = next((w.text[1:].strip() for w in words if w.is_shell), "")
+        if words[0].is_background or (words[0].is_shell and words[0].text.startswith("|")):
+            raise FlagError(f"there is no command before '{words[0].text[:1]}'")
+        source = text[words[0].start : words[-1].end]
+        commands.append(TypedCommand(source, plain, shell, words[-1].is_background))
     return commands
 
 
-def scan(text: str) -> list[list[Word]]:
+def variable_lookup(variables: Mapping[str, str]) -> Lookup:
+    """Return a lookup in a session's variables, then in the environment."""
+
+    def lookup(name: str) -> str:
+        value = variables.get(name, os.environ.get(name))
+        if value is None:
+            raise FlagError(f"variable ${name} is not set (write {name}=value, or '${name}')")
+        return value
+
+    return lookup
+
+
+def scan(text: str, lookup: Lookup | None = None) -> list[list[Word]]:
     """Split text into commands of words with their places; the last command may be empty."""
     commands: list[list[Word]] = [[]]
     position = 0
@@ -52,14 +116,31 @@ def scan(text: str) -> list[list[Word]]:
         elif character == "#":
             end = text.find("\n", position)
             position = len(text) if end < 0 else end
+        elif _is_operator(text, position, "|") or (character == "!" and not commands[-1]):
+            end = text.find("\n", position)
+            end = len(text) if end < 0 else end
+            commands[-1].append(Word(text[position:end], position, end, is_shell=True))
+            position = end
+        elif _is_operator(text, position, "&"):
+            commands[-1].append(Word("&", position, position + 1, is_background=True))
+            commands.append([])
+            position += 1
         else:
-            word = _scan_word(text, position)
+            word = _scan_word(text, position, lookup)
             commands[-1].append(word)
             position = word.end
     return commands
 
 
-def _scan_word(text: str, start: int) -> Word:
+def _is_operator(text: str, position: int, operator: str) -> bool:
+    """Tell whether an operator stands by itself here."""
+    if text[position] != operator:
+        return False
+    following = text[position + 1 : position + 2]
+    return not following or following.isspace() or following == ";"
+
+
+def _scan_word(text: str, start: int, lookup: Lookup | None) -> Word:
     parts: list[str] = []
     quote = ""
     position = start
@@ -76,6 +157,10 @@ def _scan_word(text: str, start: int) -> Word:
             if following != "\n":
                 parts.append(following)
             position += 2
+            continue
+        if character == "$" and lookup and quote != "'" and (name := _NAME.match(text, position)):
+            parts.append(lookup(name.group(1) or name.group(2)))
+            position = name.end()
             continue
         if character == quote:
             quote = ""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from maplab_py.console.aliases import read_aliases
 from maplab_py.console.arguments import USAGE, Arguments, parse_arguments
 from maplab_py.console.log import start_logging
 from maplab_py.console.output import ConsoleTerminal
-from maplab_py.console.paths import user_flagfile
+from maplab_py.console.paths import user_aliases, user_flagfile
 from maplab_py.console.registry import Registry, load_registry
 from maplab_py.console.runner import Runner
 from maplab_py.console.scripts import read_batch, read_script, run_batch
@@ -70,7 +71,7 @@ def _start(arguments: Arguments, terminal: ConsoleTerminal) -> Status:
         status = runner.run_text("\n".join(texts), keep_going=arguments.keep_going)
     else:
         status = runner.run_text(sys.stdin.read(), keep_going=arguments.keep_going)
-    return status or runner.check_unsaved(discard=arguments.discard)
+    return status or runner.finish(discard=arguments.discard)
 
 
 def make_runner(arguments: Arguments, terminal: ConsoleTerminal, registry: Registry) -> Runner:
@@ -86,6 +87,10 @@ def make_runner(arguments: Arguments, terminal: ConsoleTerminal, registry: Regis
             session.settings.assign_file(user_flagfile(), Layer.USER_CONFIG)
         except FlagError as error:
             terminal.warning(str(error))
+    try:
+        session.aliases.update(read_aliases(user_aliases()))
+    except UserError as error:
+        terminal.warning(str(error))
     for path in arguments.flagfiles:
         session.settings.assign_file(path, Layer.START_UP)
     session.settings.assign(arguments.flags, Layer.START_UP, "start-up")

@@ -80,12 +80,54 @@ class MapsState:
     selected: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class Conflict:
+    """A map that two commands changed at the same time, and where the later result went."""
+
+    key: str
+    kept_as: str
+
+
+def merge_states(
+    base: MapsState, result: MapsState, current: MapsState
+) -> tuple[MapsState, tuple[Conflict, ...]]:
+    """Bring what a command made of `base` into the present state.
+
+    Args:
+        base: What the command started from.
+        result: What it made of it.
+        current: What has become of it meanwhile.
+
+    Returns:
+        The new state. A map that was changed on both sides keeps its present value; the command's
+        value is taken in under a new key, and named in the second result.
+    """
+    if current is base:
+        return result, ()
+    entries = dict(current.entries)
+    conflicts = []
+    for key, entry in result.entries.items():
+        if base.entries.get(key) is entry:
+            continue
+        if current.entries.get(key) is base.entries.get(key):
+            entries[key] = entry
+        else:
+            free = next(k for n in range(1, len(entries) + 2) if (k := f"{key}-{n}") not in entries)
+            entries[free] = dataclasses.replace(entry, key=free, folder=None, saved=None)
+            conflicts.append(Conflict(key, free))
+    for key in base.entries.keys() - result.entries.keys():
+        if current.entries.get(key) is base.entries[key]:
+            del entries[key]
+    selected = current.selected if current.selected in entries else result.selected
+    return MapsState(entries, selected if selected in entries else ""), tuple(conflicts)
+
+
 class MapManager:
     """The maps of a session by key."""
 
-    def __init__(self) -> None:
-        """Start without maps."""
-        self.state = MapsState()
+    def __init__(self, state: MapsState | None = None) -> None:
+        """Start with the maps of a state, without any when it is not given."""
+        self.state = MapsState() if state is None else state
 
     def __len__(self) -> int:
         return len(self.state.entries)

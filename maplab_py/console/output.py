@@ -6,12 +6,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import IO, TextIO
 
-from maplab_py.console.interrupt import cancellable, interruptible
+from maplab_py.console.foreground import in_waiting_thread, interruptible
 from maplab_py.console.layout import blocks_of
+from maplab_py.console.pager import page
 from maplab_py.console.progress import TerminalProgress
-from maplab_py.console.render import plain_text, render, render_json, wants_colour
+from maplab_py.console.render import (
+    plain_text,
+    render,
+    render_json,
+    render_json_error,
+    rendered,
+    wants_colour,
+)
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.progress import Progress
 from maplab_py.report import Report
@@ -26,7 +34,10 @@ class ConsoleTerminal:
     def __init__(self, *, as_json: bool = False) -> None:
         """Make the terminal of this process."""
         self.as_json = as_json
+        self.is_prompt = False  # a person reads the output as it comes
         self._transcript: TextIO | None = None
+        self._out: IO[str] | None = None  # instead of standard output
+        self._progresses: list[TerminalProgress] = []  # of the running command and inner ones
 
     @property
     def is_interactive(self) -> bool:
@@ -39,6 +50,10 @@ class ConsoleTerminal:
         Raises:
             Cancelled: The answer is Ctrl-C.
         """
+        self._hide_progress()
+        return in_waiting_thread(lambda: self._ask(question))
+
+    def _ask(self, question: str) -> bool:
         sys.stderr.write(f"{question} [y/N] ")
         sys.stderr.flush()
         try:
@@ -49,14 +64,37 @@ class ConsoleTerminal:
         self._copy(f"{question} [y/N] {answer}")
         return answer.lower() in ("y", "yes")
 
-    def show(self, report: Report, command: str) -> None:
+    def show(self, report: Report, command: str, seconds: float | None = None) -> None:
         """Print a report to standard output."""
+        self._hide_progress()
+        out = self._out or sys.stdout
         if self.as_json:
-            render_json(report, command, sys.stdout)
-        elif blocks_of(report):
-            render(report, sys.stdout)
+            render_json(report, command, seconds, out)
+        elif blocks_of(report) and not self._page(report):
+            render(report, out)
         if self._transcript is not None:
             self._copy("\n\n".join(plain_text(block) for block in blocks_of(report)))
+
+    def failed(self, text: str, command: str, status: int) -> None:
+        """Say that a command failed: a line on standard error, with --json also an object."""
+        self.clear_progress()
+        if self.as_json:
+            render_json_error(text, command, status, self._out or sys.stdout)
+        self.error(text)
+
+    def tick(self) -> None:
+        """Show that a command which says nothing is alive."""
+        for progress in self._progresses[-1:]:
+            progress.tick()
+
+    @contextmanager
+    def redirected(self, stream: IO[str]) -> Iterator[None]:
+        """Let reports go to another stream than standard output."""
+        self._out = stream
+        try:
+            yield
+        finally:
+            self._out = None
 
     def note(self, text: str) -> None:
         """Print a line that is not part of a report; never into a pipe that wants reports."""
@@ -76,13 +114,22 @@ class ConsoleTerminal:
 
     @contextmanager
     def progress(self, command: str, verbosity: int = 0) -> Iterator[Progress]:
-        """Show progress on standard error and let Ctrl-C cancel the command."""
-        with cancellable(command):
-            progress = TerminalProgress(sys.stderr, verbosity)
-            try:
-                yield progress
-            finally:
-                progress.close()
+        """Show progress on standard error."""
+        self._hide_progress()
+        progress = TerminalProgress(sys.stderr, verbosity, command)
+        self._progresses.append(progress)
+        try:
+            yield progress
+        finally:
+            progress.close()
+            if progress in self._progresses:  # not so when the command was left behind
+                self._progresses.remove(progress)
+
+    def clear_progress(self) -> None:
+        """Remove all bars for good, also those of a command that was left behind."""
+        for progress in self._progresses:
+            progress.close()
+        self._progresses.clear()
 
     def transcribe(self, path: Path | None) -> None:
         """Copy all further output to a file; None ends it.
@@ -102,6 +149,15 @@ class ConsoleTerminal:
     def echo_to_transcript(self, text: str) -> None:
         """Copy what the user typed into the transcript."""
         self._copy(text)
+
+    def _page(self, report: Report) -> bool:
+        if not self.is_prompt or self._out is not None:
+            return False
+        return page(rendered(report, sys.stdout))
+
+    def _hide_progress(self) -> None:
+        for progress in self._progresses:
+            progress.hide()
 
     def _copy(self, text: str) -> None:
         if self._transcript is not None:

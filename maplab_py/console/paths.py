@@ -16,3 +16,8 @@ def user_flagfile() -> Path:
     """Return the flag file that every session of this user reads ($XDG_CONFIG_HOME/maplab/flags)."""
     base = os.environ.get("XDG_CONFIG_HOME", "")
     return (Path(base) if base else Path.home() / ".config") / "maplab" / "flags"
+
+
+def user_aliases() -> Path:
+    """Return the file of aliases that every session reads ($XDG_CONFIG_HOME/maplab/aliases)."""
+    return user_flagfile().with_name("aliases")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import TYPE_CHECKING, Any, TextIO
 
-from maplab_py.console.interrupt import check_cancelled
+from maplab_py.console.cancellation import current_token
 from maplab_py.console.render import wants_colour
 
 if TYPE_CHECKING:
@@ -21,15 +22,25 @@ class TerminalProgress:
     A verbosity above zero prints the lines of intermediate results everywhere.
     """
 
-    def __init__(self, stream: TextIO, verbosity: int = 0) -> None:
-        """Start the clock of one command."""
+    def __init__(self, stream: TextIO, verbosity: int = 0, what: str = "") -> None:
+        """Start the clock of one command.
+
+        Args:
+            stream: Where the bar goes.
+            verbosity: Above zero: print lines of intermediate results everywhere.
+            what: Shown until the command says what it is at.
+        """
         self._stream = stream
+        self._token = current_token()
+        self._what = what
         self._is_live = wants_colour(stream)
         self._prints_lines = stream.isatty() or verbosity > 0
         self._start = time.monotonic()
         self._updated = 0.0
+        self._lock = threading.Lock()
         self._bar: RichProgress | None = None
         self._task: Any = None
+        self._is_closed = False
 
     def step(self, done: float, total: float, what: str = "") -> None:
         """Say that `done` of `total` is finished.
@@ -37,49 +48,84 @@ class TerminalProgress:
         Raises:
             Cancelled: The user has asked to stop.
         """
-        check_cancelled()
+        self._token.check()
         now = time.monotonic()
         if not self._is_live or now - self._start < SECONDS_BEFORE_BAR:
             return
         if now - self._updated < SECONDS_BETWEEN_UPDATES and done < total:
             return
         self._updated = now
-        self._update(done, total, what)
+        self._update(done, total, what or self._what)
+
+    def tick(self) -> None:
+        """Show that the command is alive although it says nothing; any thread may call this."""
+        is_late = time.monotonic() - self._start > SECONDS_BEFORE_BAR
+        if self._is_live and self._bar is None and is_late:
+            self._update(0, None, self._what)
 
     def line(self, text: str) -> None:
         """Print one line of intermediate result."""
-        if not self._prints_lines:
+        if not self._prints_lines or self._token.abandoned:
             return
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        else:
-            self._stream.write(text + "\n")
-            self._stream.flush()
+        with self._lock:
+            if self._bar is not None:
+                self._bar.console.print(text, markup=False, highlight=False)
+            else:
+                self._stream.write(text + "\n")
+                self._stream.flush()
 
     def check(self) -> None:
         """Raise Cancelled when the user has asked to stop."""
-        check_cancelled()
+        self._token.check()
+
+    def hide(self) -> None:
+        """Remove the bar because something else is printed; it may come back after a while."""
+        with self._lock:
+            self._start = time.monotonic()
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
 
     def close(self) -> None:
-        """Remove the bar."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        """Remove the bar for good."""
+        with self._lock:
+            self._is_closed = True
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
 
-    def _update(self, done: float, total: float, what: str) -> None:
-        if self._bar is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bar
+    def _update(self, done: float, total: float | None, what: str) -> None:
+        with self._lock:
+            if self._is_closed:
+                return
+            if self._bar is None:
+                self._bar = _make_bar(self._stream)
+                self._bar.start()
+                self._task = self._bar.add_task(what, total=total)
+            self._bar.update(self._task, completed=done, total=total, description=what)
 
-            self._bar = Bar(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TaskProgressColumn(),
-                TimeRemainingColumn(),
-                console=Console(file=self._stream),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task(what, total=total)
-        self._bar.update(self._task, completed=done, total=total, description=what)
+
+def _make_bar(stream: TextIO) -> RichProgress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("left", style="dim"),
+        TimeRemainingColumn(),
+        TextColumn("past", style="dim"),
+        TimeElapsedColumn(),
+        console=Console(file=stream),
+        transient=True,
+        redirect_stdout=False,  # the streams are swapped by the prompt too, in its own order
+        redirect_stderr=False,
+    )

@@ -14,6 +14,7 @@ from prompt_toolkit.formatted_text import StyleAndTextTuples
 from prompt_toolkit.history import FileHistory, History, InMemoryHistory
 from prompt_toolkit.lexers import Lexer
 from prompt_toolkit.output import ColorDepth
+from prompt_toolkit.patch_stdout import patch_stdout
 from prompt_toolkit.styles import Style
 
 from maplab_py.console.colouring import coloured_parts
@@ -23,6 +24,9 @@ from maplab_py.console.render import wants_colour
 from maplab_py.console.runner import Runner
 from maplab_py.console.session import Session
 from maplab_py.console.status import Status
+from maplab_py.errors import Cancelled
+
+SHEEP = "sheep"
 
 _STYLE = Style.from_dict(
     {
@@ -34,6 +38,8 @@ _STYLE = Style.from_dict(
         "flag": "ansiblue",
         "value": "ansigreen",
         "comment": "ansibrightblack",
+        "bottom-toolbar": "noreverse ansibrightblack",
+        "bottom-toolbar.text": "noreverse ansibrightblack",
     }
 )
 
@@ -85,12 +91,33 @@ def prompt_parts(session: Session) -> StyleAndTextTuples:
     """Return the prompt: `maplab <key>:/$ `, with `*` when the map has unsaved changes."""
     key = session.maps.selected_key
     parts: StyleAndTextTuples = []
-    if session.prompt_sign:
-        parts.append(("class:sign", session.prompt_sign + " "))
+    if session.marks.get(SHEEP):
+        parts.append(("class:sign", session.marks[SHEEP] + " "))
     parts += [("", "maplab "), ("class:key", f"<{key}>")]
     if key and not session.maps.selected.is_saved:
         parts.append(("class:unsaved", "*"))
     return [*parts, ("", ":/$ ")]
+
+
+def toolbar_text(session: Session) -> str:
+    """Return the line below the prompt: what is selected, unsaved, running and announced."""
+    facts = []
+    if session.maps.selected_key:
+        entry = session.maps.selected
+        missions, landmarks = len(entry.vi_map.missions), len(entry.vi_map.landmarks)
+        facts += [
+            f"map {entry.key}",
+            f"{missions} mission{'' if missions == 1 else 's'}",
+            f"{len(entry.vi_map.vertices)} vertices",
+            f"{landmarks} landmarks",
+            "saved" if entry.is_saved else "unsaved",
+        ]
+        others = len(session.maps) - 1
+        facts += [f"{others} other map{'' if others == 1 else 's'}"] if others else []
+    running = ", ".join(f"[{job.number}] {job.call.command.name}" for job in session.jobs.running)
+    facts += [f"running {running}"] if running else []
+    facts += [f"{topic} {text}" for topic, text in session.marks.items() if text and topic != SHEEP]
+    return " · ".join(facts)
 
 
 def run_prompt(runner: Runner) -> Status:
@@ -105,12 +132,17 @@ def run_prompt(runner: Runner) -> Status:
         complete_while_typing=False,
         style=_STYLE,
         color_depth=ColorDepth.DEPTH_1_BIT if plain else None,
+        bottom_toolbar=None if plain else lambda: toolbar_text(session) or None,
+        refresh_interval=0 if plain else 1.0,
     )
+    runner.terminal.is_prompt = True
+    session.jobs.on_finish = runner.tell_of_job
     for problem in session.registry.problems:
         runner.terminal.warning(problem)
     while True:
         try:
-            line = prompt.prompt(lambda: prompt_parts(session))
+            with patch_stdout(raw=True):
+                line = prompt.prompt(lambda: prompt_parts(session))
         except KeyboardInterrupt:
             continue
         except EOFError:
@@ -124,16 +156,13 @@ def run_prompt(runner: Runner) -> Status:
 
 
 def _may_leave(runner: Runner) -> bool:
-    """Ask before unsaved changes are lost."""
-    unsaved = [entry.key for entry in runner.session.maps.unsaved]
-    if not unsaved:
-        return True
-    from maplab_py.errors import Cancelled
-
+    """Ask before running jobs or unsaved changes are lost."""
+    unsaved = ", ".join(entry.key for entry in runner.session.maps.unsaved)
+    running = ", ".join(job.text for job in runner.session.jobs.running)
+    questions = [f"still running: {running}; leave and stop it?"] if running else []
+    questions += [f"unsaved changes in {unsaved}; leave without saving?"] if unsaved else []
     try:
-        return runner.terminal.ask(
-            f"unsaved changes in {', '.join(unsaved)}; leave without saving?"
-        )
+        return all(runner.terminal.ask(question) for question in questions)
     except Cancelled:
         return False
 

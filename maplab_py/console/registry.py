@@ -17,6 +17,7 @@ from maplab_py.errors import UserError
 ENTRY_POINT_GROUP = "maplab_py.plugins"
 PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
 ALWAYS_LOADED = "console"
+BUILT_IN = "maplab_plugins."
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +76,10 @@ class Registry:
     def owner(self, command: Command) -> str:
         """Return the name of the plugin that brought a command."""
         return self._owners[command.name].name
+
+    def is_built_in(self, command: Command) -> bool:
+        """Tell a command of this distribution from a stranger's."""
+        return self._owners[command.name].module.startswith(BUILT_IN)
 
     def flags_named(self, name: str) -> list[tuple[Command, Flag]]:
         """Return every command that has a flag of this name, with the flag."""
@@ -158,5 +163,5 @@ def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
 
 def _loading_order(entry: EntryPoint) -> tuple[bool, bool, str]:
     """Built-in plugins come first, so that a stranger's plugin cannot take over a command."""
-    own = entry.value.startswith("maplab_plugins.")
+    own = entry.value.startswith(BUILT_IN)
     return entry.name != ALWAYS_LOADED, not own, entry.name

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from typing import TYPE_CHECKING, TextIO
+from typing import IO, TYPE_CHECKING
 
 from maplab_py.console.layout import Block, Pairs, Paragraph, Table, blocks_of
-from maplab_py.report import Report
+from maplab_py.report import SCHEMA_VERSION, Report
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 
-def wants_colour(stream: TextIO) -> bool:
+def wants_colour(stream: IO[str]) -> bool:
     """Tell whether control codes may be written: a terminal, and NO_COLOR is not set."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
-def render(report: Report, stream: TextIO) -> None:
+def render(report: Report, stream: IO[str]) -> None:
     """Print a report for people."""
     blocks = blocks_of(report)
     if wants_colour(stream):
@@ -29,9 +30,41 @@ def render(report: Report, stream: TextIO) -> None:
     stream.flush()
 
 
-def render_json(report: Report, command: str, stream: TextIO) -> None:
-    """Print a report as one JSON object on one line, with the command that made it."""
-    stream.write(json.dumps({"command": command, "report": report.as_json()}) + "\n")
+def rendered(report: Report, stream: IO[str]) -> str:
+    """Return a report as `render` would print it to a stream."""
+    text = io.StringIO()
+    if wants_colour(stream):
+        _render_rich(blocks_of(report), text, forced=True)
+    else:
+        render(report, text)
+    return text.getvalue()
+
+
+def render_json(report: Report, command: str, seconds: float | None, stream: IO[str]) -> None:
+    """Print a report as one JSON object on one line; see docs/json.md."""
+    line = {
+        "schema": SCHEMA_VERSION,
+        "command": command,
+        "status": 1 if report.failure else 0,
+        "error": report.failure or None,
+        "seconds": None if seconds is None else round(seconds, 3),
+        "report": report.as_json(),
+    }
+    stream.write(json.dumps(line) + "\n")
+    stream.flush()
+
+
+def render_json_error(text: str, command: str, status: int, stream: IO[str]) -> None:
+    """Print that a command failed as one JSON object on one line."""
+    line = {
+        "schema": SCHEMA_VERSION,
+        "command": command,
+        "status": status,
+        "error": text,
+        "seconds": None,
+        "report": None,
+    }
+    stream.write(json.dumps(line) + "\n")
     stream.flush()
 
 
@@ -60,10 +93,10 @@ def _plain_table(table: Table) -> str:
     return "\n".join([table.title, *lines] if table.title else lines)
 
 
-def _render_rich(blocks: list[Block], stream: TextIO) -> None:
+def _render_rich(blocks: list[Block], stream: IO[str], *, forced: bool = False) -> None:
     from rich.console import Console
 
-    console = Console(file=stream, highlight=False)
+    console = Console(file=stream, highlight=False, force_terminal=forced or None)
     for number, block in enumerate(blocks):
         if number:
             console.print()

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from maplab_py.console.lines import split_commands
+from maplab_py.console.aliases import expanded
+from maplab_py.console.call import Call
+from maplab_py.console.foreground import run_in_foreground
+from maplab_py.console.jobs import Job
+from maplab_py.console.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.log import log_path
 from maplab_py.console.output import ConsoleTerminal
 from maplab_py.console.session import Session
@@ -14,6 +21,7 @@ from maplab_py.console.status import Status, status_of
 from maplab_py.errors import MaplabError, UserError
 
 LEAVE = ("q", "quit", "exit")
+_MAX_ALIAS_DEPTH = 8
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +43,7 @@ class Runner:
         self.session = session
         self.terminal = terminal
         self.wants_exit = False
+        self._alias_depth = 0
 
     def run_text(self, text: str, *, keep_going: bool = False) -> Status:
         """Run the commands of a text; stop at the first that fails unless told to go on.
@@ -43,15 +52,15 @@ class Runner:
             The status of the first command that failed.
         """
         try:
-            commands = split_commands(text)
+            commands = typed_commands(text)
         except UserError as error:
             return self.report_error("", error)
         failed: list[str] = []
         first = Status.OK
-        for words in commands:
-            status = self.run_words(words)
+        for command in commands:
+            status = self._run_typed(command, keep_going=keep_going)
             first = first or status
-            failed += [" ".join(words)] if status else []
+            failed += [command.source] if status else []
             if self.wants_exit or status == Status.CANCELLED or (status and not keep_going):
                 break
         if keep_going and failed:
@@ -61,44 +70,15 @@ class Runner:
 
     def run_words(self, words: Sequence[str]) -> Status:
         """Run one command and return its status."""
-        if words[0] in LEAVE and len(words) == 1:
-            self.wants_exit = True
-            return Status.OK
-        logger.info("command: %s", " ".join(words))
-        self.terminal.echo_to_transcript("> " + " ".join(words))
-        start = time.perf_counter()
-        try:
-            call = self.session.parse(words)
-            if call.wants_help:
-                call = self.session.parse(["help", call.command.name])
-            report = self.session.execute(call)
-        except (Exception, KeyboardInterrupt) as error:
-            logger.exception("%s", words[0])
-            return self.report_error(words[0], error)
-        name = call.command.name
-        self.terminal.show(report, name)
-        self.terminal.note(f"{name}: {format_seconds(time.perf_counter() - start)}")
-        if report.failure:
-            self.terminal.error(f"{name}: {report.failure}")
-            logger.error("%s: %s", name, report.failure)
-            return Status.FAILED
-        return Status.OK
+        return self._run(TypedCommand(" ".join(words), list(words)))
 
-    def report_error(self, command: str, error: BaseException) -> Status:
-        """Print an error as one line and return its status."""
-        status = status_of(error)
-        known = command in self.session.registry.names
-        name = self.session.registry.find(command).name if known else command
-        if status is Status.CANCELLED:
-            self.terminal.error(f"{name}: cancelled; the maps are as before")
-        elif isinstance(error, MaplabError):
-            text = " ".join(str(error).split("\n"))
-            prefixed = not known or text.startswith(name)
-            self.terminal.error(text if prefixed else f"{name}: {text}")
-        else:
-            reason = (f"{type(error).__name__}: {error}".splitlines() or [""])[0]
-            self.terminal.error(f"{name}: {reason} (an error of the program; see {log_path()})")
-        return status
+    def finish(self, *, discard: bool) -> Status:
+        """End a script: wait for its jobs, then say which maps have changes that are on no disk."""
+        status = Status.OK
+        for job in self.session.jobs.jobs:
+            if not job.was_told:
+                status = status or self.run_words(["join", str(job.number)])
+        return status or self.check_unsaved(discard=discard)
 
     def check_unsaved(self, *, discard: bool) -> Status:
         """Say at the end of a script which maps have changes that are on no disk."""
@@ -107,6 +87,141 @@ class Runner:
             return Status.OK
         self.terminal.error(f"unsaved changes are lost: {unsaved} (save them, or give --discard)")
         return Status.USER_ERROR
+
+    def report_error(self, command: str, error: BaseException) -> Status:
+        """Print an error as one line and return its status."""
+        status = status_of(error)
+        known = command in self.session.registry.names
+        name = self.session.registry.find(command).name if known else command
+        if status is Status.CANCELLED:
+            text = f"{name}: cancelled; the maps are as before"
+        elif isinstance(error, MaplabError):
+            text = " ".join(str(error).split("\n"))
+            text = text if not known or text.startswith(name) else f"{name}: {text}"
+        else:
+            reason = (f"{type(error).__name__}: {error}".splitlines() or [""])[0]
+            text = f"{name}: {reason} (an error of the program; see {log_path()})"
+        self.terminal.failed(text, name, int(status))
+        return status
+
+    def _run_typed(self, command: TypedCommand, *, keep_going: bool) -> Status:
+        """Run what was typed: an assignment, a shell command, an alias or a command."""
+        try:
+            (command,) = typed_commands(command.source, variable_lookup(self.session.variables))
+            if command.assignment is not None:
+                name, value = command.assignment
+                self.session.variables[name] = value
+                return Status.OK
+            if not command.words:
+                return self._run_shell(command.shell)
+            text = expanded(command, self.session.aliases)
+        except UserError as error:
+            return self.report_error("", error)
+        if text is None:
+            return self._run(command)
+        if self._alias_depth >= _MAX_ALIAS_DEPTH:
+            return self.report_error("", UserError(f"alias '{command.words[0]}' contains itself"))
+        self._alias_depth += 1
+        try:
+            return self.run_text(text, keep_going=keep_going)
+        finally:
+            self._alias_depth -= 1
+
+    def _run(self, command: TypedCommand) -> Status:
+        """Run one command and show its report."""
+        words = command.words
+        if words[0] in LEAVE and len(words) == 1:
+            self.wants_exit = True
+            return Status.OK
+        logger.info("command: %s", command.source)
+        self.terminal.echo_to_transcript("> " + command.source)
+        start = time.perf_counter()
+        try:
+            call = self.session.parse(words)
+            if call.wants_help:
+                call = self.session.parse(["help", call.command.name])
+            if command.in_background:
+                return self._start_job(call, command)
+            with self._piped(command.shell), self.session.lock:
+                report = run_in_foreground(
+                    call.command.name,
+                    lambda: self.session.execute(call),
+                    may_be_abandoned=not call.command.acts_outside,
+                    while_waiting=self.terminal.tick,
+                )
+                name = call.command.name
+                seconds = time.perf_counter() - start
+                self.terminal.show(report, name, seconds)
+        except (Exception, KeyboardInterrupt) as error:
+            logger.exception("%s", words[0])
+            return self.report_error(words[0], error)
+        trial = " (dry run: nothing has changed)" if call.is_trial else ""
+        self.terminal.note(f"{name}: {format_seconds(seconds)}{trial}")
+        if report.failure:
+            self.terminal.error(f"{name}: {report.failure}")
+            logger.error("%s: %s", name, report.failure)
+            return Status.FAILED
+        return Status.OK
+
+    def _start_job(self, call: Call, command: TypedCommand) -> Status:
+        text = command.source.rstrip("& \t")
+        job = self.session.start_call(call, text)
+        self.terminal.note(f"[{job.number}] {text} (see: jobs, join, cancel)")
+        return Status.OK
+
+    def tell_of_job(self, job: Job) -> None:
+        """Say that a job is over; called in the job's thread."""
+        name = job.call.command.name
+        text = f"[{job.number}] {name}: {job.state} after {format_seconds(job.elapsed_s)}"
+        if job.problem:
+            text += f": {job.problem}"
+        for conflict in job.conflicts:
+            text += f"; '{conflict.key}' has changed meanwhile: see map '{conflict.kept_as}'"
+        self.terminal.note(text)
+
+    def _run_shell(self, line: str) -> Status:
+        """Give a line to the shell; Ctrl-C reaches it as it reaches us."""
+        if not line:
+            return self.report_error("", UserError("nothing behind '!' (write !ls)"))
+        self.terminal.echo_to_transcript("> !" + line)
+        try:
+            code = subprocess.run(line, shell=True, check=False, env=self._environment).returncode
+        except KeyboardInterrupt:
+            return Status.CANCELLED
+        if code:
+            self.terminal.error(f"!{line}: exit status {code}")
+        return Status.FAILED if code else Status.OK
+
+    @property
+    def _environment(self) -> dict[str, str]:
+        return {**os.environ, **self.session.variables}
+
+    @contextmanager
+    def _piped(self, line: str) -> Iterator[None]:
+        """Let the report of a command go into a shell command's standard input."""
+        if not line:
+            yield
+            return
+        with subprocess.Popen(
+            line, shell=True, stdin=subprocess.PIPE, text=True, env=self._environment
+        ) as child:
+            assert child.stdin is not None
+            try:
+                with self.terminal.redirected(child.stdin):
+                    yield
+            except BrokenPipeError:
+                pass
+            finally:
+                _close(child)
+
+
+def _close(child: subprocess.Popen[str]) -> None:
+    """Close the pipe to a shell command; it may have stopped reading before."""
+    try:
+        if child.stdin is not None:
+            child.stdin.close()
+    except BrokenPipeError:
+        pass
 
 
 def format_seconds(seconds: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -54,11 +55,26 @@ def read_batch(path: Path) -> Batch:
     if unknown:
         raise UserError(f"{path}: unknown key '{min(map(str, unknown))}'")
     folders = _strings(content, "vi_map_folder_paths", path)
+    found = [folder for pattern in folders for folder in _matching(pattern, path)]
+    return Batch(tuple(found), _strings(content, "commands", path))
+
+
+def _matching(pattern: str, path: Path) -> list[str]:
+    """Return the folders that an entry of the list means: itself, or what its wildcards match.
+
+    Raises:
+        UserError: A variable is not set, or the wildcards match nothing.
+    """
     try:
-        expanded = tuple(str(expand_path(folder)) for folder in folders)
+        text = str(expand_path(pattern))
     except ValueError as error:
         raise UserError(f"{path}: vi_map_folder_paths: {error}") from None
-    return Batch(expanded, _strings(content, "commands", path))
+    if not any(character in text for character in "*?["):
+        return [text]
+    folders = sorted(name for name in glob.glob(text) if Path(name).is_dir())
+    if not folders:
+        raise UserError(f"{path}: vi_map_folder_paths: no folder matches {pattern}")
+    return folders
 
 
 def run_batch(
@@ -82,7 +98,8 @@ def run_batch(
         runner.terminal.note(f"map folder {folder}")
         text = "\n".join(batch.commands).replace(FOLDER_TEMPLATE, _quoted(folder))
         status = runner.run_text(text, keep_going=keep_going)
-        status = status or runner.check_unsaved(discard=discard)
+        status = status or runner.finish(discard=discard)
+        runner.session.watchers.close()
         failed += status != Status.OK
         first = first or status
         if status == Status.CANCELLED or (status and not keep_going):

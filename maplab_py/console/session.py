@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from maplab_py.console.call import Call, call_from_keywords, call_from_words
+from maplab_py.console.cancellation import current_token
 from maplab_py.console.context import CommandContext
+from maplab_py.console.jobs import Job, JobBoard
 from maplab_py.console.lines import split_commands
-from maplab_py.console.maps import MapManager
+from maplab_py.console.maps import MapManager, MapsState, merge_states
 from maplab_py.console.registry import Registry, load_registry
 from maplab_py.console.settings import Layer, Setting, Settings
 from maplab_py.console.terminal import SilentTerminal, Terminal
+from maplab_py.console.watchers import Watchers
+from maplab_py.errors import Cancelled
 from maplab_py.report import Message, Report
 from maplab_py.vimap import VIMap
 
@@ -34,7 +41,8 @@ class Session:
     From Python::
 
         with maplab_py.open_map(folder) as session:
-            report = session.run("optvi", ba_num_iterations=20)
+            report = session.optvi(ba_num_iterations=20)  # or session.run("optvi", ...)
+            print(report.cost_after)
     """
 
     def __init__(self, registry: Registry | None = None, terminal: Terminal | None = None) -> None:
@@ -49,7 +57,12 @@ class Session:
         self.maps = MapManager()
         self.settings = Settings(self.registry)
         self.timings: list[Timing] = []
-        self.prompt_sign = ""  # put before the prompt
+        self.jobs = JobBoard()
+        self.aliases: dict[str, str] = {}
+        self.variables: dict[str, str] = {}  # $NAME in typed lines, before the environment's
+        self.marks: dict[str, str] = {}  # shown around the prompt: the sheep, a viewer's address
+        self.lock = threading.RLock()  # held while a command of the foreground runs
+        self.watchers = Watchers()  # follow the maps, as the viewer does
 
     @property
     def vi_map(self) -> VIMap:
@@ -66,6 +79,7 @@ class Session:
         traceback: TracebackType | None,
     ) -> None:
         """Forget the maps."""
+        self.watchers.close()
         self.maps = MapManager()
 
     def run(self, command: str, *words: str, **flags: Any) -> Report:
@@ -81,7 +95,8 @@ class Session:
             MaplabError: The command failed; nothing has changed.
         """
         found = self.registry.find(command)
-        return self.execute(call_from_keywords(found, words, flags, self.settings))
+        with self.lock:
+            return self.execute(call_from_keywords(found, words, flags, self.settings))
 
     def parse(self, words: Sequence[str]) -> Call:
         """Read the words of one command line into a call."""
@@ -107,27 +122,76 @@ class Session:
 
     def execute(self, call: Call) -> Report:
         """Run a call as a transaction: if it fails or is cancelled, all maps are as before."""
-        command = call.command
-        arguments = call.arguments()
+        base = self.maps.state
+        try:
+            report, result = self.compute(call, base, self.terminal)
+            if current_token().abandoned:
+                raise Cancelled("cancelled")
+            self.maps.state, _ = merge_states(base, result, self.maps.state)
+        finally:
+            self.watchers.after_command(self.maps)
+        return report
+
+    def compute(self, call: Call, base: MapsState, terminal: Terminal) -> tuple[Report, MapsState]:
+        """Run a call on a state of the maps; return its report and what it made of them.
+
+        The session's own maps stay as they are.
+
+        Raises:
+            MaplabError: The command failed.
+        """
+        command, arguments = call.command, call.arguments()
+        draft = self._with_maps(MapManager(base), terminal)
         if command.needs_map:
-            _ = self.maps.selected
-        before = self.maps.state
+            _ = draft.maps.selected
         start = time.perf_counter()
         try:
-            with self.terminal.progress(command.name, call.verbosity) as progress:
-                context = CommandContext(self, progress, self.terminal, command.name)
+            with terminal.progress(command.name, call.verbosity) as progress:
+                context = CommandContext(
+                    draft, progress, terminal, command.name, is_trial=call.is_trial
+                )
                 report = command.function(context, *_by_position(call, arguments), **arguments)
                 if context.has_drafts:
                     progress.check()
             context.apply_drafts()
-        except BaseException:
-            self.maps.state = before
-            raise
         finally:
             self.timings.append(Timing(command.name, time.perf_counter() - start))
         if call.keeps_flags:
             self.settings.keep(command, dict(call.given))
-        return report if isinstance(report, Report) else Message("" if report is None else report)
+        found = report if isinstance(report, Report) else Message(report or "")
+        return found, base if call.is_trial else draft.maps.state
+
+    def start(self, command: str, *words: str, **flags: Any) -> Job:
+        """Start a command in the background; see `run`. The job knows its state and its report."""
+        call = call_from_keywords(self.registry.find(command), words, flags, self.settings)
+        return self.start_call(call, call.command.name)
+
+    def start_call(self, call: Call, text: str) -> Job:
+        """Start a call in the background, on the maps as they are now.
+
+        Raises:
+            UserError: The call cannot be carried out as given.
+        """
+        call.arguments()
+        if call.command.needs_map:
+            _ = self.maps.selected
+        return self.jobs.start(self, call, text)
+
+    def __getattr__(self, name: str) -> Callable[..., Report]:
+        """Return a command as a function: `session.optvi(ba_num_iterations=20)`."""
+        registry = self.__dict__.get("registry")
+        if registry is None or name not in registry.names:
+            raise AttributeError(f"a session has no attribute and no command '{name}'")
+        return functools.partial(self.run, name)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *(n for n in self.registry.names if n.isidentifier())})
+
+    def _with_maps(self, maps: MapManager, terminal: Terminal) -> Session:
+        """Return this session as a running command shall see it: with its own draft of the maps."""
+        inside = copy.copy(self)
+        inside.maps, inside.terminal, inside.lock = maps, terminal, threading.RLock()
+        return inside
 
 
 def _by_position(call: Call, arguments: dict[str, Any]) -> list[Any]:

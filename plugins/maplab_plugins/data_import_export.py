@@ -26,7 +26,7 @@ class WrittenFiles(Report):
     rows: int
 
 
-@command("csv_export", example="csv_export --csv_export_path=csv")
+@command("csv_export", example="csv_export --csv_export_path=csv", acts_outside=True)
 def csv_export(
     context: CommandContext,
     *,
@@ -45,7 +45,11 @@ def csv_export(
     return _export_csv(context, csv_export_path, options, map_mission, overwrite)
 
 
-@command("csv_export_vertices_only", example="csv_export_vertices_only --csv_export_path=csv")
+@command(
+    "csv_export_vertices_only",
+    example="csv_export_vertices_only --csv_export_path=csv",
+    acts_outside=True,
+)
 def csv_export_vertices_only(
     context: CommandContext,
     *,
@@ -85,7 +89,12 @@ def _export_csv(
     )
 
 
-@command("export_trajectory_to_csv", "ettc", example="ettc --pose_export_file=poses.csv")
+@command(
+    "export_trajectory_to_csv",
+    "ettc",
+    example="ettc --pose_export_file=poses.csv",
+    acts_outside=True,
+)
 def export_trajectory_to_csv(
     context: CommandContext,
     *,
@@ -128,7 +137,12 @@ def export_trajectory_to_csv(
     return WrittenFiles((path,), len(states))
 
 
-@command("export_ncamera_calibration", "encc", example="encc --ncamera_calibration_export_folder=c")
+@command(
+    "export_ncamera_calibration",
+    "encc",
+    example="encc --ncamera_calibration_export_folder=c",
+    acts_outside=True,
+)
 def export_ncamera_calibration(
     context: CommandContext,
     *,
@@ -158,7 +172,11 @@ def export_ncamera_calibration(
     return WrittenFiles(paths, len(paths))
 
 
-@command("export_mission_info", example="export_mission_info --mission_info_export_path=info.yaml")
+@command(
+    "export_mission_info",
+    example="export_mission_info --mission_info_export_path=info.yaml",
+    acts_outside=True,
+)
 def export_mission_info(
     context: CommandContext,
     *,

@@ -153,9 +153,9 @@ def test_watch_repeats_and_reports_the_commands_failure(capsys: Capture) -> None
 def test_the_sheep_comes_and_goes() -> None:
     runner = make_runner()
     runner.run_text("sheep")
-    assert runner.session.prompt_sign == "\N{SHEEP}"
+    assert runner.session.marks["sheep"] == "\N{SHEEP}"
     runner.run_text("enable_sheep")
-    assert runner.session.prompt_sign == ""
+    assert runner.session.marks["sheep"] == ""
 
 
 def test_batch_runs_the_commands_for_each_folder(tmp_path: Path, capsys: Capture) -> None:

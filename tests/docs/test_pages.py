@@ -38,6 +38,15 @@ def test_command_pages_are_those_of_the_registry() -> None:
     assert stale == [], "run docs/scripts/generate_command_pages.py"
 
 
+def test_generated_pages_are_up_to_date() -> None:
+    migration = _script("generate_migration_page").page(load_registry())
+    assert (DOCS / "migration.md").read_text() == migration, "run generate_migration_page.py"
+    decisions = _script("generate_command_pages").decisions()
+    assert (DOCS / "decisions" / "index.md").read_text() == decisions, (
+        "run docs/scripts/generate_command_pages.py"
+    )
+
+
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_links_lead_somewhere(path: Path) -> None:
     missing = [target for target in links(path) if not (path.parent / target).exists()]
@@ -101,8 +110,9 @@ def test_python_blocks_compile() -> None:
 
 
 def test_decisions_have_their_three_parts() -> None:
-    decisions = sorted((DOCS / "decisions").glob("*.md"))
-    assert [int(path.name[:4]) for path in decisions] == list(range(1, len(decisions) + 1))
+    decisions = sorted((DOCS / "decisions").glob("0*.md"))
+    numbers = [int(path.name[:4]) for path in decisions]
+    assert len(numbers) == len(set(numbers)) >= 9
     for path in decisions:
         text = path.read_text()
         for part in ("**Context.**", "**Decision.**", "**Consequences.**"):

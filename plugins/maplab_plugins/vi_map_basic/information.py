@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.plugin import CommandContext, Report, UserError, command
 from maplab_py.vimap.ids import to_hex_list
+
+if TYPE_CHECKING:
+    from maplab_py.vimap.consistency import ConsistencyReport
+    from maplab_py.vimap.statistics import CoobservabilityReport, MapStatistics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +57,7 @@ class CameraList(Report):
 
 
 @command("map_stats", "ms")
-def map_stats(context: CommandContext) -> Report:
+def map_stats(context: CommandContext) -> MapStatistics:
     """Count what is in the map, mission by mission."""
     from maplab_py.vimap.statistics import map_statistics
 
@@ -60,7 +65,7 @@ def map_stats(context: CommandContext) -> Report:
 
 
 @command("mission_coobservability_stats", "mcs")
-def mission_coobservability_stats(context: CommandContext) -> Report:
+def mission_coobservability_stats(context: CommandContext) -> CoobservabilityReport:
     """Show which missions share landmarks."""
     from maplab_py.vimap.statistics import coobservability
 
@@ -115,7 +120,7 @@ def print_camera_calibrations(context: CommandContext) -> CameraList:
 
 
 @command("check_map_consistency")
-def check_map_consistency(context: CommandContext) -> Report:
+def check_map_consistency(context: CommandContext) -> ConsistencyReport:
     """Check that everything in the map fits together; fails when something does not."""
     from maplab_py.vimap.consistency import check_consistency
 

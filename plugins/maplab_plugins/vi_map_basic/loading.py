@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from maplab_py.options import option
 from maplab_py.plugin import CommandContext, Report, UserError, command, key_of_folder
 from maplab_py.vimap import VIMap
 
@@ -48,7 +49,22 @@ class MergedMaps(Report):
     details: tuple[Report, ...]
 
 
-@command("list_maps_on_file_system", example="list_maps_on_file_system ~/maps", needs_map=False)
+@dataclasses.dataclass(frozen=True)
+class ReadingOptions:
+    """How map files are read."""
+
+    proto_max_size_megabytes: int = option(
+        2000, help="Refuse map files that unpack to more than this.", unit="MB"
+    )
+    repair: bool = option(
+        False, help="Keep what both copies of an observation say instead of refusing the map."
+    )
+
+
+_READING = ReadingOptions()
+
+
+@command("list_maps_on_file_system", example="list_maps_on_file_system maps", needs_map=False)
 def list_maps_on_file_system(
     context: CommandContext,  # noqa: ARG001
     maps_folder: Path,
@@ -68,17 +84,14 @@ def load(
     *,
     map_key: str = "",
     assign_new_ids: bool = False,
-    proto_max_size_megabytes: int = 2000,
-    repair: bool = False,
-) -> Report:
+    reading: ReadingOptions = _READING,
+) -> LoadedMaps:
     """Load a map into memory and select it.
 
     Args:
         map_folder: Folder of the map.
         map_key: Key of the map in memory; empty = the folder's name.
         assign_new_ids: Give missions, vertices, landmarks and edges new ids.
-        proto_max_size_megabytes: Refuse map files that unpack to more than this.
-        repair: Drop what refers to things that do not exist instead of refusing the map.
     """
     from maplab_py.storage.native import load_map
     from maplab_py.vimap.edits import with_new_ids
@@ -86,19 +99,25 @@ def load(
     key = context.maps.check_new_key(map_key or key_of_folder(map_folder))
     vi_map, report = load_map(
         map_folder,
-        max_size_megabytes=proto_max_size_megabytes,
-        repair=repair,
+        max_size_megabytes=reading.proto_max_size_megabytes,
+        repair=reading.repair,
         progress=context.progress,
     )
     if assign_new_ids:
         vi_map = with_new_ids(vi_map)
-    context.maps.add(key, vi_map, folder=map_folder, is_saved=not (assign_new_ids or repair))
+    context.maps.add(
+        key, vi_map, folder=map_folder, is_saved=not (assign_new_ids or reading.repair)
+    )
     return LoadedMaps((_loaded(key, vi_map, map_folder),), (report,))
 
 
 @command("load_all", example="load_all --maps_folder=maps", needs_map=False)
 def load_all(
-    context: CommandContext, maps_folder: Path, *, assign_new_ids: bool = False
+    context: CommandContext,
+    maps_folder: Path,
+    *,
+    assign_new_ids: bool = False,
+    reading: ReadingOptions = _READING,
 ) -> LoadedMaps:
     """Load every map below a folder, each under the name of its folder; the last is selected.
 
@@ -115,18 +134,22 @@ def load_all(
         raise UserError(
             f"load_all: two folders would get the map key '{twice[0]}'; load them singly"
         )
-    loaded = _load_each(context, folders)
+    loaded = _load_each(context, folders, reading)
     lines = []
     for key, folder, (vi_map, _) in zip(keys, folders, loaded, strict=True):
         value = with_new_ids(vi_map) if assign_new_ids else vi_map
-        context.maps.add(key, value, folder=folder, is_saved=not assign_new_ids)
+        context.maps.add(key, value, folder=folder, is_saved=not (assign_new_ids or reading.repair))
         lines.append(_loaded(key, value, folder))
     return LoadedMaps(tuple(lines), ())
 
 
 @command("load_merge_map", example="load_merge_map --map_folder=maps/v1_02")
 def load_merge_map(
-    context: CommandContext, map_folder: Path, *, assign_new_ids: bool = False
+    context: CommandContext,
+    map_folder: Path,
+    *,
+    assign_new_ids: bool = False,
+    reading: ReadingOptions = _READING,
 ) -> MergedMaps:
     """Load a map and merge its missions into the selected map.
 
@@ -134,7 +157,7 @@ def load_merge_map(
         map_folder: Folder of the map.
         assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids.
     """
-    return _merge_all(context, [map_folder], "", assign_new_ids=assign_new_ids)
+    return _merge_all(context, [map_folder], "", reading, assign_new_ids=assign_new_ids)
 
 
 @command("load_merge_all_maps", example="load_merge_all_maps --maps_folder=maps", needs_map=False)
@@ -144,6 +167,7 @@ def load_merge_all_maps(
     *,
     target_map_key: str = "",
     assign_new_ids: bool = False,
+    reading: ReadingOptions = _READING,
 ) -> MergedMaps:
     """Load every map below a folder and merge all missions into the selected map or a new one.
 
@@ -155,12 +179,17 @@ def load_merge_all_maps(
             one recording can serve as several.
     """
     key = _target_key(context, maps_folder, target_map_key)
-    return _merge_all(context, _folders_below(maps_folder), key, assign_new_ids=assign_new_ids)
+    folders = _folders_below(maps_folder)
+    return _merge_all(context, folders, key, reading, assign_new_ids=assign_new_ids)
 
 
 @command("load_merge_submap", example="load_merge_submap --map_folder=submap_1", needs_map=False)
 def load_merge_submap(
-    context: CommandContext, map_folder: Path, *, assign_new_ids: bool = False
+    context: CommandContext,
+    map_folder: Path,
+    *,
+    assign_new_ids: bool = False,
+    reading: ReadingOptions = _READING,
 ) -> MergedMaps:
     """Load a piece of a mission and append it to that mission in the selected map.
 
@@ -172,8 +201,8 @@ def load_merge_submap(
     """
     key = _target_key(context, map_folder, "")
     if assign_new_ids:
-        return _merge_all(context, [map_folder], key, assign_new_ids=True)
-    return _append_all(context, [map_folder], key, assign_new_ids=False)
+        return _merge_all(context, [map_folder], key, reading, assign_new_ids=True)
+    return _append_all(context, [map_folder], key, reading, assign_new_ids=False)
 
 
 @command(
@@ -187,6 +216,7 @@ def load_merge_all_submaps(
     *,
     target_map_key: str = "",
     assign_new_ids: bool = False,
+    reading: ReadingOptions = _READING,
 ) -> MergedMaps:
     """Load the pieces of missions below a folder in time order and join them.
 
@@ -197,18 +227,24 @@ def load_merge_all_submaps(
         assign_new_ids: Give the joined missions, vertices, landmarks and edges new ids.
     """
     key = _target_key(context, maps_folder, target_map_key)
-    return _append_all(context, _folders_below(maps_folder), key, assign_new_ids=assign_new_ids)
+    folders = _folders_below(maps_folder)
+    return _append_all(context, folders, key, reading, assign_new_ids=assign_new_ids)
 
 
 def _merge_all(
-    context: CommandContext, folders: list[Path], new_key: str, *, assign_new_ids: bool
+    context: CommandContext,
+    folders: list[Path],
+    new_key: str,
+    reading: ReadingOptions,
+    *,
+    assign_new_ids: bool,
 ) -> MergedMaps:
     """Load folders and merge them into the selected map, or into a new one if a key is given."""
     from maplab_py.vimap.edits import with_new_ids
     from maplab_py.vimap.merge import merge_maps
 
-    loaded = _load_each(context, folders)
-    base = context.vi_map if context.maps.selected_key else None
+    loaded = _load_each(context, folders, reading)
+    base = None if new_key else context.vi_map
     details: list[Report] = []
     for vi_map, _ in loaded:
         context.progress.check()
@@ -221,16 +257,21 @@ def _merge_all(
 
 
 def _append_all(
-    context: CommandContext, folders: list[Path], new_key: str, *, assign_new_ids: bool
+    context: CommandContext,
+    folders: list[Path],
+    new_key: str,
+    reading: ReadingOptions,
+    *,
+    assign_new_ids: bool,
 ) -> MergedMaps:
     """Load folders in time order and append each to its mission, which the first of it begins."""
     from maplab_py.vimap.edits import with_new_ids
     from maplab_py.vimap.merge import merge_maps
     from maplab_py.vimap.submaps import append_submap
 
-    loaded = _load_each(context, folders)
+    loaded = _load_each(context, folders, reading)
     pieces = sorted((vi_map for vi_map, _ in loaded), key=_start_time_ns)
-    selected = context.vi_map if context.maps.selected_key else None
+    selected = None if new_key else context.vi_map
     base = None if assign_new_ids else selected
     details: list[Report] = []
     for piece in pieces:
@@ -280,13 +321,16 @@ def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> s
     return context.maps.check_new_key(target_map_key or key_of_folder(folder))
 
 
-def _load_each(context: CommandContext, folders: list[Path]) -> list[tuple[VIMap, Report]]:
+def _load_each(
+    context: CommandContext, folders: list[Path], reading: ReadingOptions
+) -> list[tuple[VIMap, Report]]:
     from maplab_py.storage.native import load_map
 
     loaded: list[tuple[VIMap, Report]] = []
     for done, folder in enumerate(folders):
         context.progress.step(done, len(folders), f"load {folder.name}")
-        loaded.append(load_map(folder))
+        limit, repair = reading.proto_max_size_megabytes, reading.repair
+        loaded.append(load_map(folder, max_size_megabytes=limit, repair=repair))
     return loaded
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 from maplab_py.vimap import VIMap
+
+if TYPE_CHECKING:
+    from maplab_py.vimap.merge import MergeReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +34,7 @@ class MapList(Report):
 
 
 @command("list", "ls", "list_maps", needs_map=False)
-def list_maps(context: CommandContext) -> Report:
+def list_maps(context: CommandContext) -> MapList | Message:
     """List the maps in memory."""
     if not len(context.maps):
         return Message("no maps in memory")
@@ -70,7 +74,7 @@ def create_new_map(context: CommandContext, map_key: str) -> Message:
     return Message(f"new map '{map_key}' is selected")
 
 
-@command("delete_map", "delete", see_also=("clear_storage",))
+@command("delete_map", "delete", example="delete_map --yes", see_also=("clear_storage",))
 def delete_map(context: CommandContext, map_key: str = "", *, yes: bool = False) -> Message:
     """Drop a map from memory; its files stay.
 
@@ -86,7 +90,7 @@ def delete_map(context: CommandContext, map_key: str = "", *, yes: bool = False)
     return Message(f"map '{key}' is dropped{_selection(context)}")
 
 
-@command("clear_storage", see_also=("delete_map",), needs_map=False)
+@command("clear_storage", example="clear_storage --yes", see_also=("delete_map",), needs_map=False)
 def clear_storage(context: CommandContext, *, yes: bool = False) -> Message:
     """Drop all maps from memory; their files stay.
 
@@ -128,7 +132,9 @@ def copy_map(context: CommandContext, target_map_key: str) -> Message:
 
 
 @command("merge_map", example="merge_map --map_key=v1_02", see_also=("join_all_maps",))
-def merge_map(context: CommandContext, map_key: str, *, assign_new_ids: bool = False) -> Report:
+def merge_map(
+    context: CommandContext, map_key: str, *, assign_new_ids: bool = False
+) -> MergeReport:
     """Merge another map in memory into the selected one; the other stays as it is.
 
     Args:
@@ -148,7 +154,7 @@ def merge_map(context: CommandContext, map_key: str, *, assign_new_ids: bool = F
 @command("join_all_maps", example="join_all_maps --target_map_key=all", needs_map=False)
 def join_all_maps(
     context: CommandContext, target_map_key: str, *, assign_new_ids: bool = False
-) -> Report:
+) -> MergeReport:
     """Merge all maps in memory into a new one and drop them.
 
     Args:

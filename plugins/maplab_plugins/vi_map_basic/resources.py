@@ -72,7 +72,7 @@ def list_resource_folders(context: CommandContext) -> ResourceFolderList:
 
 
 @command("resource_statistics", "res_stats")
-def resource_statistics(context: CommandContext) -> Report:
+def resource_statistics(context: CommandContext) -> ResourceStatistics | Message:
     """Count the selected map's resources by type and by what they belong to."""
     resources = context.vi_map.resources
     if not len(resources):
@@ -96,7 +96,7 @@ def use_map_resource_folder(context: CommandContext) -> Message:
     return Message("new resources go to the map's own resource folder")
 
 
-@command("use_external_resource_folder", example="use_external_resource_folder /data/images")
+@command("use_external_resource_folder", example="use_external_resource_folder images")
 def use_external_resource_folder(context: CommandContext, resource_folder: Path) -> Message:
     """Let new resources go to a folder outside the map.
 

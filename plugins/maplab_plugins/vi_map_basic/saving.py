@@ -29,6 +29,27 @@ class SavedMaps(Report):
 
 
 @dataclasses.dataclass(frozen=True)
+class PlannedSave:
+    """What saving one map would do."""
+
+    map_key: str
+    folder: Path
+    replaces_a_map: bool
+    missions: int
+    vertices: int
+    landmarks: int
+    resources_to_copy: int
+    resource_files_to_delete: int
+
+
+@dataclasses.dataclass(frozen=True)
+class SavePlan(Report):
+    """What saving would do; nothing has been written."""
+
+    maps: tuple[PlannedSave, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class ResourceMigration:
     """Where the resource files go when a map is saved; at most one of the four is given."""
 
@@ -55,40 +76,52 @@ class ResourceMigration:
 _NO_MIGRATION = ResourceMigration()
 
 
-@command("save", example="save --map_folder=maps/merged --overwrite", see_also=("save_all",))
+@command(
+    "save",
+    example="save --map_folder=maps/merged --overwrite",
+    see_also=("save_all",),
+    acts_outside=True,
+)
 def save(
     context: CommandContext,
     map_folder: Path | None = None,
     *,
     overwrite: bool = False,
     migration: ResourceMigration = _NO_MIGRATION,
-) -> SavedMaps:
+    dry_run: bool = False,
+) -> SavedMaps | SavePlan:
     """Save the selected map; the folder's old content stays until the new one is complete.
 
     Args:
         map_folder: Where to; empty = the folder that the map was loaded from or last saved to.
         overwrite: Replace a map that is there already.
+        dry_run: Only tell what would be written and replaced.
     """
     folder = map_folder or context.map_folder
     if folder is None:
         raise UserError(f"save: map '{context.map_key}' has no folder yet; give --map_folder=...")
-    return _save(context, [(context.map_key, folder)], migration, overwrite=overwrite)
+    jobs = [(context.map_key, folder)]
+    if dry_run:
+        return _plan(context, jobs, migration, overwrite=overwrite)
+    return _save(context, jobs, migration, overwrite=overwrite)
 
 
-@command("save_all", example="save_all --maps_folder=results", needs_map=False)
+@command("save_all", example="save_all --maps_folder=results", needs_map=False, acts_outside=True)
 def save_all(
     context: CommandContext,
     maps_folder: Path | None = None,
     *,
     overwrite: bool = False,
     migration: ResourceMigration = _NO_MIGRATION,
-) -> SavedMaps:
+    dry_run: bool = False,
+) -> SavedMaps | SavePlan:
     """Save all maps in memory.
 
     Args:
         maps_folder: Folder that gets one sub-folder per map, named after its key; empty = each
             map's own folder.
         overwrite: Replace maps that are there already.
+        dry_run: Only tell what would be written and replaced.
     """
     jobs = []
     for entry in context.maps:
@@ -100,6 +133,8 @@ def save_all(
         jobs.append((entry.key, folder))
     if not jobs:
         raise UserError("save_all: no maps in memory")
+    if dry_run:
+        return _plan(context, jobs, migration, overwrite=overwrite)
     return _save(context, jobs, migration, overwrite=overwrite)
 
 
@@ -121,6 +156,59 @@ def set_map_folder(context: CommandContext, map_folder: Path) -> Message:
     return Message(f"map '{entry.key}' will be saved to {map_folder}")
 
 
+def _check(jobs: list[tuple[str, Path]], migration: ResourceMigration, *, overwrite: bool) -> None:
+    from maplab_py.storage.native import is_map_folder
+
+    migration.check()
+    for key, folder in jobs:
+        if is_map_folder(folder) and not overwrite:
+            raise UserError(f"map '{key}': {folder} holds a map already; give --overwrite")
+
+
+def _plan(
+    context: CommandContext,
+    jobs: list[tuple[str, Path]],
+    migration: ResourceMigration,
+    *,
+    overwrite: bool,
+) -> SavePlan:
+    from maplab_py.storage.native import is_map_folder
+
+    _check(jobs, migration, overwrite=overwrite)
+    planned = []
+    for key, folder in jobs:
+        entry = context.maps.get(key)
+        vi_map = entry.vi_map
+        copies, leaving = _planned_files(vi_map, entry.folder, folder, migration)
+        planned.append(
+            PlannedSave(
+                key,
+                folder,
+                is_map_folder(folder),
+                len(vi_map.missions),
+                len(vi_map.vertices),
+                len(vi_map.landmarks),
+                copies,
+                leaving,
+            )
+        )
+    return SavePlan(tuple(planned))
+
+
+def _planned_files(
+    vi_map: VIMap, old_folder: Path | None, folder: Path, migration: ResourceMigration
+) -> tuple[int, int]:
+    """Count the resource files that would be copied, and those that would be deleted then."""
+    moved = migration.move_resources_to_external_folder
+    if moved or migration.copy_resources_to_external_folder:
+        from maplab_py.storage import resources
+
+        files = len(resources.existing_files(vi_map, old_folder or folder))
+        return files, files if moved else 0
+    _, copies, leaving = _with_resources(vi_map, old_folder, folder, migration)
+    return len(copies), len(leaving)
+
+
 def _save(
     context: CommandContext,
     jobs: list[tuple[str, Path]],
@@ -128,12 +216,9 @@ def _save(
     *,
     overwrite: bool,
 ) -> SavedMaps:
-    from maplab_py.storage.native import is_map_folder, save_map
+    from maplab_py.storage.native import save_map
 
-    migration.check()
-    for key, folder in jobs:
-        if is_map_folder(folder) and not overwrite:
-            raise UserError(f"map '{key}': {folder} holds a map already; give --overwrite")
+    _check(jobs, migration, overwrite=overwrite)
     reports = []
     for done, (key, folder) in enumerate(jobs):
         context.progress.step(done, len(jobs), f"save {key}")

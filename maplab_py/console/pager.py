@@ -1,0 +1,34 @@
+"""Long output through the user's pager, so that its beginning does not run off the screen."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+PAGER_VARIABLE = "MAPLAB_PAGER"
+_DEFAULT = "less -FRX"
+
+
+def pager_command() -> str:
+    """Return the pager: $MAPLAB_PAGER, else less; empty when there is none or it is `cat`."""
+    configured = os.environ.get(PAGER_VARIABLE)
+    if configured is not None:
+        return "" if configured.strip() == "cat" else configured.strip()
+    return _DEFAULT if shutil.which("less") else ""
+
+
+def page(text: str) -> bool:
+    """Show text by the pager if it is longer than the terminal; tell whether that was done."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return False
+    pager = pager_command()
+    if not pager or text.count("\n") < shutil.get_terminal_size().lines:
+        return False
+    sys.stdout.flush()
+    try:
+        subprocess.run(pager, shell=True, input=text, text=True, check=False)
+    except KeyboardInterrupt:
+        return True
+    return True

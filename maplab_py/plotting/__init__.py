@@ -1,0 +1,1 @@
+"""Figures of maps: arrays in, matplotlib figures out; no windows, no global state."""

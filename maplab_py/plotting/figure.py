@@ -1,0 +1,93 @@
+"""What all figures have in common: size, colours, and how they become files."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import UserError
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex_list
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".svg", ".pdf")
+_DPI = 150
+_MAX_POINTS = 20_000
+
+
+def new_figure(width_in: float = 8.0, height_in: float = 6.0) -> Figure:
+    """Return an empty figure that belongs to no window system."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def mission_names(vi_map: VIMap) -> list[str]:
+    """Return short names of the missions: the first eight digits of their ids."""
+    return [name[:8] for name in to_hex_list(vi_map.missions.id)]
+
+
+def mission_colour(row: int) -> Any:
+    """Return the colour of a mission, the same in all figures."""
+    from matplotlib import colormaps
+
+    return colormaps["tab10"](row % 10)
+
+
+def thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return at most some thousands of rows, evenly taken, as more cannot be told apart."""
+    return rows[:: max(1, -(-len(rows) // _MAX_POINTS))]
+
+
+def label(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Name the axes of a plot and give it a faint grid."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(visible=True, alpha=0.3)
+    if title:
+        axes.set_title(title)
+
+
+def legend(axes: Axes, count: int) -> None:
+    """Add a legend unless it would cover the plot."""
+    if 0 < count <= 12:
+        axes.legend(fontsize="small")
+
+
+def check_plot_file(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file that cannot become a figure, before any work is done.
+
+    Raises:
+        UserError: Its suffix is not one of `SUFFIXES`, or it exists and `overwrite` is not set.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise UserError(f"--plot_file={path}: the name must end in {', '.join(SUFFIXES)}")
+    if path.exists() and not overwrite:
+        raise UserError(f"--plot_file={path} exists; give --overwrite or another name")
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure to a file; the same figure gives the same bytes.
+
+    Raises:
+        UserError: The file cannot be written.
+    """
+    metadata = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    suffix = path.suffix.lower()
+    content = io.BytesIO()
+    figure.savefig(content, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content.getvalue())
+    except OSError as error:
+        raise UserError(f"--plot_file={path}: cannot be written: {error.strerror}") from None

@@ -1,0 +1,28 @@
+"""The console's own commands: help, lasting flags, aliases, jobs, timing, transcript, plugins."""
+
+from maplab_plugins.console.aliases import alias, unalias
+from maplab_plugins.console.help import list_plugins, show_help
+from maplab_plugins.console.jobs import cancel, join, list_jobs
+from maplab_plugins.console.lasting_flags import list_flags, set_flags, unset_flags
+from maplab_plugins.console.new_plugin import new_plugin
+from maplab_plugins.console.schema import show_schema
+from maplab_plugins.console.session import enable_sheep, show_timing, transcript, watch
+
+__all__ = [
+    "alias",
+    "cancel",
+    "enable_sheep",
+    "join",
+    "list_flags",
+    "list_jobs",
+    "list_plugins",
+    "new_plugin",
+    "set_flags",
+    "show_help",
+    "show_schema",
+    "show_timing",
+    "transcript",
+    "unalias",
+    "unset_flags",
+    "watch",
+]

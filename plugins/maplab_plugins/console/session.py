@@ -1,0 +1,103 @@
+"""The course of a session: time spent, repetition, transcript, sheep."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+from maplab_py.plugin import Cancelled, CommandContext, Message, Report, UserError, command
+
+
+@dataclasses.dataclass(frozen=True)
+class TimingLine:
+    """The runs of one command."""
+
+    command: str
+    runs: int
+    total_s: float
+    mean_s: float
+    longest_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class TimingTable(Report):
+    """Time spent in commands in this session, most expensive first."""
+
+    timings: tuple[TimingLine, ...]
+
+
+@command("timing", needs_map=False)
+def show_timing(context: CommandContext) -> TimingTable | Message:
+    """Show how long the commands of this session took."""
+    seconds: dict[str, list[float]] = {}
+    for timing in context.session.timings:
+        seconds.setdefault(timing.command, []).append(timing.seconds)
+    lines = [
+        TimingLine(name, len(runs), sum(runs), sum(runs) / len(runs), max(runs))
+        for name, runs in seconds.items()
+    ]
+    if not lines:
+        return Message("no command has run yet")
+    return TimingTable(tuple(sorted(lines, key=lambda line: -line.total_s)))
+
+
+@command(
+    "watch",
+    "w",
+    example='watch --command="map_stats" --every=1 --repetitions=2',
+    needs_map=False,
+    acts_outside=True,
+)
+def watch(
+    context: CommandContext, command: str, *, every: float = 2.0, repetitions: int = 0
+) -> Message:
+    """Repeat a command until Ctrl-C.
+
+    Args:
+        command: The command with its flags, in quotes.
+        every: Pause between two runs in seconds.
+        repetitions: Stop after so many runs; 0 = only at Ctrl-C.
+    """
+    if not command.strip():
+        raise UserError("watch: --command is empty; say what to repeat")
+    if every < 0 or repetitions < 0:
+        raise UserError("watch: --every and --repetitions cannot be negative")
+    runs = 0
+    try:
+        while not repetitions or runs < repetitions:
+            if runs:
+                _sleep(context, every)
+            context.session.run_line(command, context.terminal)
+            runs += 1
+    except Cancelled:
+        return Message(f"stopped after {runs} runs")
+    return Message(f"{runs} runs")
+
+
+def _sleep(context: CommandContext, seconds: float) -> None:
+    """Wait, but notice Ctrl-C at once."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        context.progress.check()
+        time.sleep(min(0.05, max(0.0, end - time.monotonic())))
+    context.progress.check()
+
+
+@command("transcript", example="transcript session.txt", needs_map=False, acts_outside=True)
+def transcript(context: CommandContext, file: Path | None = None) -> Message:
+    """Copy everything that is typed and printed from now on to a file.
+
+    Args:
+        file: File to append to; without one the copying ends.
+    """
+    context.terminal.transcribe(file)
+    return Message(f"transcript goes to {file}" if file else "transcript ended")
+
+
+@command("enable_sheep", "sheep", needs_map=False, acts_outside=True)
+def enable_sheep(context: CommandContext) -> Message:
+    """Put a sheep into the prompt; once more to let it go."""
+    marks = context.session.marks
+    marks["sheep"] = "" if marks.get("sheep") else "\N{SHEEP}"
+    return Message("baa")

@@ -1,0 +1,171 @@
+"""Commands that draw a map into a file: PNG, SVG or PDF."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.plugin import CommandContext, Report, command
+
+_EVALUATION = TrajectoryEvaluationOptions()
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot(Report):
+    """A figure that was written."""
+
+    file: Path
+    what: str
+
+
+@command(
+    "plot_trajectory",
+    example="plot_trajectory --plot_file=top.png --overwrite",
+    see_also=("plot_errors", "plot_coobservability"),
+    acts_outside=True,
+)
+def plot_trajectory(
+    context: CommandContext,
+    *,
+    plot_file: Path = Path("trajectory.png"),
+    plot_landmarks: bool = True,
+    ground_truth: Path | None = None,
+    map_mission_list: str = "",
+    overwrite: bool = False,
+) -> Plot:
+    """Draw the missions from above, with their landmarks.
+
+    Args:
+        plot_file: File to write; its suffix says which kind.
+        plot_landmarks: Draw the landmarks too, those judged bad apart.
+        ground_truth: Draw this trajectory too (TUM, EuRoC or CSV), laid on the vertices.
+        map_mission_list: Missions to draw, separated by commas; empty = all.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.plotting import figure, maps
+
+    figure.check_plot_file(plot_file, overwrite=overwrite)
+    missions = context.mission_rows("", map_mission_list)
+    truth = None
+    if ground_truth is not None:
+        from maplab_py.interop.trajectories import read_trajectory
+        from maplab_py.plotting.time_series import truth_in_global_frame
+
+        truth = truth_in_global_frame(context.vi_map, read_trajectory(ground_truth), missions)
+    drawn = maps.trajectories(context.vi_map, missions, landmarks=plot_landmarks, p_G_truth=truth)
+    figure.write_figure(drawn, plot_file)
+    return Plot(plot_file, "trajectories from above")
+
+
+@command(
+    "plot_errors",
+    example="plot_errors --ground_truth=V1_01_easy.csv --plot_file=errors.png",
+    see_also=("evaluate_trajectory",),
+    acts_outside=True,
+)
+def plot_errors(
+    context: CommandContext,
+    *,
+    ground_truth: Path,
+    options: TrajectoryEvaluationOptions = _EVALUATION,
+    plot_file: Path = Path("errors.png"),
+    map_mission_list: str = "",
+    overwrite: bool = False,
+) -> Plot:
+    """Draw the errors of the vertices over time, as evaluate_trajectory measures them.
+
+    Args:
+        ground_truth: TUM, EuRoC or CSV file with stamped poses.
+        plot_file: File to write; its suffix says which kind.
+        map_mission_list: Missions to draw, separated by commas; empty = all.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.interop.trajectories import read_trajectory
+    from maplab_py.plotting import figure, time_series
+
+    figure.check_plot_file(plot_file, overwrite=overwrite)
+    drawn, rmse_m = time_series.errors_over_time(
+        context.vi_map,
+        read_trajectory(ground_truth),
+        options,
+        context.mission_rows("", map_mission_list),
+    )
+    figure.write_figure(drawn, plot_file)
+    return Plot(plot_file, f"errors over time, RMSE {rmse_m:.4f} m")
+
+
+@command("plot_landmarks", example="plot_landmarks --plot_file=landmarks.png", acts_outside=True)
+def plot_landmarks(
+    context: CommandContext,
+    *,
+    plot_file: Path = Path("landmarks.png"),
+    map_mission_list: str = "",
+    overwrite: bool = False,
+) -> Plot:
+    """Draw how often landmarks are observed, how far they are, and how they were judged.
+
+    Args:
+        plot_file: File to write; its suffix says which kind.
+        map_mission_list: Missions whose landmarks count, separated by commas; empty = all.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.plotting import figure, maps
+
+    figure.check_plot_file(plot_file, overwrite=overwrite)
+    missions = context.mission_rows("", map_mission_list)
+    figure.write_figure(maps.landmark_histograms(context.vi_map, missions), plot_file)
+    return Plot(plot_file, "landmark histograms")
+
+
+@command(
+    "plot_coobservability",
+    example="plot_coobservability --plot_file=shared.png",
+    see_also=("mission_coobservability_stats",),
+    acts_outside=True,
+)
+def plot_coobservability(
+    context: CommandContext,
+    *,
+    plot_file: Path = Path("coobservability.png"),
+    overwrite: bool = False,
+) -> Plot:
+    """Draw how many landmarks each pair of missions shares.
+
+    Args:
+        plot_file: File to write; its suffix says which kind.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.plotting import figure, maps
+
+    figure.check_plot_file(plot_file, overwrite=overwrite)
+    figure.write_figure(maps.coobservability(context.vi_map), plot_file)
+    return Plot(plot_file, "co-observability matrix")
+
+
+@command(
+    "plot_vi_states_of_mission",
+    example="plot_vi_states_of_mission --map_mission=59f0 --plot_file=states.png",
+    see_also=("export_trajectory_to_csv",),
+    acts_outside=True,
+)
+def plot_vi_states_of_mission(
+    context: CommandContext,
+    *,
+    map_mission: str = "",
+    plot_file: Path = Path("vi_states.png"),
+    overwrite: bool = False,
+) -> Plot:
+    """Draw position, velocity and biases of a mission over time.
+
+    Args:
+        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
+        plot_file: File to write; its suffix says which kind.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.plotting import figure, time_series
+
+    figure.check_plot_file(plot_file, overwrite=overwrite)
+    row = context.mission_row(map_mission)
+    figure.write_figure(time_series.inertial_states(context.vi_map, row), plot_file)
+    return Plot(plot_file, "states of a mission")

@@ -1,0 +1,63 @@
+"""A map with a resource of every type that commands show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from maplab_py.interop.ply import PlyCloud, write_ply
+from maplab_py.storage.native import save_map
+from maplab_py.storage.resource_types import RESOURCE_TYPES
+from maplab_py.storage.resources import relative_path
+from maplab_py.vimap import ResourceOwner, Resources, VIMap
+from maplab_py.vimap.ids import random_ids
+
+_TYPES = {kind.name: kind.number for kind in RESOURCE_TYPES}
+_SHOWN = (
+    "raw_images",
+    "undistorted_images",
+    "raw_color_images",
+    "undistorted_color_images",
+    "raw_depth_maps",
+    "optimized_depth_maps",
+    "disparity_maps",
+    "point_cloud",
+    "color_point_cloud",
+    "point_cloud_w_intensity",
+)
+
+
+def save_with_resources(vi_map: VIMap, folder: Path) -> None:
+    """Save a map with resources and their files."""
+    table = Resources.filled(
+        len(_SHOWN),
+        id=random_ids(len(_SHOWN), np.random.default_rng(0)),
+        type=[_TYPES[name] for name in _SHOWN],
+        owner_kind=[ResourceOwner.FRAME] * len(_SHOWN),
+        owner=np.arange(len(_SHOWN)),
+    )
+    owner_kind = np.array(table.owner_kind)
+    owner_kind[-1] = ResourceOwner.MISSION
+    owner = np.array(table.owner)
+    owner[-1] = 0
+    vi_map = vi_map.replace(resources=table.replace(owner_kind=owner_kind, owner=owner))
+    save_map(vi_map, folder)
+    for row, name in enumerate(_SHOWN):
+        path = folder / "resources" / relative_path(vi_map, row)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, name)
+
+
+def _write(path: Path, name: str) -> None:
+    if "cloud" in name:
+        points = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.0], [0.0, -1.0, 3.0]])
+        write_ply(PlyCloud(points, np.full((3, 3), 7, dtype=np.uint8)), path)
+    elif "depth" in name or "disparity" in name:
+        depth = np.zeros((480, 640), dtype=np.uint16)
+        depth[240, 320] = 2500
+        cv2.imwrite(str(path), depth)
+    else:
+        shape = (24, 32, 3) if "color" in name else (24, 32)
+        cv2.imwrite(str(path), np.full(shape, 80, dtype=np.uint8))

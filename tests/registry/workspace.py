@@ -1,0 +1,195 @@
+"""A folder in which the example of every command can be typed.
+
+A new command whose example needs something that is not here gets it here: a file in
+`make_workspace`, or lines that are typed first in `PREPARED`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from maplab_py.console.session import Session
+from maplab_py.geometry import se3
+from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
+from maplab_py.storage.native import save_map
+from maplab_py.vimap import VIMap
+from tests.registry.resources import save_with_resources
+from tests.simulation.small import simulated
+
+ROUND = Scenario(
+    name="round",
+    world=WorldOptions(landmarks_per_room=1200),
+    measurement=MeasurementOptions(frame_rate_hz=3.0, max_keypoints=150),
+    sessions=(
+        SessionOptions(duration_s=20.0, turns=1.3),
+        SessionOptions(duration_s=20.0, turns=1.3, start_turn=0.1),
+    ),
+)
+"""Two walks round a room, each with a loop and much in common."""
+
+MERGED = "load_merge_all_maps --maps_folder=maps --target_map_key=office; elq"
+PREPARED = {
+    "cancel": "",
+    "load": "",
+    "load_all": "",
+    "load_merge_all_maps": "",
+    "load_merge_all_submaps": "",
+    "load_merge_map": "load maps/v1_01",
+    "load_merge_submap": "",
+    "merge_map": "load_all maps; select_map v1_01",
+    "select_map": "load_all maps",
+    "rename_map": MERGED,
+    "join_all_maps": "load_all maps",
+    "anchor_mission": f"{MERGED}; sbk --map_mission=a1; ",
+    "anchor_all_missions": f"{MERGED}; sbk --map_mission=59f0",
+    "redo": f"{MERGED}; rlq; undo",
+    "restore": f"{MERGED}; snapshot before_relax; rlq",
+    "timing": MERGED,
+    "unalias": "alias tidy=elq",
+    "unset": "set --ba_num_iterations=3",
+}
+"""Lines typed before a command's example; MERGED where nothing is said."""
+
+CLOSED = f"{MERGED}; lc --lc_insert_lc_edge_instead_of_merging"
+for _name in (
+    "assign_edge_uncertainties",
+    "assign_switch_variable_uncertainties_for_loop-closure_edges",
+    "assign_switch_variable_values_for_loop-closure_edges",
+    "visualize_loop_closures",
+):
+    PREPARED[_name] = CLOSED
+for _name in ("save_view", "export_view", "viewer_stop"):
+    PREPARED[_name] = f"{MERGED}; visualize --viewer_port=0"
+for _name in ("print_summary_map", "localize"):
+    PREPARED[_name] = f"{MERGED}; summary_map --summary_map_save_path=office_summary"
+for _name in ("segment_database_stats", "prune_segments", "export_segments"):
+    PREPARED[_name] = f"{MERGED}; collect_segments --database=device.segments"
+# two short walks show no accelerometer scale, and are refused if that is asked of them
+PREPARED["self_calibrate"] = f"{MERGED}; set --sc_states=intrinsics,extrinsics_rotation"
+PREPARED["remove_loopclosure"] = f"{MERGED}; lc"
+PREPARED["simulate"] = f"{MERGED}; !rm -r simulated"
+PREPARED["relax_external"] = f"{MERGED}; sbk --map_mission=59f0; sbk --map_mission=a1"
+PREPARED["import_g2o"] = f"{MERGED}; export_g2o graph.g2o"
+PREPARED["visualize_difference"] = f"{MERGED}; snapshot before; rlq"
+
+_SHOWING = ("images", "depth_maps", "disparity_maps", "pointclouds")
+
+
+def lines_before(name: str) -> str:
+    """Return what is typed before a command's example."""
+    if name.startswith("visualize_") and any(kind in name for kind in _SHOWING):
+        return "load with_resources/office"
+    return PREPARED.get(name, MERGED)
+
+
+SLOW = (
+    "anchor_all_missions",
+    "anchor_mission",
+    "assign_edge_uncertainties",
+    "demo",
+    "loopclosure_all_missions",
+    "loopclosure_one_mission",
+    "optimize_visual",
+    "relax",
+    "relax_missions_independently",
+    "simulate",
+    "warmup",
+)
+"""Commands whose examples take more than a second or two."""
+
+
+def make_workspace(folder: Path) -> None:
+    """Write the maps and files that examples name."""
+    data = simulated(ROUND)
+    first, second = (
+        _with_mission_id(vi_map, id_)
+        for vi_map, id_ in zip(data.maps, (0x59F0, 0xA1B2), strict=True)
+    )
+    for place, vi_map in (
+        ("maps/v1_01", first),
+        ("maps/v1_02", second),
+        ("euroc_v1_01/part_1", first),
+        ("submap_1", first),
+    ):
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        save_map(vi_map, folder / place)
+    save_with_resources(first, folder / "with_resources" / "office")
+    _write_closures(first, second, folder / "closures.yaml")
+    sensors = next((folder / "maps" / "v1_01").rglob("sensors.yaml"))
+    (folder / "sensors.yaml").write_bytes(sensors.read_bytes())
+    (folder / "images").mkdir()
+    (folder / "simulated").mkdir()
+    data.truth.save(folder / "simulated" / "truth.npz")
+    with Session() as session:
+        session.run("load", map_folder=folder / "maps" / "v1_01")
+        session.run("ettc", pose_export_file=folder / "V1_01_easy.csv", csv_export_format="rpg")
+
+
+def _write_closures(first: VIMap, second: VIMap, path: Path) -> None:
+    """Write one closure between the first vertices of two maps, in maplab's YAML."""
+
+    def pose(T: Any) -> dict[str, list[float]]:
+        return {"rotation_xyzw": T[:4].tolist(), "translation_m": T[4:].tolist()}
+
+    ends = {
+        name: {
+            "timestamp_ns": int(vi_map.vertices.timestamp_ns[0]),
+            "pose": pose(vi_map.T_G_I[0]),
+        }
+        for name, vi_map in (("camera_from", first), ("camera_to", second))
+    }
+    closure = {
+        **ends,
+        "T_from_to": pose(se3.relative(first.T_G_I[0], second.T_G_I[0])),
+        "covariance": (np.eye(6) * 1e-4).ravel().tolist(),
+        "switch_variable": 1.0,
+        "switch_variable_variance": 1e-8,
+    }
+    path.write_text(yaml.safe_dump([closure]))
+
+
+def _with_mission_id(vi_map: VIMap, first_digits: int) -> VIMap:
+    ids = vi_map.missions.id.copy()
+    ids[:, 0] = (ids[:, 0] & np.uint64(0xFFFFFFFFFFFF)) | np.uint64(first_digits << 48)
+    return vi_map.replace(missions=vi_map.missions.replace(id=ids))
+
+
+def digest(value: Any) -> str:
+    """Return a checksum of every byte of a map (or any nest of dataclasses and arrays)."""
+    checksum = hashlib.sha256()
+    _feed(value, checksum)
+    return checksum.hexdigest()
+
+
+def _feed(value: Any, checksum: Any) -> None:
+    if isinstance(value, np.ndarray):
+        checksum.update(f"{value.dtype} {value.shape}".encode())
+        checksum.update(np.ascontiguousarray(value).tobytes())
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            checksum.update(field.name.encode())
+            _feed(getattr(value, field.name), checksum)
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            checksum.update(repr(key).encode())
+            _feed(item, checksum)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _feed(item, checksum)
+    else:
+        checksum.update(repr(value).encode())
+
+
+def folder_digest(folder: Path) -> dict[str, str]:
+    """Return a checksum of every file below a folder."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
