@@ -1,0 +1,167 @@
+"""From a map to a scene."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.errors import UserError
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.viewer import colours
+from maplab_py.viewer.drawing import Drawing, make_drawing
+from maplab_py.viewer.extension import plugin_layers
+from maplab_py.viewer.layers import cameras, clouds, landmarks, paths, references
+from maplab_py.viewer.layers.clouds import Cloud
+from maplab_py.viewer.layers.references import MarkedSegments
+from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.scene import WHOLE_MAP, Axes, Extent, Layer, MissionEntry, Scene
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
+
+_MAX_RAYS = 60_000
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Subject:
+    """What is to be shown: a map, and what it is held against."""
+
+    vi_map: VIMap
+    title: str = "map"
+    options: VisualizationOptions = dataclasses.field(default_factory=VisualizationOptions)
+    other: VIMap | None = None
+    other_name: str = "before"
+    side_by_side: bool = False
+    truth: Trajectory | None = None
+    clouds: tuple[Cloud, ...] = ()
+    segments: MarkedSegments | None = None
+    shows_observers: bool = False
+    shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
+    only_layers: tuple[str, ...] = ()  # visible at first; empty = each layer's own default
+
+    def replace(self, **changes: object) -> Subject:
+        """Return the subject with some of it exchanged."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+
+def build_scene(subject: Subject) -> Scene:
+    """Return everything that is drawn of a map; layers of what the map has not are left out.
+
+    Raises:
+        UserError: The map has no vertices, or the ground truth does not fit it.
+    """
+    return scene_of(make_checked_drawing(subject), subject)
+
+
+def make_checked_drawing(subject: Subject) -> Drawing:
+    """Return the drawing of a subject.
+
+    Raises:
+        UserError: The map has no vertices, or no sensors where those are to be shown.
+    """
+    if subject.shows_sensors:
+        return _sensor_drawing(subject)
+    if not len(subject.vi_map.vertices):
+        raise UserError(f"map '{subject.title}' has no vertices: there is nothing to show")
+    return make_drawing(subject.vi_map, subject.options)
+
+
+def scene_of(drawing: Drawing, subject: Subject) -> Scene:
+    """Return the scene of a drawing."""
+    if subject.shows_sensors:
+        layer = cameras.sensor_axes(subject.vi_map.sensors)
+        return Scene(subject.title, (layer,), (), drawing.extent, drawing.origin_G)
+    layers: list[Layer] = [paths.trajectories(drawing), paths.vertices(drawing)]
+    layers += landmarks.landmarks(drawing)
+    layers += [paths.loop_closures(drawing), paths.absolute_poses(drawing)]
+    layers += [cameras.frusta(drawing), paths.imu_edges(drawing)]
+    layers += [*paths.transformation_edges(drawing), paths.base_frames(drawing)]
+    if subject.segments is not None:
+        layers.append(references.marked_segments(drawing, subject.segments))
+    if subject.shows_observers:
+        rows = _good_landmarks(drawing)
+        layers.append(cameras.landmark_observers(drawing, rows, _MAX_RAYS))
+    layers += clouds.layers_of_clouds(drawing, subject.clouds)
+    if subject.truth is not None:
+        layers += references.ground_truth(drawing, subject.truth)
+    if subject.other is not None:
+        layers += references.compared(drawing, subject.other, side_by_side=subject.side_by_side)
+    added, problems = plugin_layers(drawing, {layer.name for layer in layers})
+    layers += added
+    layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
+    extent = drawing.extent
+    notes = _notes(layers) + problems
+    if subject.other is not None:
+        extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
+        notes.insert(0, f"in grey: {subject.other_name}")
+    return Scene(
+        subject.title, tuple(layers), mission_entries(drawing), extent, drawing.origin_G,
+        notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:
+    """Return the extent of the map together with the path of another state of it."""
+    shift = references.reference_shift(drawing, side_by_side=side_by_side)
+    path = other.T_G_I[:, 4:] + shift
+    path = path[np.isfinite(path).all(axis=1)]
+    outline = np.concatenate([drawing.extent.outline, path])
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    radius = max(0.5 * float(np.linalg.norm(high - low)), drawing.extent.radius_m)
+    return Extent(0.5 * (low + high), radius, drawing.extent.floor_m, outline)
+
+
+def mission_entries(drawing: Drawing) -> tuple[MissionEntry, ...]:
+    """Return the missions as the panel lists them."""
+    vi_map = drawing.vi_map
+    span_s = 1e-9 * np.diff(mission_time_spans_ns(vi_map), axis=1)[:, 0]
+    length_m = mission_distances_m(vi_map)
+    codes = colours.hex_codes(drawing.mission_colours)
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    counts = np.diff(vi_map.vertex_start)
+    return tuple(
+        MissionEntry(
+            mission_id, codes[row], int(counts[row]), float(length_m[row]), float(span_s[row]),
+            bool(known[row]),
+        )
+        for row, mission_id in enumerate(drawing.mission_ids)
+    )  # fmt: skip
+
+
+def _with_visibility(layer: Layer, subject: Subject) -> Layer:
+    if not subject.only_layers:
+        return layer
+    return dataclasses.replace(layer, is_visible=layer.name in subject.only_layers)
+
+
+def _sensor_drawing(subject: Subject) -> Drawing:
+    """Return a drawing whose extent is that of the sensors on their base."""
+    layer = cameras.sensor_axes(subject.vi_map.sensors)
+    axes = layer.parts[WHOLE_MAP]
+    if not isinstance(axes, Axes) or not len(axes):
+        raise UserError(f"map '{subject.title}' has no sensors")
+    p = axes.T[:, 4:]
+    low, high = p.min(axis=0) - axes.length_m, p.max(axis=0) + axes.length_m
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    outline = np.concatenate([p - axes.length_m, p + axes.length_m])
+    extent = Extent(0.5 * (low + high), radius, float(low[2]), outline)
+    return Drawing(subject.vi_map, subject.options, np.zeros(3), extent)
+
+
+def _good_landmarks(drawing: Drawing) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    table = drawing.vi_map.landmarks
+    return np.flatnonzero((table.quality != 1) & np.isfinite(drawing.p_landmarks).all(axis=1))
+
+
+def _notes(layers: list[Layer]) -> list[str]:
+    """Say where not everything is drawn."""
+    partial = [
+        layer
+        for layer in layers
+        if layer.name.startswith(("landmarks", "bad_landmarks", "cloud", "reference_landmarks"))
+        and layer.drawn < layer.total
+    ]
+    return [
+        f"{layer.title}: {layer.drawn:,} of {layer.total:,} are drawn (--vis_max_points)"
+        for layer in partial
+    ]

@@ -1,0 +1,1 @@
+"""The scene in browsers: the only room that knows viser."""

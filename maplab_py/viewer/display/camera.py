@@ -1,0 +1,98 @@
+"""Where a page looks from at first, and by the panel's buttons."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.viewer.scene import Extent
+
+F64 = NDArray[np.float64]
+
+FIELD_OF_VIEW_RAD = float(np.radians(45.0))
+_ELEVATIONS_DEG = {"overview": 38.0, "top": 89.9, "side": 8.0}
+VIEWS = tuple(_ELEVATIONS_DEG)
+_ASPECT = 1.35
+"""Width by height that a view of everything is sure to fit."""
+_MARGIN = 1.08
+_FREE = 0.74
+"""Part of a page's width that the panel leaves free."""
+
+
+def view_of(
+    extent: Extent, view: str = "overview", *, beside_panel: bool = False
+) -> tuple[F64, F64]:
+    """Return camera position (3,) and target (3,) that just show the whole outline; z is up.
+
+    The overview and the view from the side look across the longest direction of the map.
+
+    Args:
+        extent: What to show.
+        view: One of `VIEWS`.
+        beside_panel: Leave the part of the page free that the panel covers.
+    """
+    azimuth = _across(extent.outline)
+    if view == "overview":
+        azimuth -= np.radians(22.0)
+    elevation = np.radians(_ELEVATIONS_DEG[view])
+    back = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    p = (extent.outline - extent.centre) @ axes.T
+    tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([_ASPECT, 1.0]) / _MARGIN
+    if beside_panel:
+        tangent[0] *= _FREE
+    middle = 0.5 * (p[:, :2].min(axis=0) + p[:, :2].max(axis=0))
+    for _ in range(3):  # near points need more room: centre what is seen, not what is there
+        distance = _distance(p, middle, tangent)
+        seen = (p[:, :2] - middle) / (distance - p[:, 2:])
+        middle = middle + 0.5 * distance * (seen.min(axis=0) + seen.max(axis=0))
+    distance = max(_distance(p, middle, tangent), 0.2 * extent.radius_m)
+    if beside_panel:
+        middle[0] += distance * (1.0 - _FREE) * _ASPECT * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+    target = extent.centre + middle @ axes[:2]
+    return target + distance * back, target
+
+
+def _distance(p: F64, middle: F64, tangent: F64) -> float:
+    """Return from how far points (N, 3), right, up and back, fit into the opening (2,)."""
+    return max(float((np.abs(p[:, :2] - middle) / tangent + p[:, 2:]).max()), 0.1)
+
+
+def _across(outline: F64) -> float:
+    """Return the direction [rad] from which the outline (N, 3) is widest, on the side of -y."""
+    flat = outline[:, :2] - outline[:, :2].mean(axis=0)
+    _, axes = np.linalg.eigh(flat.T @ flat + 1e-12 * np.eye(2))
+    normal = axes[:, 0] if axes[1, 0] <= 0.0 else -axes[:, 0]
+    return float(np.arctan2(normal[1], normal[0]))
+
+
+def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bool = True) -> None:
+    """Point the camera of a page."""
+    position, target = view_of(extent, view, beside_panel=beside_panel)
+    camera.up_direction = (0.0, 0.0, 1.0)
+    camera.position = position
+    camera.look_at = target
+    camera.fov = FIELD_OF_VIEW_RAD
+    camera.near = max(1e-3, 2e-4 * extent.radius_m)
+    camera.far = 100.0 * extent.radius_m
+
+
+def aim_initially(camera: Any, extent: Extent, *, beside_panel: bool = True) -> None:
+    """Set what new pages begin with (its field for the up direction has another name)."""
+    position, target = view_of(extent, beside_panel=beside_panel)
+    camera.position = tuple(position.tolist())
+    camera.look_at = tuple(target.tolist())
+    camera.up = (0.0, 0.0, 1.0)
+    camera.fov = FIELD_OF_VIEW_RAD
+    camera.near = max(1e-3, 2e-4 * extent.radius_m)
+    camera.far = 100.0 * extent.radius_m

@@ -1,0 +1,239 @@
+"""The panel beside the scene: checkboxes, legend, facts, slider."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from maplab_py.viewer.display import text
+from maplab_py.viewer.display.camera import VIEWS
+from maplab_py.viewer.facts import Facts
+from maplab_py.viewer.options import COLOURINGS
+from maplab_py.viewer.scene import Scene
+
+MAX_CHECKBOXES = 24
+"""Beyond this many missions the panel offers a list instead of a checkbox each."""
+
+_ALL = "all missions"
+_HINT = "Click a vertex, a landmark or a loop closure."
+
+logger = logging.getLogger(__name__)
+
+
+class Actions(Protocol):
+    """What the panel can ask for. It changes the view and never the map."""
+
+    def set_layer(self, name: str, is_visible: bool) -> None:
+        """Show or hide a layer."""
+
+    def set_missions(self, visible: set[str]) -> None:
+        """Show these missions and no others."""
+
+    def set_colouring(self, colouring: str) -> None:
+        """Colour landmarks by another rule."""
+
+    def set_point_scale(self, factor: float) -> None:
+        """Draw points larger or smaller."""
+
+    def set_dark(self, is_dark: bool) -> None:
+        """Change the theme."""
+
+    def set_ground(self, is_visible: bool) -> None:
+        """Show or hide the grid."""
+
+    def look(self, client: Any, view: str) -> None:
+        """Move the camera of one page."""
+
+    def set_step(self, step: int) -> None:
+        """Move the time slider."""
+
+    def set_playing(self, is_playing: bool) -> None:
+        """Play or pause."""
+
+    def set_measuring(self, is_measuring: bool) -> None:
+        """Measure between picks."""
+
+    def clear_pick(self) -> None:
+        """Forget what was picked."""
+
+
+def by_user(lock: threading.RLock, action: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Make a callback: only for what a page does, one at a time, errors to the log."""
+
+    def callback(event: Any) -> None:
+        if getattr(event, "client_id", None) is None:
+            return
+        try:
+            with lock:
+                action(event)
+        except Exception:
+            logger.exception("the viewer could not do what a page asked for")
+
+    return callback
+
+
+class Panel:
+    """The widgets and what they show."""
+
+    def __init__(self, server: viser.ViserServer, actions: Actions, lock: threading.RLock) -> None:
+        """Make the widgets that every scene has."""
+        self._gui = server.gui
+        self._actions = actions
+        self._lock = lock
+        self._checkboxes: dict[str, Any] = {}
+        self._mission_widgets: list[Any] = []
+        self._signature: tuple[Any, ...] = ()
+        self._steps = 0
+        self.header = self._gui.add_html("", order=0)
+        self._layers = self._gui.add_folder("Layers", order=1)
+        self._missions = self._gui.add_folder("Missions", order=2)
+        with self._gui.add_folder("Colours", order=3):
+            self.colouring: Any = self._gui.add_dropdown("landmarks by", COLOURINGS)
+            self.legend = self._gui.add_html("")
+        self._bind(self.colouring, lambda event: actions.set_colouring(event.target.value))
+        self._add_selection()
+        self._playback = self._gui.add_folder("Playback", order=5, expand_by_default=False)
+        self._add_playback(200)
+        self._add_view()
+
+    def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
+        widget.on_update(by_user(self._lock, action))
+
+    def show_colouring(self, colouring: str) -> None:
+        """Show by which rule landmarks are coloured."""
+        if self.colouring.value != colouring:
+            self.colouring.value = colouring
+
+    def _add_selection(self) -> None:
+        with self._gui.add_folder("Selection", order=4):
+            self.facts = self._gui.add_html(text.hint(_HINT))
+            self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
+            self.measuring: Any = self._gui.add_checkbox("measure between picks", False)
+            self.clear = self._gui.add_button("clear", visible=False)
+        self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
+        self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick()))
+
+    def _add_playback(self, steps: int) -> None:
+        with self._playback:
+            self.slider: Any = self._gui.add_slider("step", 0, steps, 1, steps)
+            self.playing: Any = self._gui.add_checkbox("play", False)
+            self.time = self._gui.add_html(text.hint("the whole map"))
+        self._steps = steps
+        self._bind(self.slider, lambda event: self._actions.set_step(int(event.target.value)))
+        self._bind(self.playing, lambda event: self._actions.set_playing(event.target.value))
+
+    def _add_view(self) -> None:
+        with self._gui.add_folder("View", order=6, expand_by_default=False):
+            self.views = self._gui.add_button_group("look", VIEWS)
+            self.dark: Any = self._gui.add_checkbox("dark", False)
+            self.ground = self._gui.add_checkbox("ground grid", True)
+            self.point_scale = self._gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
+        self.views.on_click(
+            by_user(self._lock, lambda event: self._actions.look(event.client, event.target.value))
+        )
+        self._bind(self.dark, lambda event: self._actions.set_dark(event.target.value))
+        self._bind(self.ground, lambda event: self._actions.set_ground(event.target.value))
+        self._bind(
+            self.point_scale, lambda event: self._actions.set_point_scale(event.target.value)
+        )
+
+    def show(self, scene: Scene, layers: set[str], missions: set[str]) -> None:
+        """Say what the scene has: its counts, legend, layers and missions."""
+        self.header.content = text.header(scene)
+        entries = [
+            entry for layer in scene.layers if layer.name in layers for entry in layer.legend
+        ]
+        self.legend.content = text.legend(dict.fromkeys(entries))
+        signature = (scene.names, scene.missions)
+        if signature != self._signature:
+            self._signature = signature
+            self._make_layers(scene, layers)
+            self._make_missions(scene, missions)
+        for layer in scene.layers:
+            box = self._checkboxes[layer.name]
+            if box.label != text.layer_label(layer):
+                box.label = text.layer_label(layer)
+            if box.value != (layer.name in layers):
+                box.value = layer.name in layers
+
+    def say(self, message: str) -> None:
+        """Show a message in the place of the header."""
+        self.header.content = text.hint(message)
+
+    def _make_layers(self, scene: Scene, layers: set[str]) -> None:
+        for box in self._checkboxes.values():
+            box.remove()
+        self._checkboxes = {}
+        with self._layers:
+            for layer in scene.layers:
+                box = self._gui.add_checkbox(
+                    text.layer_label(layer), layer.name in layers, hint=text.layer_hint(layer)
+                )
+                self._bind(box, self._layer_action(layer.name))
+                self._checkboxes[layer.name] = box
+
+    def _layer_action(self, name: str) -> Callable[[Any], None]:
+        return lambda event: self._actions.set_layer(name, event.target.value)
+
+    def _make_missions(self, scene: Scene, missions: set[str]) -> None:
+        for widget in self._mission_widgets:
+            widget.remove()
+        self._mission_widgets = []
+        with self._missions:
+            self._mission_widgets.append(self._gui.add_html(text.mission_legend(scene.missions)))
+            if len(scene.missions) > MAX_CHECKBOXES:
+                names = (_ALL, *(text.mission_label(m) for m in scene.missions))
+                self._add_mission_list(scene, names)
+            elif len(scene.missions) > 1:
+                self._add_mission_boxes(scene, missions)
+
+    def _add_mission_list(self, scene: Scene, names: tuple[str, ...]) -> None:
+        chooser = self._gui.add_dropdown("show", names)
+        ids = {name: {m.id} for name, m in zip(names[1:], scene.missions, strict=True)}
+        everything = {mission.id for mission in scene.missions}
+        self._bind(
+            chooser,
+            lambda event: self._actions.set_missions(ids.get(event.target.value, everything)),
+        )
+        self._mission_widgets.append(chooser)
+
+    def _add_mission_boxes(self, scene: Scene, missions: set[str]) -> None:
+        boxes: dict[str, Any] = {}
+
+        def choose(_: Any) -> None:
+            self._actions.set_missions({key for key, box in boxes.items() if box.value})
+
+        for mission in scene.missions:
+            box = self._gui.add_checkbox(mission.id[:8], mission.id in missions)
+            self._bind(box, choose)
+            boxes[mission.id] = box
+        self._mission_widgets += boxes.values()
+
+    def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
+        """Show what was picked; without facts the hint."""
+        table = text.fact_table(facts) if facts else text.hint(_HINT)
+        self.facts.content = table + (text.hint(note) if note else "")
+        self.clear.visible = bool(facts)
+        self.show_image(image)
+
+    def show_image(self, image: NDArray[np.uint8] | None) -> None:
+        """Show the image (H, W, 3) of a vertex, or none."""
+        if image is not None:
+            self.image.image = image
+        if self.image.visible != (image is not None):
+            self.image.visible = image is not None
+
+    def show_step(self, step: int, steps: int, note: str) -> None:
+        """Move the slider, which may have another number of steps now."""
+        if steps != self._steps:
+            self.slider.max = steps
+            self._steps = steps
+        if int(self.slider.value) != step:
+            self.slider.value = step
+        self.time.content = text.hint(note)

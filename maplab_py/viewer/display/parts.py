@@ -1,0 +1,211 @@
+"""Parts of a scene as nodes of viser; only what has changed is sent."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from maplab_py.viewer.drawing import axis_lines
+from maplab_py.viewer.scene import (
+    WHOLE_MAP,
+    Axes,
+    Extent,
+    Part,
+    Points,
+    Scene,
+    Segments,
+    is_same_part,
+)
+
+U8 = NDArray[np.uint8]
+
+_NodeKey = tuple[str, str]  # layer name, mission id
+
+LIGHT_GROUND = (255, 255, 255)
+DARK_GROUND = (20, 20, 20)
+
+
+@dataclasses.dataclass
+class _Node:
+    part: Part
+    handles: list[Any]
+
+
+class Nodes:
+    """The nodes of one scene on a server.
+
+    Attributes:
+        point_scale: Factor on the size of all points.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        """Start with an empty scene."""
+        self._server = server
+        self._nodes: dict[_NodeKey, _Node] = {}
+        self._ground: Any = None
+        self.point_scale = 1.0
+
+    def show(self, scene: Scene, layers: set[str], missions: set[str]) -> int:
+        """Send what differs from what is drawn; return the number of nodes that were sent.
+
+        Only visible layers are sent; those that are hidden follow when they are shown.
+
+        Args:
+            scene: What to draw.
+            layers: Names of visible layers.
+            missions: Ids of visible missions.
+        """
+        wanted = {
+            (layer.name, mission_id): part
+            for layer in scene.layers
+            if layer.name in layers
+            for mission_id, part in layer.parts.items()
+            if mission_id == WHOLE_MAP or mission_id in missions
+        }
+        sent = 0
+        with self._server.atomic():
+            for key in set(self._nodes) - set(wanted):
+                self._remove(key)
+            for key, part in wanted.items():
+                before = self._nodes.get(key)
+                if before is not None and is_same_part(before.part, part):
+                    continue
+                sent += 1
+                if before is None or not _moved_in_place(before, part):
+                    if before is not None:
+                        self._remove(key)
+                    self._nodes[key] = _Node(part, self._add(_node_name(*key), part))
+        return sent
+
+    def scale_points(self, factor: float) -> None:
+        """Draw all points larger or smaller."""
+        self.point_scale = factor
+        for node in self._nodes.values():
+            if isinstance(node.part, Points):
+                node.handles[0].point_size = node.part.size_m * factor
+
+    def clear(self) -> None:
+        """Remove all nodes."""
+        for key in list(self._nodes):
+            self._remove(key)
+
+    def show_ground(self, extent: Extent, *, is_dark: bool) -> None:
+        """Draw a grid at the floor of the map, with squares of a round number of metres."""
+        cell = 10.0 ** np.floor(np.log10(max(extent.radius_m, 0.1)))
+        cell = cell / 5.0 if extent.radius_m < 2.5 * cell else cell / 2.0
+        grey, strong = (
+            ((42, 44, 48), (58, 61, 66)) if is_dark else ((236, 238, 241), (218, 221, 226))
+        )
+        self._ground = self._server.scene.add_grid(
+            "/ground",
+            infinite_grid=True,
+            plane="xy",
+            cell_size=float(cell),
+            section_size=float(5.0 * cell),
+            cell_color=grey,
+            section_color=strong,
+            cell_thickness=0.6,
+            section_thickness=0.9,
+            fade_distance=float(7.0 * extent.radius_m),
+            fade_strength=1.5,
+            fade_from="origin",
+            shadow_opacity=0.0,
+            position=(float(extent.centre[0]), float(extent.centre[1]), extent.floor_m),
+        )
+
+    def set_ground_visible(self, is_visible: bool) -> None:
+        """Show or hide the grid."""
+        if self._ground is not None:
+            self._ground.visible = is_visible
+
+    def _add(self, name: str, part: Part) -> list[Any]:
+        return add_part(self._server, name, part, self.point_scale)
+
+    def _remove(self, key: _NodeKey) -> None:
+        for handle in self._nodes.pop(key).handles:
+            handle.remove()
+
+
+def add_part(
+    server: viser.ViserServer, name: str, part: Part, point_scale: float = 1.0
+) -> list[Any]:
+    """Add one part and return its handles; an empty part has none."""
+    scene = server.scene
+    if isinstance(part, Axes):
+        return _add_axes(server, name, part)
+    if not len(part):
+        return []
+    if isinstance(part, Points):
+        return [
+            scene.add_point_cloud(
+                name, part.p, part.colours, point_size=part.size_m * point_scale,
+                point_shape="circle", point_shading="flat", precision="float32",
+            )
+        ]  # fmt: skip
+    if isinstance(part, Segments):
+        return [
+            scene.add_line_segments(
+                name,
+                part.ends,
+                _line_colours(part.colours),
+                thickness=part.width_px,
+                thickness_units="screen",
+            )
+        ]
+    colour = (int(part.colour[0]), int(part.colour[1]), int(part.colour[2]))
+    return [scene.add_mesh_simple(name, part.p, part.faces, color=colour, side="double")]
+
+
+def _add_axes(server: viser.ViserServer, name: str, part: Axes) -> list[Any]:
+    lines = axis_lines(part.T, np.arange(len(part)), part.length_m, 3.0)
+    handles = add_part(server, f"{name}/axes", lines)
+    for row, label in enumerate(part.labels):
+        handles.append(
+            server.scene.add_label(
+                f"{name}/{row}", label, position=part.T[row, 4:], font_screen_scale=0.8
+            )
+        )
+    return handles
+
+
+def _line_colours(colours: U8) -> U8:
+    """Return colours (N, 2, 3) of both ends of lines (N,).
+
+    viser takes the colours of lines for linear light and those of all else for sRGB (IEC 61966-2-1).
+    """
+    s = colours / 255.0
+    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    return np.repeat(np.round(255.0 * linear).astype(np.uint8)[:, None], 2, axis=1)
+
+
+def _moved_in_place(node: _Node, part: Part) -> bool:
+    """Give a node new positions and colours where it can keep its shape."""
+    before = node.part
+    if not node.handles or len(before) != len(part):
+        return False
+    if isinstance(before, Points) and isinstance(part, Points) and before.size_m == part.size_m:
+        if not np.array_equal(before.p, part.p):
+            node.handles[0].points = part.p
+        if not np.array_equal(before.colours, part.colours):
+            node.handles[0].colors = part.colours
+    elif (
+        isinstance(before, Segments)
+        and isinstance(part, Segments)
+        and before.width_px == part.width_px
+    ):
+        if not np.array_equal(before.ends, part.ends):
+            node.handles[0].points = part.ends
+        if not np.array_equal(before.colours, part.colours):
+            node.handles[0].colors = _line_colours(part.colours)
+    else:
+        return False
+    node.part = part
+    return True
+
+
+def _node_name(layer: str, mission_id: str) -> str:
+    return f"/map/{layer}/{mission_id or 'all'}"

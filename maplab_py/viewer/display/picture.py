@@ -1,0 +1,162 @@
+"""A picture of the scene, taken by an open page or by a Chromium without a window."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.viewer.display.camera import aim
+from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
+from maplab_py.viewer.scene import Extent
+
+U8 = NDArray[np.uint8]
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+HEADLESS_FLAGS = (
+    "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-default-apps", "--disable-breakpad",
+    "--disable-domain-reliability", "--mute-audio", "--hide-scrollbars",
+)  # fmt: skip
+
+_CONNECT_S = 60.0
+_SETTLE_S = 0.7
+_RENDER_S = 60.0
+
+logger = logging.getLogger(__name__)
+
+
+def find_browser() -> str | None:
+    """Return the path of a Chromium, None when there is none."""
+    return next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+
+def take_picture(
+    server: Any, url: str, extent: Extent, view: str, size_px: tuple[int, int], *, is_dark: bool
+) -> U8:
+    """Return a picture (H, W, 3) RGB of the scene.
+
+    An open page takes it, from where it looks unless a view is wanted; else a Chromium is started
+    for as long as it takes.
+
+    Args:
+        server: The viser server.
+        url: Its address.
+        extent: What the view shall show.
+        view: One of `camera.VIEWS`; empty = where the open page looks, or the overview.
+        size_px: Width and height.
+        is_dark: Colour of the ground.
+
+    Raises:
+        UserError: No page is open and no Chromium is installed.
+        EstimationError: The browser gave no picture.
+    """
+    clients = sorted(server.get_clients().items())
+    if clients:
+        return _render(clients[-1][1], extent, view, size_px, is_dark=is_dark)
+    browser = find_browser()
+    if browser is None:
+        raise UserError(
+            f"no page is open and no Chromium is installed: open {url}, or install one "
+            "(apt-get install chromium)"
+        )
+    with _headless(browser, url, size_px):
+        client = _first_client(server)
+        return _render(client, extent, view or "overview", size_px, is_dark=is_dark)
+
+
+def _first_client(server: Any) -> Any:
+    deadline = time.monotonic() + _CONNECT_S
+    while time.monotonic() < deadline:
+        clients = server.get_clients()
+        if clients:
+            time.sleep(_SETTLE_S)
+            return next(iter(clients.values()))
+        time.sleep(0.05)
+    raise EstimationError(f"the browser did not show the page within {_CONNECT_S:.0f} s")
+
+
+def _render(
+    client: Any, extent: Extent, view: str, size_px: tuple[int, int], *, is_dark: bool
+) -> U8:
+    if view:
+        with client.atomic():
+            aim(client.camera, extent, view, beside_panel=False)
+        time.sleep(_SETTLE_S)
+    width, height = size_px
+    try:
+        picture = client.get_render(
+            height=height, width=width, transport_format="png", timeout=_RENDER_S
+        )
+    except (TimeoutError, RuntimeError, ConnectionError) as error:
+        raise EstimationError(f"the browser gave no picture: {error}") from None
+    return on_ground(np.asarray(picture), is_dark=is_dark)
+
+
+def on_ground(picture: U8, *, is_dark: bool) -> U8:
+    """Lay a picture with transparency (H, W, 4) on the theme's ground; return (H, W, 3)."""
+    if picture.shape[2] == 3:
+        return picture
+    ground = np.array(DARK_GROUND if is_dark else LIGHT_GROUND, dtype=np.float64)
+    part = picture[:, :, 3:].astype(np.float64) / 255.0
+    mixed = part * picture[:, :, :3] + (1.0 - part) * ground
+    return np.asarray(np.round(mixed), dtype=np.uint8)
+
+
+@contextmanager
+def _headless(
+    browser: str, url: str, size_px: tuple[int, int]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a Chromium without a window on a page; it keeps nothing and leaves nothing behind."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
+        width, height = size_px
+        process = subprocess.Popen(
+            [
+                browser, *HEADLESS_FLAGS, *sandbox, f"--user-data-dir={profile}",
+                f"--window-size={width},{height + 120}", url,
+            ],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(timeout=5.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def save_picture(picture: U8, path: Path) -> None:
+    """Write a picture (H, W, 3) RGB; the suffix says in which format.
+
+    Raises:
+        UserError: The file cannot be written or the suffix is unknown.
+    """
+    import cv2
+
+    try:
+        ok, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[:, :, ::-1]))
+    except cv2.error:
+        ok = False
+    if not ok:
+        raise UserError(f"--file={path}: a name ending in .png or .jpg is wanted")
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise UserError(f"--file={path}: cannot be written ({error.strerror})") from None

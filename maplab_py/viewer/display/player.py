@@ -1,0 +1,193 @@
+"""The time slider: the map grows in the order in which it was recorded.
+
+What each step brings is a node of its own, made once; moving the slider shows and hides nodes,
+which costs a few bytes per step however large the map is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from maplab_py.geometry import se3
+from maplab_py.viewer import colours
+from maplab_py.viewer.display.parts import add_part
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.layers.cameras import frustum_points, mission_cameras
+from maplab_py.viewer.layers.clouds import Cloud, cloud_colours
+from maplab_py.viewer.layers.landmarks import landmark_colours, point_size
+from maplab_py.viewer.options import PlaybackOptions
+from maplab_py.viewer.playback import Timeline, make_timeline
+from maplab_py.viewer.subsampling import spread_rows
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_FRUSTUM = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+
+
+class Player:
+    """The nodes of one playback."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drawing: Drawing,
+        missions: set[str],
+        options: PlaybackOptions,
+        clouds: tuple[Cloud, ...] = (),
+    ) -> None:
+        """Send the nodes of all steps, hidden.
+
+        Args:
+            server: Where to draw.
+            drawing: The map.
+            missions: Ids of the missions to play.
+            options: How.
+            clouds: Dense clouds, each shown from the vertex on at which it was recorded.
+        """
+        self._server = server
+        self._drawing = drawing
+        self._fades = options.landmark_fadeout
+        self.timeline: Timeline = make_timeline(drawing, options)
+        self._plays = np.array([m in missions for m in drawing.mission_ids], dtype=np.bool_)
+        self._recent: list[Any] = []
+        self.step = -1
+        with server.atomic():
+            self._chunks = self._make_chunks()
+            self._add_clouds(clouds)
+            self._heads = self._make_heads()
+
+    def go(self, step: int) -> None:
+        """Show the map as it was after a step."""
+        before, self.step = self.step, step
+        with self._server.atomic():
+            low, high = min(before, step) + 1, max(before, step) + 1
+            for number in range(low, high):
+                for handle in self._chunks.get(number, ()):
+                    handle.visible = step > before
+            self._place_heads(step)
+            if self._fades:
+                self._show_recent(step)
+
+    def head(self) -> int:
+        """Return the vertex (row) that the first mission that is played has reached, or -1."""
+        rows = self.timeline.head[self.step, self._plays]
+        return int(rows[0]) if len(rows) else -1
+
+    def note(self) -> str:
+        """Return the words beside the slider."""
+        timeline = self.timeline
+        shown = int(np.count_nonzero(timeline.vertex_step <= self.step))
+        return f"{timeline.seconds[self.step]:.1f} s, {shown:,} of {len(timeline.vertex_step):,} vertices"
+
+    def remove(self) -> None:
+        """Take all nodes away."""
+        with self._server.atomic():
+            handles = [h for chunk in self._chunks.values() for h in chunk]
+            for handle in [
+                *handles,
+                *(h for hs in self._heads.values() for h in hs),
+                *self._recent,
+            ]:
+                handle.remove()
+        self._chunks, self._heads, self._recent = {}, {}, []
+
+    def _make_chunks(self) -> dict[int, list[Any]]:
+        drawing, timeline = self._drawing, self.timeline
+        mission = drawing.vi_map.vertices.mission
+        start = np.flatnonzero((mission[1:] == mission[:-1]) & self._plays[mission[1:]])
+        paths = _grouped(timeline.vertex_step[start + 1], start)
+        rows = timeline.landmarks[self._plays[drawing.landmark_mission[timeline.landmarks]]]
+        clouds = _grouped(timeline.landmark_step[rows], rows)
+        every, _ = landmark_colours(drawing)
+        chunks: dict[int, list[Any]] = {}
+        p = drawing.p_vertices
+        for step, own in paths.items():
+            path = make_segments(
+                p[own], p[own + 1], drawing.mission_colours[mission[own]], own, 3.0
+            )
+            chunks.setdefault(step, []).extend(add_part(self._server, f"/play/{step}/path", path))
+        for step, own in clouds.items():
+            cloud = make_points(drawing.p_landmarks[own], every[own], own, point_size(drawing))
+            chunks.setdefault(step, []).extend(
+                add_part(self._server, f"/play/{step}/landmarks", cloud)
+            )
+        for chunk in chunks.values():
+            for handle in chunk:
+                handle.visible = False
+        return chunks
+
+    def _add_clouds(self, clouds: tuple[Cloud, ...]) -> None:
+        total = max(sum(len(cloud.p_G) for cloud in clouds), 1)
+        limit = self._drawing.options.max_points
+        for number, cloud in enumerate(clouds):
+            if cloud.faces is not None:
+                continue
+            step = 0 if cloud.vertex < 0 else int(self.timeline.vertex_step[cloud.vertex])
+            p = cloud.p_G - self._drawing.origin_G
+            rows = spread_rows(p, max(1, limit * len(p) // total))
+            size = 0.9 * self._drawing.unit_m / np.sqrt(max(min(total, limit), 1_000))
+            part = make_points(p[rows], cloud_colours(cloud)[rows], rows, size)
+            for handle in add_part(self._server, f"/play/{step}/cloud_{number}", part):
+                handle.visible = False
+                self._chunks.setdefault(step, []).append(handle)
+
+    def _make_heads(self) -> dict[int, list[Any]]:
+        """Make the camera, or a dot, that travels along each mission."""
+        drawing = self._drawing
+        heads: dict[int, list[Any]] = {}
+        for mission in np.flatnonzero(self._plays).tolist():
+            colour = drawing.mission_colours[mission]
+            name = f"/play/head/{drawing.mission_ids[mission]}"
+            lines = [
+                se3.transform(camera.T_I_C, frustum_points(camera.camera, 0.06 * drawing.unit_m))[
+                    _FRUSTUM
+                ]
+                for camera in mission_cameras(drawing.vi_map, mission)
+            ]
+            if lines:
+                ends = np.concatenate(lines)
+                part = make_segments(ends[:, 0], ends[:, 1], colour, np.arange(len(ends)), 2.5)
+                heads[mission] = add_part(self._server, name, part)
+                continue
+            dot = make_points(np.zeros((1, 3)), colour, np.array([0]), 0.02 * drawing.unit_m)
+            heads[mission] = add_part(self._server, name, dot)
+        return heads
+
+    def _place_heads(self, step: int) -> None:
+        for mission, handles in self._heads.items():
+            row = int(self.timeline.head[step, mission])
+            for handle in handles:
+                handle.visible = row >= 0
+                if row >= 0:
+                    handle.wxyz = self._drawing.vi_map.T_G_I[row, [3, 0, 1, 2]]
+                    handle.position = self._drawing.p_vertices[row]
+
+    def _show_recent(self, step: int) -> None:
+        for handle in self._recent:
+            handle.remove()
+        rows, age = self.timeline.recent(self._drawing, step)
+        keep = self._plays[self._drawing.landmark_mission[rows]]
+        keep &= self._drawing.vi_map.landmarks.quality[rows] != 1
+        rows, age = rows[keep], age[keep]
+        base = np.broadcast_to(colours.REFERENCE, (len(rows), 3))
+        glow = age[:, None] * base + (1.0 - age[:, None]) * colours.PICKED
+        part = make_points(
+            self._drawing.p_landmarks[rows],
+            glow.astype(np.uint8),
+            rows,
+            1.6 * point_size(self._drawing),
+        )
+        self._recent = add_part(self._server, "/play/recent", part)
+
+
+def _grouped(step: I64, rows: I64) -> dict[int, I64]:
+    """Return the rows of each step."""
+    order = np.argsort(step, kind="stable")
+    cuts = np.flatnonzero(np.diff(step[order])) + 1
+    groups = np.split(order, cuts) if len(order) else []
+    return {int(step[own[0]]): rows[own] for own in groups}

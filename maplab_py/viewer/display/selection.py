@@ -1,0 +1,137 @@
+"""What was clicked: its facts, its frusta and rays, and the distance between two picks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from maplab_py.viewer import colours
+from maplab_py.viewer.display.panel import Panel
+from maplab_py.viewer.display.parts import add_part
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.facts import facts
+from maplab_py.viewer.layers.cameras import (
+    camera_centres,
+    frustum_lines,
+    mission_cameras,
+    observer_rays,
+)
+from maplab_py.viewer.picking import Pick
+from maplab_py.viewer.scene import Entity, Part
+from maplab_py.vimap.table import ragged_rows
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+ImageOf = Callable[[int], "U8 | None"]
+"""Gives the image (H, W, 3) of a vertex (row), if there is one."""
+
+_MAX_FRUSTA = 16
+"""More cameras of one landmark's observers would hide it."""
+
+logger = logging.getLogger(__name__)
+
+
+class Selection:
+    """The picked thing and its marks in the scene."""
+
+    def __init__(self, server: viser.ViserServer, panel: Panel) -> None:
+        """Start with nothing picked."""
+        self._server = server
+        self._panel = panel
+        self._handles: list[Any] = []
+        self._anchor: Pick | None = None  # the first of two picks to measure between
+        self.is_measuring = False
+        self.picked: Pick | None = None
+        self.distance_m: float | None = None
+
+    def pick(self, drawing: Drawing, found: Pick, image_of: ImageOf) -> None:
+        """Mark what was clicked and show its facts."""
+        previous, self.picked, self.distance_m = self.picked, found, None
+        self._clear_marks()
+        note = ""
+        if self.is_measuring and previous is not None:
+            self._anchor = previous
+            self.distance_m = float(np.linalg.norm(found.p - previous.p))
+            note = f"distance to the pick before: {self.distance_m:.3f} m"
+        self._mark(drawing, found)
+        image = image_of(found.row) if found.entity is Entity.VERTEX else None
+        self._panel.show_facts(facts(drawing.vi_map, found.entity, found.row), image, note)
+
+    def clear(self) -> None:
+        """Forget the pick."""
+        self._clear_marks()
+        self.picked = self._anchor = self.distance_m = None
+        self._panel.show_facts((), None)
+
+    def _clear_marks(self) -> None:
+        for handle in self._handles:
+            handle.remove()
+        self._handles = []
+
+    def _mark(self, drawing: Drawing, found: Pick) -> None:
+        size = 0.005 * drawing.unit_m
+        row = np.array([found.row])
+        self._add("point", make_points(found.p[None], colours.PICKED, row, size))
+        if found.entity is Entity.VERTEX:
+            self._mark_vertex(drawing, found.row)
+        elif found.entity is Entity.LANDMARK:
+            start, end, vertices = observer_rays(drawing, found.row)
+            self._add("rays", make_segments(start, end, colours.PICKED, vertices, 1.0))
+            observers = np.unique(vertices)
+            every = -(-len(observers) // _MAX_FRUSTA)
+            self._add_frusta(drawing, observers[::every], 0.015, 1.0)
+        elif found.entity is Entity.LOOP_CLOSURE:
+            edges = drawing.vi_map.loop_closure_edges
+            ends = np.array([edges.from_vertex[found.row], edges.to_vertex[found.row]])
+            p = drawing.p_vertices[ends]
+            self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, row, 6.0))
+            self._add_frusta(drawing, ends.astype(np.int64), 0.05, 2.0)
+        if self.distance_m is not None and self._anchor is not None:
+            self._mark_distance(found, self._anchor, self.distance_m, size)
+
+    def _mark_vertex(self, drawing: Drawing, row: int) -> None:
+        vi_map = drawing.vi_map
+        self._add_frusta(drawing, np.array([row]), 0.05, 2.0)
+        frames = np.arange(*vi_map.frame_start[row : row + 2])
+        keypoints = ragged_rows(vi_map.keypoint_start, frames)
+        landmark = vi_map.keypoints.landmark[keypoints]
+        seen = (landmark >= 0) & (vi_map.landmarks.quality[landmark] != 1)
+        centres, _ = camera_centres(drawing, keypoints[seen])
+        rows = landmark[seen].astype(np.int64)
+        rays = make_segments(centres, drawing.p_landmarks[rows], colours.PICKED, rows, 0.6)
+        self._add("rays", rays)
+
+    def _add_frusta(
+        self, drawing: Drawing, vertices: NDArray[np.int64], size: float, width_px: float
+    ) -> None:
+        missions = drawing.vi_map.vertices.mission[vertices]
+        lines = [
+            frustum_lines(drawing, vertices[missions == mission], camera, size * drawing.unit_m)
+            for mission in np.unique(missions).tolist()
+            for camera in mission_cameras(drawing.vi_map, mission)
+        ]
+        if lines:
+            ends = np.concatenate(lines)
+            rows = np.arange(len(ends))
+            part = make_segments(ends[:, 0], ends[:, 1], colours.PICKED, rows, width_px)
+            self._add("frusta", part)
+
+    def _mark_distance(self, found: Pick, anchor: Pick, distance_m: float, size: float) -> None:
+        row = np.array([0])
+        self._add("anchor", make_points(anchor.p[None], colours.SECOND_PICK, row, size))
+        line = make_segments(anchor.p[None], found.p[None], colours.SECOND_PICK, row, 3.0)
+        self._add("distance", line)
+        middle = 0.5 * (anchor.p + found.p)
+        label = self._server.scene.add_label(
+            "/pick/distance_label", f"{distance_m:.3f} m", position=middle
+        )
+        self._handles.append(label)
+
+    def _add(self, name: str, part: Part) -> None:
+        self._handles += add_part(self._server, f"/pick/{name}", part)

@@ -1,0 +1,96 @@
+"""A viser server that listens on this machine only, shares nothing and keeps off the prompt."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import re
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rich
+import viser
+import websockets.asyncio.server
+
+from maplab_py.errors import UserError
+
+LOOPBACK = "127.0.0.1"
+_OWN_ORIGINS = (None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"))
+"""Pages that may open a connection: our own, whatever port it was forwarded to, and programs."""
+
+logger = logging.getLogger(__name__)
+_rich_print = rich.print
+_patching = threading.Lock()
+
+
+def _print_unless_viser(*objects: object, **settings: Any) -> None:
+    """Stand in for `rich.print`: what viser would print goes to the log."""
+    if str(sys._getframe(1).f_globals.get("__name__", "")).startswith("viser"):
+        logger.debug("viser: %s", " ".join(str(o) for o in objects if isinstance(o, str)))
+    else:
+        _rich_print(*objects, **settings)
+
+
+class _Forwarder(logging.Handler):
+    """Sends records of a library to our own log, where no traceback disturbs the prompt."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Forward one record."""
+        logger.info("%s: %s", record.name, record.getMessage(), exc_info=record.exc_info)
+
+
+def start_server(port: int) -> viser.ViserServer:
+    """Start a server on the loopback interface.
+
+    Args:
+        port: Wanted port; a busy one is replaced by the next that is free, 0 = any.
+
+    Raises:
+        UserError: The port is not one, or none is free.
+    """
+    if not 0 <= port <= 65535:
+        raise UserError(f"--viewer_port={port}: a port is 0 (any) to 65535")
+    _hush_libraries()
+    with (
+        _patching,
+        _patched(websockets.asyncio.server, "serve", _own_serve()),
+    ):
+        try:
+            server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False, label="maplab")
+        except OSError as error:
+            raise UserError(f"--viewer_port={port}: cannot be served ({error})") from None
+    server.request_share_url = _no_sharing  # type: ignore[method-assign]
+    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    return server
+
+
+def _own_serve() -> Any:
+    """Return the function that opens the socket, restricted to connections of our own pages."""
+    return functools.partial(websockets.asyncio.server.serve, origins=_OWN_ORIGINS)
+
+
+def _no_sharing(*_: object, **__: object) -> None:
+    """Stand in for viser's tunnel through a public server."""
+    logger.warning("a page asked for a public address and got none")
+
+
+def _hush_libraries() -> None:
+    rich.print = _print_unless_viser
+    for name in ("websockets", "websockets.server"):
+        library = logging.getLogger(name)
+        if not any(isinstance(handler, _Forwarder) for handler in library.handlers):
+            library.addHandler(_Forwarder())
+        library.propagate = False
+
+
+@contextmanager
+def _patched(owner: Any, name: str, value: Any) -> Iterator[None]:
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)

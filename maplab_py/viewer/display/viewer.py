@@ -1,0 +1,490 @@
+"""One viewer: a server, what it shows, and how it follows the map.
+
+Three kinds of threads meet here: the console's, viser's pool that runs what pages ask for, and
+the viewer's own that builds scenes, so that no command waits for a picture. All state is changed
+under one lock; maps are values, so what is being drawn cannot change underneath.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from maplab_py.errors import MaplabError, UserError
+from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
+from maplab_py.viewer.display.camera import aim, aim_initially
+from maplab_py.viewer.display.export import export_html
+from maplab_py.viewer.display.panel import Panel, by_user
+from maplab_py.viewer.display.parts import Nodes
+from maplab_py.viewer.display.picture import save_picture, take_picture
+from maplab_py.viewer.display.player import Player
+from maplab_py.viewer.display.selection import ImageOf, Selection
+from maplab_py.viewer.display.server import LOOPBACK, start_server
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.live import moved_scene
+from maplab_py.viewer.options import PlaybackOptions
+from maplab_py.viewer.picking import Pick, pick
+from maplab_py.viewer.scene import Scene
+from maplab_py.vimap import VIMap
+
+_MAX_SHARE = 0.02
+"""Part of the time that following a running command may take."""
+
+_PLAYED_LAYERS = {"trajectories", "vertices", "landmarks", "bad_landmarks", "observers"}
+
+logger = logging.getLogger(__name__)
+
+
+def no_image(row: int) -> None:  # noqa: ARG001
+    """Say that a vertex has no image."""
+    return
+
+
+class Viewer:
+    """A running viewer.
+
+    Attributes:
+        scene: What is shown.
+        subject: What it was made of.
+    """
+
+    def __init__(self, port: int = 8080, *, is_dark: bool = False) -> None:
+        """Start the server.
+
+        Args:
+            port: Wanted port; a busy one is replaced by the next, 0 = any.
+            is_dark: Theme at first.
+
+        Raises:
+            UserError: No port is free.
+        """
+        self._lock = threading.RLock()
+        self._server = start_server(port)
+        self._nodes = Nodes(self._server)
+        self._panel = Panel(self._server, self, self._lock)
+        self._selection = Selection(self._server, self._panel)
+        self._choices: dict[str, bool] = {}  # layers that the user has switched
+        self._hidden: set[str] = set()  # ids of missions that the user has hidden
+        self._player: Player | None = None
+        self._playback = PlaybackOptions()
+        self._image_of: ImageOf = no_image
+        self._is_dark = is_dark
+        self._drawing: Drawing | None = None
+        self.scene: Scene | None = None
+        self.subject: Subject | None = None
+        self._pending: Subject | None = None
+        self._building: Subject | None = None
+        self._wake = threading.Event()
+        self._idle = threading.Event()
+        self._idle.set()
+        self._is_stopped = False
+        self._next_live = 0.0
+        self.set_dark(is_dark)
+        self._server.scene.on_click()(by_user(self._lock, self._clicked))
+        self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
+        self._worker.start()
+        self._ticker = threading.Thread(target=self._tick, name="maplab playback", daemon=True)
+        self._ticker.start()
+        atexit.register(self.stop)
+
+    # -- what the console does --------------------------------------------------------------------
+
+    @property
+    def server(self) -> Any:
+        """The viser server."""
+        return self._server
+
+    @property
+    def port(self) -> int:
+        """The port that is served, which need not be the one asked for."""
+        return int(self._server.get_port())
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{LOOPBACK}:{self.port}"
+
+    @property
+    def is_dark(self) -> bool:
+        """Tell which theme is shown."""
+        return self._is_dark
+
+    @property
+    def wanted(self) -> Subject | None:
+        """What is shown, or soon will be."""
+        with self._lock:
+            return self._pending or self._building or self.subject
+
+    @property
+    def pages(self) -> int:
+        """The number of open pages."""
+        return len(self._server.get_clients())
+
+    def show(
+        self,
+        subject: Subject,
+        *,
+        playback: PlaybackOptions | None = None,
+        image_of: ImageOf = no_image,
+    ) -> Scene:
+        """Show a subject now.
+
+        Args:
+            subject: What to show.
+            playback: How the time slider plays it.
+            image_of: Where images of vertices come from.
+
+        Raises:
+            UserError: There is nothing to show.
+        """
+        drawing = make_checked_drawing(subject)
+        scene = scene_of(drawing, subject)
+        with self._lock:
+            self._playback = playback or PlaybackOptions()
+            self._image_of = image_of
+            self._choices = {}
+            is_elsewhere = self.scene is None or _is_elsewhere(self.scene, scene)
+            self._show(subject, drawing, scene)
+            if is_elsewhere:
+                self.look_at_everything()
+        return scene
+
+    def follow(self, subject: Subject) -> None:
+        """Show another state soon, without waiting for it; only the latest wish counts."""
+        with self._lock:
+            self._pending = subject
+            self._idle.clear()
+        self._wake.set()
+
+    def follow_live(self, make_map: Callable[[], VIMap]) -> bool:
+        """Show where a running command has got to, if that costs the command next to nothing.
+
+        Only positions are followed. After each update the viewer lets fifty times as long pass as
+        the update took.
+
+        Args:
+            make_map: Makes the map as it is now; not called when it is too early.
+
+        Returns:
+            Whether it was shown.
+        """
+        began = time.perf_counter()
+        if began < self._next_live or self._pending is not None or not self.pages:
+            return False
+        with self._lock:
+            if self._drawing is None or self.scene is None or self._player is not None:
+                return False
+            scene = moved_scene(self.scene, self._drawing, make_map())
+            self._nodes.show(scene, self.visible_layers, self.visible_missions)
+        took = time.perf_counter() - began
+        self._next_live = began + took / _MAX_SHARE
+        return True
+
+    def wait(self, timeout_s: float = 60.0) -> bool:
+        """Wait until everything asked for is shown; tell whether it is."""
+        return self._idle.wait(timeout_s)
+
+    def look_at_everything(self) -> None:
+        """Let all pages, and those that will be opened, see the whole map."""
+        if self.scene is None:
+            return
+        aim_initially(self._server.initial_camera, self.scene.extent)
+        for client in self._server.get_clients().values():
+            aim(client.camera, self.scene.extent)
+
+    def save_picture(self, path: Path, size_px: tuple[int, int], view: str = "") -> int:
+        """Save a picture of the scene; return the number of open pages that could have taken it.
+
+        Args:
+            path: A .png or .jpg file.
+            size_px: Width and height.
+            view: One of `camera.VIEWS`; empty = as the newest open page looks.
+
+        Raises:
+            UserError: Nothing is shown, the file cannot be written, or there is no browser.
+            EstimationError: The browser gave no picture.
+        """
+        scene = self._shown()
+        self.wait()
+        pages = self.pages
+        picture = take_picture(
+            self._server, self.url, scene.extent, view, size_px, is_dark=self._is_dark
+        )
+        save_picture(picture, path)
+        return pages
+
+    def export(self, path: Path) -> int:
+        """Write what is visible to one HTML file; return its size in bytes.
+
+        Raises:
+            UserError: Nothing is shown, or the file cannot be written.
+        """
+        scene = self._shown()
+        self.wait()
+        with self._lock:
+            return export_html(
+                self._server, scene, self.visible_layers, path, is_dark=self._is_dark
+            )
+
+    def _shown(self) -> Scene:
+        if self.scene is None:
+            raise UserError("nothing is shown yet: visualize")
+        return self.scene
+
+    def stop(self) -> None:
+        """Stop the server; harmless when it has stopped already."""
+        atexit.unregister(self.stop)
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._is_stopped = True
+        self._wake.set()
+        self._idle.set()
+        self._server.stop()
+
+    @property
+    def is_stopped(self) -> bool:
+        """Tell whether the server has been stopped."""
+        return self._is_stopped
+
+    # -- what is visible --------------------------------------------------------------------------
+
+    @property
+    def visible_layers(self) -> set[str]:
+        """Names of the layers that are drawn."""
+        if self.scene is None:
+            return set()
+        return {
+            layer.name
+            for layer in self.scene.layers
+            if self._choices.get(layer.name, layer.is_visible)
+        }
+
+    @property
+    def visible_missions(self) -> set[str]:
+        """Ids of the missions that are drawn."""
+        if self.scene is None:
+            return set()
+        return {m.id for m in self.scene.missions} - self._hidden
+
+    @property
+    def drawing(self) -> Drawing:
+        """The map as it is drawn; raises UserError while nothing is shown."""
+        if self._drawing is None:
+            raise UserError("nothing is shown yet: visualize")
+        return self._drawing
+
+    @property
+    def selection(self) -> Selection:
+        """What is picked."""
+        return self._selection
+
+    @property
+    def player(self) -> Player | None:
+        """What the time slider has begun to play, if anything."""
+        return self._player
+
+    def set_layer(self, name: str, is_visible: bool) -> None:
+        """Show or hide a layer."""
+        with self._lock:
+            self._choices[name] = is_visible
+            self._redraw()
+
+    def set_missions(self, visible: set[str]) -> None:
+        """Show these missions and no others."""
+        with self._lock:
+            if self.scene is None:
+                return
+            self._hidden = {m.id for m in self.scene.missions} - visible
+            self._stop_playback()
+            self._redraw()
+
+    def set_colouring(self, colouring: str) -> None:
+        """Colour landmarks by another rule."""
+        with self._lock:
+            if self.subject is None:
+                return
+            options = self.subject.options.with_colouring(colouring)
+            self.follow(self.subject.replace(options=options))
+
+    def set_point_scale(self, factor: float) -> None:
+        """Draw points larger or smaller."""
+        with self._lock:
+            self._nodes.scale_points(factor)
+
+    def set_dark(self, is_dark: bool) -> None:
+        """Change the theme."""
+        with self._lock:
+            self._is_dark = is_dark
+            self._server.gui.configure_theme(
+                dark_mode=is_dark, show_share_button=False, show_logo=False,
+                control_width="medium",
+                brand_color=(76, 141, 214),
+            )  # fmt: skip
+            if self._panel.dark.value != is_dark:
+                self._panel.dark.value = is_dark
+            if self.scene is not None:
+                self._nodes.show_ground(self.scene.extent, is_dark=is_dark)
+
+    def set_ground(self, is_visible: bool) -> None:
+        """Show or hide the grid."""
+        with self._lock:
+            self._nodes.set_ground_visible(is_visible)
+
+    def look(self, client: Any, view: str) -> None:
+        """Move the camera of one page."""
+        if client is not None and self.scene is not None:
+            with client.atomic():
+                aim(client.camera, self.scene.extent, view)
+
+    # -- the time slider --------------------------------------------------------------------------
+
+    def set_step(self, step: int) -> None:
+        """Show the map as it was after a step; the last step is the whole map."""
+        with self._lock:
+            if self._drawing is None or self.scene is None:
+                return
+            steps = self._playback.steps
+            if step >= steps:
+                self._stop_playback()
+                self._redraw()
+                return
+            if self._player is None:
+                self._nodes.show(
+                    _without_played(self.scene), self.visible_layers, self.visible_missions
+                )
+                clouds = self.subject.clouds if self.subject is not None else ()
+                self._player = Player(
+                    self._server, self._drawing, self.visible_missions, self._playback, clouds
+                )
+            self._player.go(max(step, 0))
+            self._panel.show_step(max(step, 0), steps, self._player.note())
+            vertex = self._player.head()
+            self._panel.show_image(self._image_of(vertex) if vertex >= 0 else None)
+
+    def set_playing(self, is_playing: bool) -> None:
+        """Play or pause; playing from the end begins anew."""
+        with self._lock:
+            if is_playing and self._player is None:
+                self.set_step(0)
+            if self._panel.playing.value != is_playing:
+                self._panel.playing.value = is_playing
+
+    def _stop_playback(self) -> None:
+        if self._player is not None:
+            self._player.remove()
+            self._player = None
+            self._panel.show_image(None)
+        if self._panel.playing.value:
+            self._panel.playing.value = False
+        steps = self._playback.steps
+        self._panel.show_step(steps, steps, "the whole map")
+
+    def _tick(self) -> None:
+        """Move the slider while it plays."""
+        while not self._is_stopped:
+            time.sleep(1.0 / self._playback.vertex_frequency)
+            try:
+                with self._lock:
+                    if not self._is_stopped and self._panel.playing.value and self._player:
+                        self.set_step(self._player.step + 1)
+            except Exception:
+                logger.exception("the viewer cannot play on")
+                self._panel.playing.value = False
+
+    # -- picking ----------------------------------------------------------------------------------
+
+    def set_measuring(self, is_measuring: bool) -> None:
+        """Measure between picks."""
+        self._selection.is_measuring = is_measuring
+
+    def clear_pick(self) -> None:
+        """Forget what was picked."""
+        self._selection.clear()
+
+    def select(self, found: Pick) -> None:
+        """Mark a thing and show its facts, as if it had been clicked."""
+        with self._lock:
+            self._selection.pick(self.drawing, found, self._image_of)
+
+    def _clicked(self, event: Any) -> None:
+        if self.scene is None:
+            return
+        found = pick(
+            self.scene, event.ray_origin, event.ray_direction,
+            layers=self.visible_layers, missions=self.visible_missions,
+        )  # fmt: skip
+        if found is not None:
+            self.select(found)
+
+    # -- drawing ----------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        """Build and show what is asked for; the latest wish only."""
+        while not self._is_stopped:
+            self._wake.wait()
+            self._wake.clear()
+            with self._lock:
+                subject, self._pending = self._pending, None
+                self._building = subject
+            if subject is not None and not self._is_stopped:
+                self._show_safely(subject)
+            with self._lock:
+                self._building = None
+                if self._pending is None:
+                    self._idle.set()
+
+    def _show_safely(self, subject: Subject) -> None:
+        try:
+            drawing = make_checked_drawing(subject)
+            scene = scene_of(drawing, subject)
+            with self._lock:
+                if not self._is_stopped:
+                    self._show(subject, drawing, scene)
+        except MaplabError as error:
+            with self._lock:
+                self._panel.say(str(error))
+        except Exception:
+            logger.exception("the viewer could not follow the map")
+
+    def _show(self, subject: Subject, drawing: Drawing, scene: Scene) -> None:
+        is_new_map = self.subject is None or self.subject.vi_map is not subject.vi_map
+        is_new_place = self.scene is None or self.scene.extent.radius_m != scene.extent.radius_m
+        self.subject, self.scene, self._drawing = subject, scene, drawing
+        if is_new_map:
+            self._selection.clear()
+        self._stop_playback()
+        if is_new_place:
+            self._nodes.show_ground(scene.extent, is_dark=self._is_dark)
+        self._panel.show_colouring(subject.options.landmark_colouring)
+        self._redraw()
+
+    def _redraw(self) -> None:
+        if self.scene is None:
+            return
+        layers, missions = self.visible_layers, self.visible_missions
+        shown = self.scene if self._player is None else _without_played(self.scene)
+        self._nodes.show(shown, layers, missions)
+        self._panel.show(self.scene, layers, missions)
+
+
+def _is_elsewhere(before: Scene, after: Scene) -> bool:
+    """Tell whether the view shall move: another map, or one that now takes more room."""
+    larger = after.extent.radius_m > 1.2 * before.extent.radius_m
+    return before.title != after.title or larger
+
+
+def _without_played(scene: Scene) -> Scene:
+    """Return the scene without the layers that playback draws itself."""
+    kept = tuple(
+        layer
+        for layer in scene.layers
+        if layer.name not in _PLAYED_LAYERS and not layer.name.startswith("cloud_")
+    )
+    return dataclasses.replace(scene, layers=kept)

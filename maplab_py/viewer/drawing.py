@@ -1,0 +1,164 @@
+"""What all layers of one drawing share: the map, its colours, and where the scene's origin lies."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.geometry import so3
+from maplab_py.viewer import colours
+from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.scene import Extent, Points, Segments
+from maplab_py.viewer.subsampling import spread_rows
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex_list
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+_OUTLINE_POINTS = 1500
+_FAR_M = 2000.0
+"""Beyond this distance from the origin of G float32 would cost more than 0.1 mm."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drawing:
+    """A map about to be drawn."""
+
+    vi_map: VIMap
+    options: VisualizationOptions
+    origin_G: F64  # (3,)
+    extent: Extent
+
+    @cached_property
+    def mission_ids(self) -> list[str]:
+        """Ids of all missions."""
+        return to_hex_list(self.vi_map.missions.id)
+
+    @cached_property
+    def mission_colours(self) -> U8:
+        """Colours (M, 3)."""
+        return colours.mission_colours(len(self.vi_map.missions), self.options.color_salt)
+
+    @cached_property
+    def shift(self) -> F64:
+        """What takes positions of each mission (M, 3) from G to the scene."""
+        return mission_shift(self.vi_map, self.options) - self.origin_G
+
+    @cached_property
+    def p_vertices(self) -> F64:
+        """Positions (V, 3) of the vertices in the scene."""
+        return self.vi_map.T_G_I[:, 4:] + self.shift[self.vi_map.vertices.mission]
+
+    @cached_property
+    def landmark_mission(self) -> NDArray[np.int32]:
+        """Mission row (L,) of each landmark."""
+        return self.vi_map.vertices.mission[self.vi_map.landmarks.vertex]
+
+    @cached_property
+    def p_landmarks(self) -> F64:
+        """Positions (L, 3) of the landmarks in the scene."""
+        return self.vi_map.p_G + self.shift[self.landmark_mission]
+
+    @property
+    def unit_m(self) -> float:
+        """Length that looks the same in a map of any size.
+
+        It goes in steps of a fifth, so that a small change of the map leaves the sizes of all
+        points as they are, and they need not be sent anew.
+        """
+        step = np.round(4.0 * np.log2(self.extent.radius_m)) / 4.0
+        return float(2.0**step) * self.options.scale
+
+    def by_mission(self, mission: NDArray[Any]) -> list[tuple[str, I64]]:
+        """Return the mission ids that occur in (N,) mission rows, with the places of each."""
+        order = np.argsort(mission, kind="stable")
+        cuts = np.flatnonzero(np.diff(mission[order])) + 1
+        groups = np.split(order, cuts) if len(order) else []
+        return [(self.mission_ids[int(mission[places[0]])], places) for places in groups]
+
+
+def mission_shift(vi_map: VIMap, options: VisualizationOptions) -> F64:
+    """Return by how much each mission (M, 3) is drawn away from where it is [m]."""
+    shift = np.tile(
+        [options.offset_x_m, options.offset_y_m, options.offset_z_m], (len(vi_map.missions), 1)
+    )
+    distance = options.spatially_distribute_missions_meters
+    shift[:, 0] += distance * np.arange(len(vi_map.missions))
+    return shift
+
+
+def make_drawing(vi_map: VIMap, options: VisualizationOptions) -> Drawing:
+    """Find origin and extent of a map."""
+    shift = mission_shift(vi_map, options)
+    path = _finite(vi_map.T_G_I[:, 4:] + shift[vi_map.vertices.mission])
+    if not len(path):
+        path = np.zeros((1, 3))
+    low, high = path.min(axis=0), path.max(axis=0)
+    origin = np.round(0.5 * (low + high), -3)
+    if np.abs(0.5 * (low + high)).max() < _FAR_M:
+        origin = np.zeros(3)
+    landmarks = _finite(vi_map.p_G + shift[vi_map.vertices.mission[vi_map.landmarks.vertex]])
+    return Drawing(vi_map, options, origin, _extent(path - origin, landmarks - origin))
+
+
+def _extent(path: F64, landmarks: F64) -> Extent:
+    """Return the extent of the path (N, 3) and of most landmarks (M, 3).
+
+    The outermost tenth of the landmarks does not count, nor one further away than the path is large.
+    """
+    low, high = path.min(axis=0), path.max(axis=0)
+    reach = max(float(np.linalg.norm(high - low)), 1.0)
+    near = landmarks[np.all(np.abs(landmarks - 0.5 * (low + high)) < 2.5 * reach, axis=1)]
+    outline = path
+    if len(near) >= 20:
+        lowest, highest = np.percentile(near, [5.0, 95.0], axis=0)
+        inner = near[np.all((near >= lowest) & (near <= highest), axis=1)]
+        low, high = np.minimum(low, lowest), np.maximum(high, highest)
+        outline = np.concatenate([path, inner])
+    outline = outline[spread_rows(outline, _OUTLINE_POINTS)]
+    radius = max(0.5 * float(np.linalg.norm(high - low)), 0.5)
+    return Extent(0.5 * (low + high), radius, float(low[2]), outline)
+
+
+def _finite(p: F64) -> F64:
+    return np.asarray(p[np.isfinite(p).all(axis=1)])
+
+
+def make_points(p: F64, colour: U8, rows: I64, size_m: float) -> Points:
+    """Return a cloud of points (N, 3) in one colour (3,) or one each (N, 3), finite ones only."""
+    every = np.broadcast_to(colour, (len(p), 3))
+    keep = np.isfinite(p).all(axis=1)
+    return Points(
+        np.ascontiguousarray(p[keep], dtype=np.float32),
+        np.ascontiguousarray(every[keep]),
+        np.asarray(rows[keep], dtype=np.int64),
+        size_m,
+    )
+
+
+def make_segments(start: F64, end: F64, colour: U8, rows: I64, width_px: float = 1.5) -> Segments:
+    """Return lines from (N, 3) to (N, 3) in one colour (3,) or one each (N, 3), finite ones only."""
+    ends = np.stack([start, end], axis=1)
+    every = np.broadcast_to(colour, (len(ends), 3))
+    keep = np.isfinite(ends).all(axis=(1, 2))
+    return Segments(
+        np.ascontiguousarray(ends[keep], dtype=np.float32),
+        np.ascontiguousarray(every[keep]),
+        np.asarray(rows[keep], dtype=np.int64),
+        width_px,
+    )
+
+
+def axis_lines(T: F64, rows: I64, length_m: float, width_px: float = 2.0) -> Segments:
+    """Return the x, y and z axes of poses (N, 7) of the scene as three lines each."""
+    tips = length_m * so3.to_matrix(T[:, :4]).transpose(0, 2, 1)  # (N, axis, 3)
+    start = np.repeat(T[:, 4:], 3, axis=0)
+    every = np.tile(colours.AXES, (len(T), 1))
+    return make_segments(start, start + tips.reshape(-1, 3), every, np.repeat(rows, 3), width_px)

@@ -1,0 +1,151 @@
+"""Landmarks: which are drawn, and in which colour."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.viewer import colours
+from maplab_py.viewer.drawing import Drawing, make_points
+from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
+from maplab_py.viewer.subsampling import spread_rows
+from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.queries import observation_counts, observer_counts
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+
+def landmarks(drawing: Drawing) -> list[Layer]:
+    """The landmarks, and those of bad quality as a layer of their own."""
+    chosen = _chosen(drawing)
+    is_bad = drawing.vi_map.landmarks.quality[chosen] == LandmarkQuality.BAD
+    limit = drawing.options.max_points
+    every, legend = landmark_colours(drawing)
+    layers = []
+    for name, title, rows in (
+        ("landmarks", "Landmarks", chosen[~is_bad]),
+        ("bad_landmarks", "Bad landmarks", chosen[is_bad]),
+    ):
+        if not len(rows) and name != "landmarks":
+            continue
+        shown = rows[spread_rows(drawing.p_landmarks[rows], limit)]
+        parts: dict[str, Part] = {}
+        for mission_id, own in drawing.by_mission(drawing.landmark_mission[shown]):
+            parts[mission_id] = make_points(
+                drawing.p_landmarks[shown[own]], every[shown[own]], shown[own], point_size(drawing)
+            )
+        is_visible = name == "landmarks" or not drawing.options.check_landmark_constrained
+        layers.append(Layer(name, title, parts, len(rows), Entity.LANDMARK, is_visible, legend))
+    return layers
+
+
+def point_size(drawing: Drawing) -> float:
+    """Return the diameter of landmarks [m]."""
+    return 0.0024 * drawing.unit_m
+
+
+def _chosen(drawing: Drawing) -> I64:
+    """Return the rows that the flags let through and that have a place."""
+    options, vi_map = drawing.options, drawing.vi_map
+    keep = np.isfinite(drawing.p_landmarks).all(axis=1)
+    if options.landmarks_min_observers > 0:
+        keep &= observer_counts(vi_map) >= options.landmarks_min_observers
+    if options.landmarks_min_number_of_observer_missions > 0:
+        wanted = options.landmarks_min_number_of_observer_missions
+        keep &= observer_mission_counts(vi_map) >= wanted
+    if options.show_only_landmark_type:
+        keep &= vi_map.landmarks.feature_type == int(options.show_only_landmark_type)
+    return np.flatnonzero(keep)
+
+
+def observer_mission_counts(vi_map: VIMap) -> I64:
+    """Return the number (L,) of missions that observe each landmark."""
+    keypoints = vi_map.observations
+    missions = max(len(vi_map.missions), 1)
+    landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
+    pairs = np.unique(
+        landmark * missions + vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]]
+    )
+    return np.bincount(pairs // missions, minlength=len(vi_map.landmarks))
+
+
+def first_observation_s(vi_map: VIMap) -> F64:
+    """Return when each landmark (L,) was first observed: seconds since its mission's start, or NaN."""
+    vertex = first_observer(vi_map)
+    seen = vertex >= 0
+    begin = vi_map.vertices.timestamp_ns[vi_map.vertex_start[:-1].clip(0, len(vi_map.vertices) - 1)]
+    seconds = np.full(len(vertex), np.nan)
+    own = vertex[seen]
+    since = vi_map.vertices.timestamp_ns[own] - begin[vi_map.vertices.mission[own]]
+    seconds[seen] = 1e-9 * since
+    return seconds
+
+
+def first_observer(vi_map: VIMap) -> I64:
+    """Return the first observing vertex row (L,) of each landmark in its own mission, else any; or -1."""
+    vertex = vi_map.keypoint_vertex[vi_map.observations].astype(np.int64)
+    landmark = vi_map.keypoints.landmark[vi_map.observations]
+    home = vi_map.vertices.mission[vi_map.landmarks.vertex]
+    is_foreign = vi_map.vertices.mission[vertex] != home[landmark]
+    order = np.lexsort((vertex, is_foreign, landmark))
+    first = np.full(len(vi_map.landmarks), -1, dtype=np.int64)
+    first[landmark[order[::-1]]] = vertex[order[::-1]]
+    return first
+
+
+def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Return a colour (L, 3) for each landmark by the rule of the options, and the legend."""
+    rule = drawing.options.landmark_colouring
+    if rule == "mission":
+        pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.45)
+        return pale[drawing.landmark_mission], ()
+    if rule == "quality":
+        entries = ("not judged", "bad", "good")
+        legend = zip(entries, colours.hex_codes(colours.QUALITY), strict=True)
+        quality = drawing.vi_map.landmarks.quality
+        return colours.QUALITY[quality], tuple(LegendEntry(t, (c,)) for t, c in legend)
+    if rule == "type":
+        kinds, place = np.unique(drawing.vi_map.landmarks.feature_type, return_inverse=True)
+        palette = colours.mission_colours(max(len(kinds), 1))
+        names = zip(kinds.tolist(), colours.hex_codes(palette), strict=False)
+        return palette[place], tuple(LegendEntry(f"type {kind}", (c,)) for kind, c in names)
+    if rule == "grey":
+        grey = np.full(3, drawing.options.landmark_gray_level, dtype=np.uint8)
+        return np.tile(grey, (len(drawing.vi_map.landmarks), 1)), ()
+    if rule in ("observations", "missions"):
+        return _count_colours(drawing, rule)
+    return _scale_colours(drawing, rule)
+
+
+def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour by height or by time."""
+    options, vi_map = drawing.options, drawing.vi_map
+    if rule == "height":
+        part, low, high = colours.normalised(
+            vi_map.p_G[:, 2], options.color_by_height_period_m, options.color_by_height_offset_m
+        )
+        title, unit = "height", "m"
+    else:
+        seconds = first_observation_s(vi_map)
+        part, low, high = colours.normalised(
+            seconds, options.color_landmarks_by_time_period_seconds
+        )
+        title, unit = "first observed after", "s"
+    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
+    legend = LegendEntry(title, codes, f"{low:.1f} {unit}", f"{high:.1f} {unit}")
+    return colours.ramp(part, colours.SEQUENTIAL), (legend,)
+
+
+def _count_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour by the number of observations or of observing missions, from 1 to the limit."""
+    vi_map = drawing.vi_map
+    counts = (
+        observation_counts(vi_map) if rule == "observations" else observer_mission_counts(vi_map)
+    )
+    limit = max(drawing.options.landmarks_max_observers, 2)
+    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
+    title = "observations" if rule == "observations" else "observing missions"
+    part = (counts - 1.0) / (limit - 1.0)
+    return colours.ramp(part, colours.SEQUENTIAL), (LegendEntry(title, codes, "1", f"{limit}+"),)

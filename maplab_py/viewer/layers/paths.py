@@ -1,0 +1,117 @@
+"""Trajectories, vertices, and the edges between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.viewer import colours
+from maplab_py.viewer.drawing import Drawing, axis_lines, make_points, make_segments
+from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, Part
+from maplab_py.vimap import TransformationKind
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+_EDGE_COLOURS = colours.from_hex("#7f9cc0", "#5fa39a", "#b08a5a", "#9a86b8")
+
+
+def trajectories(drawing: Drawing) -> Layer:
+    """Lines through the vertices of each mission."""
+    mission = drawing.vi_map.vertices.mission
+    start = np.flatnonzero(mission[1:] == mission[:-1])
+    p = drawing.p_vertices
+    parts: dict[str, Part] = {}
+    for mission_id, own in drawing.by_mission(mission[start]):
+        rows = start[own]
+        colour = drawing.mission_colours[mission[rows[0]]]
+        parts[mission_id] = make_segments(p[rows], p[rows + 1], colour, rows, 3.0)
+    return Layer("trajectories", "Trajectories", parts, len(drawing.vi_map.missions))
+
+
+def vertices(drawing: Drawing) -> Layer:
+    """A dot for each vertex."""
+    mission = drawing.vi_map.vertices.mission
+    parts: dict[str, Part] = {}
+    for mission_id, rows in drawing.by_mission(mission):
+        colour = drawing.mission_colours[mission[rows[0]]]
+        parts[mission_id] = make_points(
+            drawing.p_vertices[rows], colour, rows, 0.0045 * drawing.unit_m
+        )
+    return Layer("vertices", "Vertices", parts, len(mission), Entity.VERTEX)
+
+
+def imu_edges(drawing: Drawing) -> Layer:
+    """The inertial edges."""
+    edges = drawing.vi_map.imu_edges
+    parts = _edge_parts(drawing, edges.from_vertex, edges.to_vertex, 0)
+    return Layer("imu_edges", "IMU edges", parts, len(edges), is_visible=False)
+
+
+def transformation_edges(drawing: Drawing) -> list[Layer]:
+    """The relative-pose edges, one layer per kind that occurs."""
+    edges = drawing.vi_map.transformation_edges
+    titles = {
+        TransformationKind.ODOMETRY: "Odometry edges",
+        TransformationKind.WHEEL_ODOMETRY: "Wheel odometry edges",
+        TransformationKind.TRANSFORMATION: "Transformation edges",
+    }
+    layers = []
+    for place, (kind, title) in enumerate(titles.items(), start=1):
+        rows = np.flatnonzero(edges.kind == kind)
+        if len(rows):
+            ends = edges.from_vertex[rows], edges.to_vertex[rows]
+            parts = _edge_parts(drawing, *ends, place)
+            name = title.lower().replace(" ", "_")
+            layers.append(Layer(name, title, parts, len(rows), is_visible=False))
+    return layers
+
+
+def _edge_parts(drawing: Drawing, start: I32, end: I32, colour: int) -> dict[str, Part]:
+    p, mission = drawing.p_vertices, drawing.vi_map.vertices.mission
+    known = np.flatnonzero((start >= 0) & (end >= 0))
+    return {
+        mission_id: make_segments(
+            p[start[known[own]]], p[end[known[own]]], _EDGE_COLOURS[colour], known[own], 2.0
+        )
+        for mission_id, own in drawing.by_mission(mission[start[known]])
+    }
+
+
+def loop_closures(drawing: Drawing) -> Layer:
+    """The loop closure edges, coloured by how far they are trusted."""
+    edges = drawing.vi_map.loop_closure_edges
+    p = drawing.p_vertices
+    rows = np.flatnonzero((edges.from_vertex >= 0) & (edges.to_vertex >= 0))
+    colour = colours.ramp(edges.switch_variable[rows], colours.TRUST)
+    part = make_segments(p[edges.from_vertex[rows]], p[edges.to_vertex[rows]], colour, rows, 2.5)
+    legend = LegendEntry("switch value", tuple(colours.hex_codes(colours.TRUST)), "0", "1")
+    parts = {WHOLE_MAP: part}
+    return Layer(
+        "loop_closures", "Loop closures", parts, len(edges), Entity.LOOP_CLOSURE, legend=(legend,)
+    )
+
+
+def base_frames(drawing: Drawing) -> Layer:
+    """T_G_M of each mission, named by the beginning of its id."""
+    T = drawing.vi_map.T_G_M.copy()
+    T[:, 4:] += drawing.shift
+    known = drawing.vi_map.baseframes.is_known[drawing.vi_map.missions.baseframe]
+    parts: dict[str, Part] = {}
+    for row, mission_id in enumerate(drawing.mission_ids):
+        label = mission_id[:8] + ("" if known[row] else " (base frame unknown)")
+        parts[mission_id] = Axes(T[row : row + 1], 0.06 * drawing.unit_m, (label,))
+    return Layer("base_frames", "Base frames", parts, len(T), is_visible=False)
+
+
+def absolute_poses(drawing: Drawing) -> Layer:
+    """Absolute pose measurements, each as axes at T_G_S."""
+    table = drawing.vi_map.absolute_poses
+    mission = drawing.vi_map.vertices.mission[table.vertex]
+    parts: dict[str, Part] = {}
+    for mission_id, rows in drawing.by_mission(mission):
+        T = table.T_G_S[rows].copy()
+        T[:, 4:] += drawing.shift[mission[rows]]
+        parts[mission_id] = axis_lines(T, rows, 0.02 * drawing.unit_m)
+    return Layer("absolute_poses", "Absolute pose measurements", parts, len(table))

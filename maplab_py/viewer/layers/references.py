@@ -1,0 +1,153 @@
+"""What the map is held against: another state of it, ground truth; and marked segments."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.trajectory_evaluation import match
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.geometry import se3
+from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.viewer import colours
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.layers.landmarks import point_size
+from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
+from maplab_py.viewer.subsampling import spread_rows
+from maplab_py.vimap import VIMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MarkedSegments:
+    """Pieces of missions with a number each, as the information that a calibration gets of them."""
+
+    first_vertex: I64  # (N,) rows
+    last_vertex: I64  # (N,)
+    value: F64  # (N,)
+    title: str = "information"
+
+
+def compared(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> list[Layer]:
+    """Another state of the map in grey, and how far the vertices have moved since.
+
+    Args:
+        drawing: The map as it is shown.
+        other: The map to compare with; vertices correspond by id.
+        side_by_side: Draw it beside the map instead of over it; then nothing has moved visibly
+            and there are no displacement lines.
+    """
+    shift = reference_shift(drawing, side_by_side=side_by_side)
+    p = other.T_G_I[:, 4:] + shift
+    mission = other.vertices.mission
+    start = np.flatnonzero(mission[1:] == mission[:-1])
+    path = make_segments(p[start], p[start + 1], colours.REFERENCE, start, 2.0)
+    lines: dict[str, Part] = {WHOLE_MAP: path}
+    layers = [Layer("reference_trajectories", "Reference paths", lines, len(other.missions))]
+    p_L = other.p_G + shift
+    rows = np.flatnonzero(np.isfinite(p_L).all(axis=1) & (other.landmarks.quality != 1))
+    rows = rows[spread_rows(p_L[rows], drawing.options.max_points)]
+    cloud = make_points(p_L[rows], colours.REFERENCE, rows, point_size(drawing))
+    points: dict[str, Part] = {WHOLE_MAP: cloud}
+    layers.append(
+        Layer(
+            "reference_landmarks", "Reference landmarks", points, len(p_L), is_visible=side_by_side
+        )
+    )
+    if not side_by_side:
+        layers.append(_displacements(drawing, other))
+    return layers
+
+
+def reference_shift(drawing: Drawing, *, side_by_side: bool) -> F64:
+    """Return what takes positions of the other state (3,) from G to the scene."""
+    aside = 2.2 * drawing.extent.radius_m if side_by_side else 0.0
+    return np.asarray(np.array([aside, 0.0, 0.0]) - drawing.origin_G)
+
+
+def displacements(vi_map: VIMap, other: VIMap) -> tuple[I64, I64, F64]:
+    """Return the rows (N,) of vertices that both maps have, and how far apart they are (N,) [m]."""
+    there = other.vertex_index.rows(vi_map.vertices.id)
+    here = np.flatnonzero(there >= 0)
+    there = there[here]
+    distance = np.linalg.norm(vi_map.T_G_I[here, 4:] - other.T_G_I[there, 4:], axis=1)
+    return here, there, distance
+
+
+def _displacements(drawing: Drawing, other: VIMap) -> Layer:
+    here, there, distance = displacements(drawing.vi_map, other)
+    before = other.T_G_I[there, 4:] - drawing.origin_G
+    largest = max(float(distance.max(initial=0.0)), 1e-9)
+    colour = colours.ramp(distance / largest, colours.HEAT)
+    after = drawing.p_vertices[here]
+    codes = tuple(colours.hex_codes(colours.HEAT))
+    legend = LegendEntry("displacement", codes, "0 m", f"{largest:.3g} m")
+    parts: dict[str, Part] = {WHOLE_MAP: make_segments(before, after, colour, here, 1.5)}
+    return Layer("displacements", "Displacement", parts, len(here), legend=(legend,))
+
+
+def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
+    """The true path laid on the map, and the error of each vertex.
+
+    Raises:
+        UserError: Too few vertices have ground truth to lay it on the map.
+    """
+    vi_map = drawing.vi_map
+    T_R_B, has_truth = match(truth, vi_map.vertices.timestamp_ns, TrajectoryEvaluationOptions())
+    rows = np.flatnonzero(has_truth)
+    if len(rows) < 3:
+        raise UserError(
+            f"{truth.source}: only {len(rows)} vertices have ground truth, 3 are needed "
+            "(do the clocks agree?)"
+        )
+    p_vertex = drawing.p_vertices[rows]
+    try:
+        T_scene_R = align_yaw_position(p_vertex, T_R_B[rows, 4:])
+    except EstimationError as error:
+        raise UserError(f"{truth.source}: {error}") from None
+    p_true = se3.transform(T_scene_R, T_R_B[rows, 4:])
+    span = vi_map.vertices.timestamp_ns[rows]
+    inside = (truth.times_ns >= span.min()) & (truth.times_ns <= span.max())
+    path = se3.transform(T_scene_R, truth.T_R_B[inside, 4:])
+    path = path[:: max(1, len(path) // 20_000)]
+    lines = make_segments(path[:-1], path[1:], colours.TRUTH, np.arange(len(path) - 1), 2.0)
+    whole: dict[str, Part] = {WHOLE_MAP: lines}
+    error_m = np.linalg.norm(p_vertex - p_true, axis=1)
+    largest = max(float(error_m.max()), 1e-9)
+    codes = tuple(colours.hex_codes(colours.HEAT))
+    legend = (LegendEntry("position error", codes, "0 m", f"{largest:.3g} m"),)
+    colour = colours.ramp(error_m / largest, colours.HEAT)
+    errors: dict[str, Part] = {WHOLE_MAP: make_segments(p_true, p_vertex, colour, rows, 1.5)}
+    dots: dict[str, Part] = {WHOLE_MAP: make_points(p_vertex, colour, rows, 0.008 * drawing.unit_m)}
+    return [
+        Layer("ground_truth", "Ground truth", whole, len(truth)),
+        Layer("errors", "Position errors", errors, len(rows), legend=legend),
+        Layer("error_colours", "Vertices by error", dots, len(rows), is_visible=False),
+    ]
+
+
+def marked_segments(drawing: Drawing, segments: MarkedSegments) -> Layer:
+    """Pieces of the trajectories, coloured by their number (thesis, figures 7.1 and 7.10)."""
+    part, low, high = colours.normalised(segments.value)
+    colour = colours.ramp(part, colours.HEAT)
+    lengths = np.maximum(segments.last_vertex - segments.first_vertex, 0)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    begin = np.repeat(np.cumsum(lengths) - lengths, lengths)
+    start = segments.first_vertex[owner] + np.arange(len(owner)) - begin
+    p = drawing.p_vertices
+    mission = drawing.vi_map.vertices.mission
+    parts: dict[str, Part] = {
+        mission_id: make_segments(
+            p[start[own]], p[start[own] + 1], colour[owner[own]], owner[own], 7.0
+        )
+        for mission_id, own in drawing.by_mission(mission[start])
+    }
+    codes = tuple(colours.hex_codes(colours.HEAT))
+    legend = LegendEntry(segments.title, codes, f"{low:.3g}", f"{high:.3g}")
+    return Layer("marked_segments", "Informative segments", parts, len(lengths), legend=(legend,))

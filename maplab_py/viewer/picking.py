@@ -1,0 +1,108 @@
+"""Which vertex, landmark or loop closure a click means."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maplab_py.viewer.scene import Entity, Points, Scene, Segments
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+_CONE_RAD = np.radians(1.2)
+"""A click means nothing that is further from its ray than this."""
+
+_BONUS_RAD = {
+    Entity.VERTEX: 0.4 * _CONE_RAD,
+    Entity.LANDMARK: 0.1 * _CONE_RAD,
+    Entity.LOOP_CLOSURE: 0.0,
+}
+"""Vertices are few and large and win against what is beside them, as do points against lines."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pick:
+    """What was clicked."""
+
+    entity: Entity
+    row: int
+    p: F64  # (3,) in the scene
+    angle_rad: float  # between the ray and the point
+
+
+def pick(
+    scene: Scene,
+    origin: ArrayLike,
+    direction: ArrayLike,
+    *,
+    layers: set[str] | None = None,
+    missions: set[str] | None = None,
+) -> Pick | None:
+    """Return what lies nearest to a ray, or None.
+
+    Nearest is by angle as seen from the ray's origin, so that a click is as exact far away as
+    close by; among things at nearly the same angle the front one wins.
+
+    Args:
+        scene: What is shown.
+        origin: Where the ray begins (3,), in the scene.
+        direction: Its direction (3,).
+        layers: Names of the layers that are visible; None = all.
+        missions: Ids of the missions that are visible; None = all.
+    """
+    o = np.asarray(origin, dtype=np.float64)
+    d = np.asarray(direction, dtype=np.float64)
+    d = d / np.linalg.norm(d)
+    best: Pick | None = None
+    best_score = np.inf
+    for layer in scene.layers:
+        if layer.entity is Entity.NONE or (layers is not None and layer.name not in layers):
+            continue
+        for mission_id, part in layer.parts.items():
+            if missions is not None and mission_id and mission_id not in missions:
+                continue
+            if not isinstance(part, (Points, Segments)) or not len(part):
+                continue
+            found = _nearest(part, o, d)
+            score = found[0] - _BONUS_RAD[layer.entity]
+            if found[0] <= _CONE_RAD and score < best_score:
+                best_score = score
+                row = int(part.rows[found[1]])
+                best = Pick(layer.entity, row, found[2], found[0])
+    return best
+
+
+def _nearest(part: Points | Segments, o: F64, d: F64) -> tuple[float, int, F64]:
+    """Return angle [rad], place in the part, and point (3,) of what lies nearest to the ray."""
+    p = part.p if isinstance(part, Points) else _nearest_on_segments(part.ends, o, d)
+    v = p - o.astype(p.dtype)
+    depth = v @ d.astype(p.dtype)
+    square = np.einsum("ij,ij->i", v, v) - depth * depth
+    with np.errstate(divide="ignore", invalid="ignore"):
+        angle = np.sqrt(np.maximum(square, 0.0)) / depth
+    angle[~(depth > 0.0)] = np.inf
+    least = float(angle.min())
+    if not np.isfinite(least):
+        return np.inf, 0, np.zeros(3)
+    similar = np.flatnonzero(angle <= least + 0.1 * _CONE_RAD)
+    place = int(similar[np.argmin(depth[similar])])
+    return float(angle[place]), place, p[place].astype(np.float64)
+
+
+def _nearest_on_segments(ends: F32, o: F64, d: F64) -> F64:
+    """Return the points (N, 3) of segments (N, 2, 3) that are closest to a line.
+
+    Source: Eberly, 3D Game Engine Design, 2006, distance between line and segment.
+    """
+    start = ends[:, 0].astype(np.float64)
+    u = ends[:, 1] - start
+    w = start - o
+    along = u @ d
+    normal_u = u - along[:, None] * d
+    normal_w = w - (w @ d)[:, None] * d
+    length = np.einsum("ij,ij->i", normal_u, normal_u)
+    part = -np.einsum("ij,ij->i", normal_u, normal_w) / np.maximum(length, 1e-12)
+    return np.asarray(start + np.clip(part, 0.0, 1.0)[:, None] * u)

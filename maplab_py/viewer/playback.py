@@ -1,0 +1,84 @@
+"""A map in the order in which it was recorded: what is there after each step."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.layers.landmarks import first_observer
+from maplab_py.viewer.options import PlaybackOptions
+from maplab_py.viewer.subsampling import spread_rows
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_RECENT_STEPS = 8
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Timeline:
+    """Which step brings which vertex and landmark. Step 0 shows the first vertices only."""
+
+    steps: int
+    vertex_step: I64  # (V,)
+    landmark_step: I64  # (L,); `steps` where nothing observes it
+    landmarks: I64  # rows that are drawn
+    head: I64  # (steps + 1, M) vertex row that each mission has reached, -1 = not begun
+    seconds: F64  # (steps + 1,) time since the start of the longest mission
+
+    def recent(self, drawing: Drawing, step: int) -> tuple[I64, F64]:
+        """Return the landmarks (N,) that the last few steps observe, and their age (N,) in [0, 1)."""
+        vi_map = drawing.vi_map
+        observer = vi_map.keypoint_vertex[vi_map.observations]
+        age = step - self.vertex_step[observer]
+        own = (age >= 0) & (age < _RECENT_STEPS)
+        landmark = vi_map.keypoints.landmark[vi_map.observations[own]]
+        order = np.lexsort((age[own], landmark))
+        rows, first = np.unique(landmark[order], return_index=True)
+        return rows.astype(np.int64), age[own][order][first] / _RECENT_STEPS
+
+
+def make_timeline(drawing: Drawing, options: PlaybackOptions) -> Timeline:
+    """Spread the missions over the steps."""
+    vi_map, steps = drawing.vi_map, options.steps
+    progress, seconds = _progress(drawing, options)
+    vertex_step = np.minimum(np.ceil(progress * steps - 1e-9).astype(np.int64), steps)
+    first = first_observer(vi_map)
+    landmark_step = np.full(len(first), steps, dtype=np.int64)
+    landmark_step[first >= 0] = vertex_step[first[first >= 0]]
+    good = np.flatnonzero(
+        (vi_map.landmarks.quality != 1) & np.isfinite(drawing.p_landmarks).all(axis=1)
+    )
+    good = good[spread_rows(drawing.p_landmarks[good], drawing.options.max_points)]
+    head = np.full((steps + 1, len(vi_map.missions)), -1, dtype=np.int64)
+    for mission in range(len(vi_map.missions)):
+        start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
+        reached = np.searchsorted(vertex_step[start:stop], np.arange(steps + 1), side="right")
+        head[:, mission] = np.where(reached > 0, start + reached - 1, -1)
+    return Timeline(steps, vertex_step, landmark_step, good, head, seconds)
+
+
+def _progress(drawing: Drawing, options: PlaybackOptions) -> tuple[F64, F64]:
+    """Return how far along (V,) each vertex is in [0, 1], and the time of each step."""
+    vi_map = drawing.vi_map
+    time_s = 1e-9 * vi_map.vertices.timestamp_ns
+    value = np.zeros(len(time_s))
+    longest, duration = 0.0, 0.0
+    for mission in range(len(vi_map.missions)):
+        own = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
+        if own.start == own.stop:
+            continue
+        travelled = time_s[own] - time_s[own][0]
+        duration = max(duration, float(travelled[-1]))
+        if options.synchronize_missions_on_distance:
+            step = np.linalg.norm(np.diff(vi_map.vertices.T_M_I[own, 4:], axis=0), axis=1)
+            travelled = np.append(0.0, np.cumsum(step))
+        if options.synchronize_missions_on_distance_percent:
+            travelled = travelled / max(float(travelled[-1]), 1e-12)
+        value[own] = travelled
+        longest = max(longest, float(travelled[-1]))
+    seconds = np.linspace(0.0, duration, options.steps + 1)
+    return value / max(longest, 1e-12), seconds

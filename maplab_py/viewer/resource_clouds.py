@@ -1,0 +1,230 @@
+"""Dense clouds, depth maps and images that a map keeps as resources."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import se3
+from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.ply import parse_ply
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors import Distortion
+from maplab_py.sensors.projection import back_project
+from maplab_py.storage.resource_types import RESOURCE_TYPES
+from maplab_py.storage.resources import ResourceStore
+from maplab_py.viewer.layers.cameras import mission_cameras
+from maplab_py.viewer.layers.clouds import Cloud
+from maplab_py.viewer.options import PointCloudOptions
+from maplab_py.viewer.scene import WHOLE_MAP
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.queries import mission_sensor_id
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+_MM = 1e-3
+_MAX_DEPTH_PIXELS = 20_000
+IMAGE_TYPES = (
+    "raw_images", "raw_color_images", "undistorted_images", "undistorted_color_images",
+    "rectified images", "rectified_color_images",
+)  # fmt: skip
+"""Types that show what a camera saw, the preferred first."""
+
+
+def type_number(name: str) -> int:
+    """Return the number of a resource type; KeyError when the format has none of this name."""
+    return {kind.name: kind.number for kind in RESOURCE_TYPES}[name]
+
+
+def resource_rows(vi_map: VIMap, name: str, missions: I64 | None = None) -> I64:
+    """Return the resources (N,) of a type that belong to some missions (rows, None = all).
+
+    Raises:
+        UserError: There is none.
+    """
+    rows = np.flatnonzero(vi_map.resources.type == type_number(name))
+    if missions is not None:
+        owners = np.array([_mission_of(vi_map, row) for row in rows.tolist()], dtype=np.int64)
+        rows = rows[np.isin(owners, missions)]
+    if not len(rows):
+        raise UserError(f"the map has no resources of type '{name}' (see: resource_statistics)")
+    return rows
+
+
+def load_clouds(
+    vi_map: VIMap,
+    folder: Path,
+    name: str,
+    options: PointCloudOptions,
+    *,
+    missions: I64 | None = None,
+    progress: Progress = SILENT,
+) -> tuple[Cloud, ...]:
+    """Load all clouds or depth maps of a type, in G.
+
+    Clouds of an image are in the frame of its camera, those of a sensor in the sensor's frame at
+    their time, those of a mission in the mission's frame.
+
+    Raises:
+        UserError: There is none.
+        MapError: A file is missing or damaged, or a sensor is not mounted.
+    """
+    store = ResourceStore(vi_map, folder)
+    rows = resource_rows(vi_map, name, missions)[:: options.visualize_every_nth]
+    rng = np.random.default_rng(0)
+    clouds = []
+    for done, row in enumerate(rows.tolist()):
+        progress.step(done, len(rows), "loading clouds")
+        if "depth" in name or "disparity" in name:
+            cloud = _of_depth_map(vi_map, store, row, options)
+        else:
+            cloud = _of_ply(vi_map, store, row)
+        title = name.replace("_", " ")
+        colour = cloud.colours
+        if options.color_random:
+            colour = np.tile(rng.integers(60, 220, 3).astype(np.uint8), (len(cloud.p_G), 1))
+        clouds.append(dataclasses.replace(cloud, title=title, colours=colour))
+    return tuple(clouds)
+
+
+def _of_ply(vi_map: VIMap, store: ResourceStore, row: int) -> Cloud:
+    content = parse_ply(store.load(row), to_hex(vi_map.resources.id[row]))
+    T_G_S = resource_pose(vi_map, row)
+    return Cloud(
+        "", se3.transform(T_G_S, content.p), content.colours, content.intensity, content.faces,
+        _mission_id(vi_map, row), _vertex_of(vi_map, row),
+    )  # fmt: skip
+
+
+def _of_depth_map(
+    vi_map: VIMap, store: ResourceStore, row: int, options: PointCloudOptions
+) -> Cloud:
+    """Return the points of a depth map: millimetres along the optical axis, 0 = unknown."""
+    depth = np.asarray(store.load(row))
+    name = to_hex(vi_map.resources.id[row])
+    if depth.ndim != 2 or vi_map.resources.owner_kind[row] != ResourceOwner.FRAME:
+        raise MapError(f"resource {name}: a depth map is an image of one channel that a frame owns")
+    frame = int(vi_map.resources.owner[row])
+    mission = int(vi_map.vertices.mission[vi_map.frames.vertex[frame]])
+    index = int(vi_map.frames.camera_index[frame])
+    mounted = next((c for c in mission_cameras(vi_map, mission) if c.index == index), None)
+    if mounted is None:
+        raise MapError(f"resource {name}: its camera is not in sensors.yaml")
+    camera = mounted.camera
+    if options.reproject_depth_maps_with_undistorted_camera:
+        camera = dataclasses.replace(
+            camera, distortion=Distortion.NONE, distortion_parameters=np.zeros(0)
+        )
+    step = max(1, int(np.ceil(np.sqrt(depth.size / _MAX_DEPTH_PIXELS))))
+    v, u = np.nonzero(depth[::step, ::step])
+    uv = step * np.stack([u, v], axis=1)
+    scale = np.array([camera.width_px / depth.shape[1], camera.height_px / depth.shape[0]])
+    rays, valid = back_project(camera, uv * scale)
+    z = _MM * depth[uv[:, 1], uv[:, 0]].astype(np.float64)
+    keep = valid & (rays[:, 2] > 0.0)
+    p_C = rays[keep] / rays[keep, 2:] * z[keep, None]
+    return Cloud(
+        "", se3.transform(resource_pose(vi_map, row), p_C), mission_id=_mission_id(vi_map, row),
+        vertex=_vertex_of(vi_map, row),
+    )  # fmt: skip
+
+
+def resource_pose(vi_map: VIMap, row: int) -> F64:
+    """Return the pose (7,) in G of the frame that a resource's points are in.
+
+    Raises:
+        MapError: The owner is gone, or its sensor is not mounted.
+    """
+    resources = vi_map.resources
+    kind, owner = int(resources.owner_kind[row]), int(resources.owner[row])
+    mission = _mission_of(vi_map, row)
+    if kind == ResourceOwner.FRAME:
+        vertex, index = int(vi_map.frames.vertex[owner]), int(vi_map.frames.camera_index[owner])
+        for camera in mission_cameras(vi_map, mission):
+            if camera.index == index:
+                return se3.compose(vi_map.T_G_I[vertex], camera.T_I_C)
+        raise MapError(f"resource {to_hex(resources.id[row])}: its camera is not in sensors.yaml")
+    if kind == ResourceOwner.SENSOR:
+        own = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
+        times = vi_map.vertices.timestamp_ns[own]
+        T_G_I, _ = interpolate_poses(
+            times, vi_map.T_G_I[own], resources.timestamp_ns[row : row + 1]
+        )
+        imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+        T_I_S = vi_map.sensors.T_I_S(imu_id, to_hex(resources.sensor_id[row]))
+        return se3.compose(T_G_I[0], T_I_S)
+    return vi_map.T_G_M[mission] if mission >= 0 else se3.identity()
+
+
+def _mission_of(vi_map: VIMap, row: int) -> int:
+    kind, owner = int(vi_map.resources.owner_kind[row]), int(vi_map.resources.owner[row])
+    if kind == ResourceOwner.FRAME:
+        return int(vi_map.vertices.mission[vi_map.frames.vertex[owner]])
+    return owner
+
+
+def _mission_id(vi_map: VIMap, row: int) -> str:
+    mission = _mission_of(vi_map, row)
+    return to_hex(vi_map.missions.id[mission]) if mission >= 0 else WHOLE_MAP
+
+
+def _vertex_of(vi_map: VIMap, row: int) -> int:
+    """Return the vertex (row) at which a resource was recorded, -1 when it belongs to no time."""
+    kind, owner = int(vi_map.resources.owner_kind[row]), int(vi_map.resources.owner[row])
+    if kind == ResourceOwner.FRAME:
+        return int(vi_map.frames.vertex[owner])
+    if kind != ResourceOwner.SENSOR:
+        return -1
+    start, stop = vi_map.vertex_start[owner : owner + 2].tolist()
+    times = vi_map.vertices.timestamp_ns[start:stop]
+    place = int(np.searchsorted(times, vi_map.resources.timestamp_ns[row], side="right")) - 1
+    return start + max(place, 0) if stop > start else -1
+
+
+class VertexImages:
+    """The images of vertices, from the map's resources."""
+
+    def __init__(self, vi_map: VIMap, folder: Path, name: str = "") -> None:
+        """Find the images of a type; without a name those of the first type that the map has."""
+        self._store = ResourceStore(vi_map, folder)
+        self._row_of_vertex: dict[int, int] = {}
+        names = (name,) if name else IMAGE_TYPES
+        owned = vi_map.resources.owner_kind == ResourceOwner.FRAME
+        for candidate in names:
+            rows = np.flatnonzero(owned & (vi_map.resources.type == type_number(candidate)))
+            if len(rows):
+                vertices = vi_map.frames.vertex[vi_map.resources.owner[rows]]
+                pairs = zip(vertices.tolist()[::-1], rows.tolist()[::-1], strict=True)
+                self._row_of_vertex = dict(pairs)
+                break
+
+    def __len__(self) -> int:
+        return len(self._row_of_vertex)
+
+    def __call__(self, vertex: int) -> U8 | None:
+        """Return the image (H, W, 3) RGB of a vertex (row), None when it has none that can be read."""
+        row = self._row_of_vertex.get(vertex)
+        if row is None:
+            return None
+        try:
+            image = np.asarray(self._store.load(row))
+        except MapError:
+            return None
+        return as_rgb(image)
+
+
+def as_rgb(image: NDArray[np.uint8] | NDArray[np.uint16]) -> U8:
+    """Return an image (H, W[, 3] BGR), depths included, as RGB (H, W, 3)."""
+    if image.dtype != np.uint8:
+        largest = max(float(image.max(initial=0)), 1.0)
+        image = np.round(image / largest * 255.0).astype(np.uint8)
+    if image.ndim == 2:
+        return np.repeat(image[:, :, None], 3, axis=2).astype(np.uint8)
+    return np.ascontiguousarray(image[:, :, 2::-1], dtype=np.uint8)

@@ -1,0 +1,169 @@
+"""The session's viewer: started when first needed, kept in step with the selected map."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+from maplab_py.options import option
+from maplab_py.plugin import CommandContext, Report, UserError
+from maplab_py.viewer.options import PlaybackOptions
+from maplab_py.vimap import VIMap
+
+if TYPE_CHECKING:
+    from maplab_py.console.maps import MapManager
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.display.selection import ImageOf
+    from maplab_py.viewer.display.viewer import Viewer
+
+NAME = "viewer"
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewerOptions:
+    """Where the page is served and how it looks."""
+
+    flag_prefix: ClassVar[str] = "viewer_"
+
+    port: int = option(8080, help="Port on this machine; a busy one gives the next, 0 = any.")
+    dark: bool = option(False, help="Dark theme; the panel can change it.")
+    open_page: bool = option(
+        True, help="Open the page when a person is at the prompt and has a desktop."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class LayerLine:
+    """One layer of the view."""
+
+    layer: str
+    in_map: int
+    visible: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewReport(Report):
+    """What is shown, and where."""
+
+    url: str
+    map: str
+    layers: tuple[LayerLine, ...]
+    notes: tuple[str, ...]
+    seconds: float
+
+
+class Following:
+    """Keeps a viewer in step with the selected map."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        """Follow with a running viewer."""
+        self.viewer = viewer
+
+    def after_command(self, maps: MapManager) -> None:
+        """Show the selected map when it is another value than the one that is shown."""
+        from maplab_py.viewer.building import Subject
+
+        subject = self.viewer.wanted
+        if subject is None or self.viewer.is_stopped or not maps.selected_key:
+            return
+        entry = maps.selected
+        if entry.vi_map is subject.vi_map or not len(entry.vi_map.vertices):
+            return
+        if entry.key == subject.title:
+            following = subject.replace(vi_map=entry.vi_map)
+        else:
+            following = Subject(entry.vi_map, entry.key, subject.options)
+        self.viewer.follow(following)
+
+    def during_command(self, make_map: Callable[[], VIMap]) -> None:
+        """Show where a running command has got to."""
+        self.viewer.follow_live(make_map)
+
+    def close(self) -> None:
+        """Stop the server."""
+        self.viewer.stop()
+
+
+def running_viewer(context: CommandContext) -> Viewer:
+    """Return the viewer of the session.
+
+    Raises:
+        UserError: None is running.
+    """
+    following = context.session.watchers.find(NAME, Following)
+    if following is None or following.viewer.is_stopped:
+        raise UserError(f"{context.command}: no viewer is running; start one: visualize")
+    return following.viewer
+
+
+def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
+    """Return the session's viewer; start one when none is running or another port is wanted."""
+    from maplab_py.viewer.display.viewer import Viewer
+
+    following = context.session.watchers.find(NAME, Following)
+    if following is not None and not following.viewer.is_stopped:
+        return following.viewer
+    viewer = Viewer(options.port, is_dark=options.dark)
+    context.session.watchers.set(NAME, Following(viewer))
+    context.announce(NAME, viewer.url)
+    context.announce(NAME, viewer.url)
+    if options.open_page and context.terminal.is_interactive and _has_desktop():
+        import webbrowser
+
+        webbrowser.open(viewer.url)
+    return viewer
+
+
+def show(
+    context: CommandContext,
+    subject: Subject,
+    viewer_options: ViewerOptions,
+    *,
+    playback: PlaybackOptions | None = None,
+    image_of: ImageOf | None = None,
+    plays: bool = False,
+) -> ViewReport:
+    """Show a subject in the session's viewer and say what is to be seen.
+
+    Args:
+        context: Of the command.
+        subject: What to show.
+        viewer_options: Where.
+        playback: How the time slider plays it.
+        image_of: Images of vertices; those that the map has as resources when not given.
+        plays: Start to play at once.
+    """
+    began = time.perf_counter()
+    viewer = ensure_viewer(context, viewer_options)
+    images = image_of or images_of_map(context, subject.vi_map)
+    viewer.show(subject, playback=playback, image_of=images)
+    if plays:
+        viewer.set_playing(True)
+    scene = viewer.scene
+    if scene is None:
+        raise UserError(f"{context.command}: nothing is shown")
+    visible = viewer.visible_layers
+    lines = tuple(LayerLine(la.title, la.total, la.name in visible) for la in scene.layers)
+    return ViewReport(viewer.url, subject.title, lines, scene.notes, time.perf_counter() - began)
+
+
+def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:
+    """Return the images that the map keeps as resources; none when it was never loaded."""
+    from maplab_py.viewer.display.viewer import no_image
+    from maplab_py.viewer.resource_clouds import VertexImages
+
+    if context.map_folder is None or not len(vi_map.resources):
+        return no_image
+    images = VertexImages(vi_map, context.map_folder)
+    return images if len(images) else no_image
+
+
+def _has_desktop() -> bool:
+    """Tell whether a browser would open a window instead of taking the terminal."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

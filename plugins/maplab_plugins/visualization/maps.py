@@ -1,0 +1,213 @@
+"""Commands that show the selected map."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
+from maplab_py.plugin import CommandContext, Report, UserError, command
+from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
+from maplab_py.vimap import VIMap
+
+_OPTIONS = VisualizationOptions()
+_VIEWER = ViewerOptions()
+_PLAYBACK = PlaybackOptions()
+
+
+@dataclasses.dataclass(frozen=True)
+class DifferenceReport(Report):
+    """How far vertices are from where they are in the other state."""
+
+    compared_with: str
+    vertices: int
+    not_in_both: int
+    mean_m: float
+    largest_m: float
+    view: ViewReport
+
+
+@command(
+    "visualize",
+    "v",
+    example="visualize --vis_color_landmarks_by_height",
+    see_also=("visualize_sequentially", "save_view", "export_view", "viewer_stop"),
+    acts_outside=True,
+)
+def visualize(
+    context: CommandContext,
+    *,
+    options: VisualizationOptions = _OPTIONS,
+    viewer: ViewerOptions = _VIEWER,
+    ground_truth: Path | None = None,
+    informative_segments: Path | None = None,
+) -> ViewReport:
+    """Show the selected map in the browser; the page follows the map from then on.
+
+    The page is served on this machine only. From elsewhere forward the port:
+    ssh -L 8080:localhost:8080 HOST. The page shows and never changes the map.
+
+    Args:
+        ground_truth: True trajectory to lay beside the map's: TUM, EuRoC, or CSV with named columns.
+        informative_segments: CSV with the columns mission, start_ns, end_ns, information: pieces of
+            missions to colour by their information.
+    """
+    from maplab_py.viewer.building import Subject
+
+    subject = Subject(context.vi_map, context.map_key, options)
+    if ground_truth is not None:
+        from maplab_py.interop.trajectories import read_trajectory
+
+        subject = subject.replace(truth=read_trajectory(ground_truth))
+    if informative_segments is not None:
+        from maplab_py.viewer.segment_file import read_segments
+
+        subject = subject.replace(segments=read_segments(informative_segments, context.vi_map))
+    return show(context, subject, viewer)
+
+
+@command(
+    "visualize_sequentially",
+    "vs",
+    example="visualize_sequentially",
+    see_also=("visualize",),
+    acts_outside=True,
+)
+def visualize_sequentially(
+    context: CommandContext,
+    *,
+    map_mission: str = "",
+    map_mission_list: str = "",
+    options: VisualizationOptions = _OPTIONS,
+    playback: PlaybackOptions = _PLAYBACK,
+    viewer: ViewerOptions = _VIEWER,
+) -> ViewReport:
+    """Play the missions in the browser: the map grows as it was recorded.
+
+    Args:
+        map_mission: Mission id or unambiguous prefix; empty = all missions.
+        map_mission_list: Several missions, separated by commas.
+    """
+    from maplab_py.viewer.building import Subject
+
+    chosen = context.mission_rows(map_mission, map_mission_list)
+    subject = Subject(_only(context.vi_map, chosen), context.map_key, options)
+    return show(context, subject, viewer, playback=playback, plays=True)
+
+
+@command("visualize_landmark_observers", example="visualize_landmark_observers", acts_outside=True)
+def visualize_landmark_observers(
+    context: CommandContext,
+    *,
+    options: VisualizationOptions = _OPTIONS,
+    viewer: ViewerOptions = _VIEWER,
+) -> ViewReport:
+    """Show the rays from every observing camera to the good landmarks."""
+    from maplab_py.viewer.building import Subject
+
+    subject = Subject(context.vi_map, context.map_key, options, shows_observers=True)
+    return show(context, subject, viewer)
+
+
+@command("visualize_sensor_extrinsics", example="visualize_sensor_extrinsics", acts_outside=True)
+def visualize_sensor_extrinsics(
+    context: CommandContext, *, viewer: ViewerOptions = _VIEWER
+) -> ViewReport:
+    """Show how the sensors are mounted: each as axes on its base sensor."""
+    from maplab_py.viewer.building import Subject
+
+    title = f"{context.map_key}: sensors"
+    return show(context, Subject(context.vi_map, title, shows_sensors=True), viewer)
+
+
+@command("visualize_loop_closures", example="visualize_loop_closures", acts_outside=True)
+def visualize_loop_closures(
+    context: CommandContext,
+    *,
+    options: VisualizationOptions = _OPTIONS,
+    viewer: ViewerOptions = _VIEWER,
+) -> ViewReport:
+    """Show the loop closure edges on the trajectories, coloured by their switch values."""
+    from maplab_py.viewer.building import Subject
+
+    if not len(context.vi_map.loop_closure_edges):
+        raise UserError(
+            f"map '{context.map_key}' has no loop closure edges: loopclosure_all_missions merges "
+            "landmarks and leaves edges only with --lc_insert_lc_edge_instead_of_merging"
+        )
+    subject = Subject(
+        context.vi_map, context.map_key, options,
+        only_layers=("trajectories", "vertices", "loop_closures"),
+    )  # fmt: skip
+    return show(context, subject, viewer)
+
+
+@command(
+    "visualize_difference",
+    example="visualize_difference --with_snapshot=before",
+    see_also=("snapshot", "undo"),
+    acts_outside=True,
+)
+def visualize_difference(
+    context: CommandContext,
+    *,
+    with_map_key: str = "",
+    with_snapshot: str = "",
+    side_by_side: bool = False,
+    options: VisualizationOptions = _OPTIONS,
+    viewer: ViewerOptions = _VIEWER,
+) -> DifferenceReport:
+    """Show the selected map over another state of it, with lines where vertices have moved.
+
+    Args:
+        with_map_key: Another map in memory; vertices correspond by id.
+        with_snapshot: A snapshot of the selected map. With neither the state before the last
+            command that changed it.
+        side_by_side: Draw the other state beside the map instead of below it.
+    """
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.layers.references import displacements
+
+    other, name = _other_state(context, with_map_key, with_snapshot)
+    here, _, distance = displacements(context.vi_map, other)
+    if not len(here):
+        raise UserError(f"{name} and map '{context.map_key}' have no vertex in common")
+    subject = Subject(
+        context.vi_map, context.map_key, options, other, name, side_by_side=side_by_side
+    )
+    view = show(context, subject, viewer)
+    missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)
+    return DifferenceReport(
+        name, len(here), missing, float(distance.mean()), float(distance.max()), view
+    )
+
+
+def _other_state(context: CommandContext, map_key: str, snapshot: str) -> tuple[VIMap, str]:
+    """Return the map to compare with and what to call it."""
+    entry = context.maps.selected
+    if map_key and snapshot:
+        raise UserError("give --with_map_key or --with_snapshot, not both")
+    if map_key:
+        return context.maps.get(map_key).vi_map, f"map '{map_key}'"
+    if snapshot:
+        if snapshot not in entry.snapshots:
+            known = ", ".join(entry.snapshots) or "none"
+            raise UserError(f"map '{entry.key}' has no snapshot '{snapshot}' (there are: {known})")
+        return entry.snapshots[snapshot], f"snapshot '{snapshot}'"
+    if not entry.past:
+        raise UserError(
+            f"map '{entry.key}' has not been changed: give --with_map_key or --with_snapshot"
+        )
+    step = entry.past[-1]
+    return step.vi_map, f"before {step.command}"
+
+
+def _only(vi_map: VIMap, missions: np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None) -> VIMap:
+    """Return the map of some missions only."""
+    if missions is None:
+        return vi_map
+    from maplab_py.vimap.selection import keep_rows
+
+    return keep_rows(vi_map, missions=missions)

@@ -1,0 +1,91 @@
+"""Commands that keep a view, and that end the viewer."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from maplab_plugins.visualization.following import NAME, running_viewer
+from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedPicture(Report):
+    """A picture that was saved."""
+
+    file: Path
+    size_px: str
+    taken_by: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedView(Report):
+    """A page that was written."""
+
+    file: Path
+    megabytes: float
+
+
+@command(
+    "save_view", example="save_view --file=map.png", see_also=("export_view",), acts_outside=True
+)
+def save_view(
+    context: CommandContext,
+    *,
+    file: Path,
+    width_px: int = 1600,
+    height_px: int = 1000,
+    view: Literal["", "overview", "top", "side"] = "",
+    overwrite: bool = False,
+) -> SavedPicture:
+    """Save what the viewer shows as a picture.
+
+    An open page takes the picture from where it looks; without one a Chromium without a window is
+    started for as long as it takes.
+
+    Args:
+        file: A .png or .jpg file.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        view: Where to look from; empty = as the newest open page does.
+        overwrite: Replace a file that is there already.
+    """
+    _check_target(file, overwrite=overwrite)
+    for name, size in (("width_px", width_px), ("height_px", height_px)):
+        if not 16 <= size <= 8192:
+            raise UserError(f"--{name}={size}: must be 16 to 8192")
+    pages = running_viewer(context).save_picture(file, (width_px, height_px), view)
+    taken_by = "an open page" if pages else "a browser without a window"
+    return SavedPicture(file, f"{width_px} x {height_px}", taken_by)
+
+
+@command(
+    "export_view", example="export_view --file=map.html", see_also=("save_view",), acts_outside=True
+)
+def export_view(context: CommandContext, *, file: Path, overwrite: bool = False) -> ExportedView:
+    """Write what the viewer shows to one HTML file that opens without a network.
+
+    Args:
+        file: The file.
+        overwrite: Replace a file that is there already.
+    """
+    _check_target(file, overwrite=overwrite)
+    return ExportedView(file, running_viewer(context).export(file) * 1e-6)
+
+
+@command("viewer_stop", needs_map=False, see_also=("visualize",), acts_outside=True)
+def viewer_stop(context: CommandContext) -> Message:
+    """Stop the viewer; its page stays open and shows nothing new."""
+    url = running_viewer(context).url
+    context.session.watchers.remove(NAME)
+    context.announce(NAME, "")
+    context.announce(NAME, "")
+    return Message(f"the viewer at {url} has stopped")
+
+
+def _check_target(file: Path, *, overwrite: bool) -> None:
+    if file.exists() and not overwrite:
+        raise UserError(f"--file={file} exists; give another name or --overwrite")
+    if not file.absolute().parent.is_dir():
+        raise UserError(f"--file={file}: there is no such folder")

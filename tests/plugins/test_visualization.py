@@ -1,0 +1,298 @@
+"""The visualisation commands, through the session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from maplab_plugins.visualization.following import Following
+
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.ply import PlyCloud, read_ply, write_ply
+from maplab_py.interop.trajectories import Trajectory, write_tum
+from maplab_py.storage.resource_types import RESOURCE_TYPES
+from maplab_py.storage.resources import relative_path
+from maplab_py.viewer.display.viewer import Viewer
+from maplab_py.vimap import ResourceOwner, Resources, VIMap
+from maplab_py.vimap.ids import random_ids, to_hex
+from tests.vimap.builders import T_I_C, walk_map
+
+TYPES = {kind.name: kind.number for kind in RESOURCE_TYPES}
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(load_registry()) as session:
+        session.set_flags(["--viewer_port=0"])
+        session.maps.add("walk", walk_map())
+        yield session
+
+
+def _viewer(session: Session) -> Viewer:
+    following = session.watchers.find("viewer", Following)
+    assert following is not None
+    return following.viewer
+
+
+def _layers(report) -> dict[str, tuple[int, bool]]:
+    return {line.layer: (line.in_map, line.visible) for line in report.layers}
+
+
+def test_visualize_reports_what_is_shown(session: Session) -> None:
+    report = session.run("v")
+    assert report.url.startswith("http://127.0.0.1:")
+    layers = _layers(report)
+    assert layers["Vertices"] == (12, True)
+    assert layers["Landmarks"] == (60, True)
+    assert layers["IMU edges"] == (11, False)
+    assert layers["Loop closures"] == (2, True)
+    assert session.run("visualize").url == report.url  # one viewer for the session
+
+
+def test_the_view_follows_every_command(session: Session) -> None:
+    session.run("visualize")
+    viewer = _viewer(session)
+    session.run("reset_landmark_quality")
+    assert viewer.wait(10.0)
+    assert viewer.subject is not None
+    assert viewer.subject.vi_map is session.vi_map
+    session.run("undo")
+    assert viewer.wait(10.0)
+    assert viewer.subject.vi_map is session.vi_map
+    other = walk_map(vertices=7, seed=4)
+    session.maps.add("other", other)
+    session.run("select_map", "walk")
+    session.run("select_map", "other")
+    assert viewer.wait(10.0)
+    assert viewer.subject.title == "other"
+    with pytest.raises(UserError):
+        session.run("select_map", "nowhere")
+    assert viewer.subject.vi_map is other
+
+
+def test_the_viewer_ends_with_the_session_and_by_command(session: Session) -> None:
+    with pytest.raises(UserError, match="no viewer is running"):
+        session.run("viewer_stop")
+    session.run("visualize")
+    first = _viewer(session)
+    assert session.marks["viewer"] == first.url
+    session.run("viewer_stop")
+    assert first.is_stopped
+    assert session.marks["viewer"] == ""
+    session.run("visualize")
+    second = _viewer(session)
+    assert second is not first
+    session.watchers.close()
+    assert second.is_stopped
+
+
+def test_difference_to_a_snapshot_and_to_the_state_before(session: Session) -> None:
+    with pytest.raises(UserError, match="has not been changed"):
+        session.run("visualize_difference")
+    session.run("snapshot", "before")
+    T = np.array(session.vi_map.vertices.T_M_I)
+    T[:, 6] += 0.25
+    moved = session.vi_map.replace(vertices=session.vi_map.vertices.replace(T_M_I=T))
+    session.maps.update(session.maps.selected.with_value(moved, "moving"))
+    for flags in ({}, {"with_snapshot": "before"}, {"side_by_side": True}):
+        report = session.run("visualize_difference", **flags)
+        assert report.vertices == 12
+        assert report.mean_m == pytest.approx(0.25)
+        assert report.largest_m == pytest.approx(0.25)
+        assert report.not_in_both == 0
+        names = _layers(report.view)
+        assert ("Displacement" in names) != ("side_by_side" in flags)
+    with pytest.raises(UserError, match=r"no snapshot 'after' .*before"):
+        session.run("visualize_difference", with_snapshot="after")
+    session.maps.add("stranger", walk_map(seed=9), select=False)
+    with pytest.raises(UserError, match="no vertex in common"):
+        session.run("visualize_difference", with_map_key="stranger")
+
+
+def test_loop_closures_only(session: Session) -> None:
+    layers = _layers(session.run("visualize_loop_closures"))
+    assert layers["Loop closures"] == (2, True)
+    assert not layers["Landmarks"][1]
+    edges = session.vi_map.loop_closure_edges.take(np.zeros(2, dtype=bool))
+    without = session.vi_map.replace(loop_closure_edges=edges)
+    session.maps.update(session.maps.selected.with_value(without, "removing"))
+    with pytest.raises(UserError, match="has no loop closure edges"):
+        session.run("visualize_loop_closures")
+
+
+def test_observers_and_sensors(session: Session) -> None:
+    observers = _layers(session.run("visualize_landmark_observers"))
+    assert observers["Landmark observers"] == (len(session.vi_map.observations), True)
+    sensors = _layers(session.run("visualize_sensor_extrinsics"))
+    assert sensors == {"Sensors": (2, True)}
+
+
+def test_missions_are_played(session: Session) -> None:
+    session.run("visualize_sequentially", vis_seq_steps=20, vis_seq_vertex_frequency=1.0)
+    player = _viewer(session).player
+    assert player is not None
+    assert player.step <= 1
+    with pytest.raises(UserError, match="no mission begins with 'ffff0000'"):
+        session.run("vs", map_mission="ffff0000")
+
+
+def test_ground_truth_from_a_file(session: Session, tmp_path: Path) -> None:
+    vi_map = session.vi_map
+    truth = Trajectory(vi_map.vertices.timestamp_ns, vi_map.T_G_I)
+    write_tum(truth, tmp_path / "truth.txt")
+    layers = _layers(session.run("visualize", ground_truth=tmp_path / "truth.txt"))
+    assert layers["Ground truth"][0] == 12
+    assert layers["Position errors"] == (12, True)
+
+
+def test_informative_segments_from_a_file(session: Session, tmp_path: Path) -> None:
+    vi_map = session.vi_map
+    times = vi_map.vertices.timestamp_ns
+    mission = to_hex(vi_map.missions.id[0])[:6]
+    path = tmp_path / "segments.csv"
+    path.write_text(
+        "mission, start_ns, end_ns, information\n"
+        f"{mission}, {times[2]}, {times[5]}, 3.5\n{mission}, {times[7]}, {times[9]}, 8\n"
+    )
+    layers = _layers(session.run("visualize", informative_segments=path))
+    assert layers["Informative segments"] == (2, True)
+    path.write_text(f"mission,start_ns,end_ns,information\n{mission},1,2,3\n")
+    with pytest.raises(MapError, match=r"segments.csv:2: the mission has no vertex"):
+        session.run("visualize", informative_segments=path)
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(MapError, match="header with mission, start_ns, end_ns, information"):
+        session.run("visualize", informative_segments=path)
+
+
+def test_views_are_exported_and_files_are_not_overwritten(session: Session, tmp_path: Path) -> None:
+    target = tmp_path / "view.html"
+    with pytest.raises(UserError, match="no viewer is running"):
+        session.run("export_view", file=target)
+    session.run("visualize")
+    report = session.run("export_view", file=target)
+    assert report.megabytes == pytest.approx(target.stat().st_size * 1e-6)
+    text = target.read_text()
+    assert "__VISER_EMBED_DATA__" in text
+    assert "12 vertices" in text
+    with pytest.raises(UserError, match=r"exists; .*--overwrite"):
+        session.run("export_view", file=target)
+    session.run("export_view", file=target, overwrite=True)
+    with pytest.raises(UserError, match="no such folder"):
+        session.run("save_view", file=tmp_path / "nowhere" / "view.png")
+    with pytest.raises(UserError, match="--width_px=1"):
+        session.run("save_view", file=tmp_path / "view.png", width_px=1)
+
+
+def test_without_a_browser_save_view_says_what_to_do(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session.run("visualize")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="no page is open and no Chromium is installed: open http"):
+        session.run("save_view", file=tmp_path / "view.png")
+
+
+def test_an_empty_map_is_refused(session: Session) -> None:
+    session.run("create_new_map", map_key="empty")
+    with pytest.raises(UserError, match="'empty' has no vertices"):
+        session.run("visualize")
+
+
+@pytest.fixture
+def with_resources(session: Session, tmp_path: Path) -> Session:
+    """The map with a cloud of a frame, one of a mission, a depth map and images."""
+    rng = np.random.default_rng(0)
+    vi_map = session.vi_map
+    kinds = ["point_cloud", "color_point_cloud", "raw_depth_maps", "raw_images", "raw_images"]
+    owners = [ResourceOwner.FRAME, ResourceOwner.MISSION, *[ResourceOwner.FRAME] * 3]
+    table = Resources.filled(
+        5, id=random_ids(5, rng), type=[TYPES[k] for k in kinds], owner_kind=owners,
+        owner=[3, 0, 4, 2, 5],
+    )  # fmt: skip
+    vi_map = vi_map.replace(resources=table)
+    for row in range(5):
+        path = tmp_path / "map" / "resources" / relative_path(vi_map, row)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write_resource(path, row)
+    session.maps.remove("walk")
+    session.maps.add("walk", vi_map, folder=tmp_path / "map")
+    return session
+
+
+POINTS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.0], [0.0, -1.0, 3.0]])
+
+
+def _write_resource(path: Path, row: int) -> None:
+    if row == 0:
+        write_ply(PlyCloud(POINTS), path)
+    elif row == 1:
+        write_ply(PlyCloud(POINTS, np.full((3, 3), 7, dtype=np.uint8)), path)
+    elif row == 2:
+        depth = np.zeros((480, 640), dtype=np.uint16)
+        depth[240, 320] = 2500
+        cv2.imwrite(str(path), depth)
+    else:
+        cv2.imwrite(str(path), np.full((24, 32), 40 * row, dtype=np.uint8))
+
+
+def _cloud(session: Session) -> np.ndarray:
+    subject = _viewer(session).subject
+    assert subject is not None
+    return np.concatenate([cloud.p_G for cloud in subject.clouds])
+
+
+def _T_G_C(vi_map: VIMap, vertex: int) -> np.ndarray:
+    return se3.compose(vi_map.T_G_I[vertex], T_I_C)
+
+
+def test_clouds_are_where_their_owners_are(with_resources: Session, tmp_path: Path) -> None:
+    vi_map = with_resources.vi_map
+    with_resources.run("visualize_xyz_pointclouds")
+    np.testing.assert_allclose(
+        _cloud(with_resources), se3.transform(_T_G_C(vi_map, 3), POINTS), atol=1e-6
+    )
+    out = tmp_path / "all.ply"
+    report = with_resources.run(
+        "visualize_xyzrgbn_pointclouds", vis_pointcloud_export_accumulated_pc_to_ply_path=str(out)
+    )
+    expected = se3.transform(vi_map.T_G_M[0], POINTS)
+    np.testing.assert_allclose(_cloud(with_resources), expected, atol=1e-6)
+    assert _layers(report)["color point cloud"] == (3, True)
+    written = read_ply(out)
+    np.testing.assert_allclose(written.p, expected, atol=1e-5)
+    assert written.colours is not None
+    assert (written.colours == 7).all()
+
+
+def test_depth_maps_become_points(with_resources: Session) -> None:
+    vi_map = with_resources.vi_map
+    with_resources.run("visualize_raw_depth_map_pointclouds")
+    # the principal point is at (320, 240): the ray is the optical axis
+    expected = se3.transform(_T_G_C(vi_map, 4), np.array([[0.0, 0.0, 2.5]]))
+    np.testing.assert_allclose(_cloud(with_resources), expected, atol=1e-6)
+
+
+def test_images_are_those_of_the_vertex(with_resources: Session) -> None:
+    with_resources.run("visualize_raw_images")
+    image_of = _viewer(with_resources)._image_of
+    shown = image_of(2)
+    assert shown is not None
+    assert shown.shape == (24, 32, 3)
+    assert (shown == 120).all()
+    assert image_of(0) is None
+
+
+def test_resources_that_are_missing_are_named(with_resources: Session, session: Session) -> None:
+    with pytest.raises(UserError, match="no resources of type 'disparity_maps'"):
+        with_resources.run("visualize_disparity_maps")
+    with pytest.raises(UserError, match="no resources of type 'point_cloud_w_intensity'"):
+        with_resources.run("visualize_xyzi_pointclouds")
+    with_resources.maps.add("unsaved", walk_map(seed=3))
+    with pytest.raises(UserError, match="never loaded or saved"):
+        with_resources.run("visualize_xyz_pointclouds")

@@ -1,0 +1,117 @@
+"""A real browser for tests: Chromium by playwright, rendering in software."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from maplab_py.viewer.display.picture import HEADLESS_FLAGS, find_browser
+from maplab_py.viewer.display.viewer import Viewer
+
+WIDTH, HEIGHT = 1000, 700
+_LAZY = """
+const draw = window.requestAnimationFrame;
+window.requestAnimationFrame = (f) => setTimeout(() => draw(f), 1500);
+"""
+"""Draws seldom: ten pages that render in software would take all of a small machine."""
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Start a browser; skip the test where there is none."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = find_browser()
+    if path is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium)")
+    flags = [flag for flag in HEADLESS_FLAGS if not flag.startswith("--headless")]
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *flags])
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+class Page:
+    """An open page, what it asked for and what it complained of."""
+
+    def __init__(
+        self,
+        browser: Any,
+        url: str,
+        size_px: tuple[int, int] = (WIDTH, HEIGHT),
+        *,
+        is_lazy: bool = False,
+    ) -> None:
+        self.page = browser.new_page(viewport={"width": size_px[0], "height": size_px[1]})
+        self.page.set_default_timeout(120_000)
+        if is_lazy:
+            self.page.add_init_script(_LAZY)
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("websocket", lambda socket: self.requests.append(socket.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(url)
+        self.page.wait_for_selector("canvas", state="attached")
+
+    def wait_until(self, condition: Any, seconds: float = 30.0) -> bool:
+        """Wait until a condition of ours holds, while the page lives on."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if condition():
+                return True
+            self.page.wait_for_timeout(50)
+        return bool(condition())
+
+    def checkbox(self, label: str) -> Any:
+        """Return the checkbox beside a label."""
+        row = f"xpath=//*[text()='{label}']/ancestor::*[.//input[@type='checkbox']][1]"
+        return self.page.locator(row).locator("input[type=checkbox]").first
+
+    def settle(self, milliseconds: int = 900) -> None:
+        self.page.wait_for_timeout(milliseconds)
+
+    def picture(self) -> np.ndarray:
+        """Return what is to be seen of the scene (H, W, 3), without panel and messages."""
+        data = np.frombuffer(self.page.screenshot(), dtype=np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert image is not None
+        return image[160:, : WIDTH - 340, ::-1]
+
+    def outside_requests(self, own: str) -> list[str]:
+        """Return what went anywhere else than to our own address."""
+        allowed = (own, own.replace("http", "ws", 1), "data:", "blob:", "file:", "about:")
+        return [url for url in self.requests if not url.startswith(allowed)]
+
+
+def place_on_page(viewer: Viewer, p: np.ndarray) -> tuple[float, float]:
+    """Return the pixel of a point of the scene on the newest page."""
+    camera = sorted(viewer.server.get_clients().items())[-1][1].camera
+    w, x, y, z = camera.wxyz
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    q = R.T @ (p - camera.position)
+    focal = 0.5 * HEIGHT / np.tan(0.5 * camera.fov)
+    return float(WIDTH / 2 + focal * q[0] / q[2]), float(HEIGHT / 2 + focal * q[1] / q[2])
+
+
+def colour_count(picture: np.ndarray, colour: np.ndarray, tolerance: int = 30) -> int:
+    """Return how many pixels have about this colour."""
+    distance = np.abs(picture.astype(int) - np.asarray(colour, dtype=int)).max(axis=2)
+    return int(np.count_nonzero(distance <= tolerance))
+
+
+def is_blank(picture: np.ndarray) -> bool:
+    return len(np.unique(picture.reshape(-1, 3), axis=0)) < 20

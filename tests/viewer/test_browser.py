@@ -1,0 +1,175 @@
+"""The page in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maplab_py.viewer import colours
+from maplab_py.viewer.building import Subject
+from maplab_py.viewer.display.viewer import Viewer
+from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
+from maplab_py.viewer.scene import Entity
+from tests.viewer.browsing import (
+    Page,
+    chromium,
+    colour_count,
+    is_blank,
+    place_on_page,
+)
+from tests.vimap.builders import walk_map
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+MAP = walk_map(vertices=14, landmarks=300, seed=3)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+SUBJECT = Subject(MAP, "walk", VisualizationOptions(scale=2.0))
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Viewer]:
+    viewer = Viewer(0)
+    yield viewer
+    viewer.stop()
+
+
+@pytest.fixture
+def viewer(running: Viewer) -> Viewer:
+    """The viewer as it is at first."""
+    running.set_dark(False)
+    running.set_measuring(False)
+    running.clear_pick()
+    running.show(SUBJECT, playback=PlaybackOptions(steps=20))
+    running.look_at_everything()
+    return running
+
+
+@pytest.fixture(scope="module")
+def shared_page(browser: Any, running: Viewer) -> Iterator[Page]:
+    running.show(SUBJECT)
+    opened = Page(browser, running.url)
+    assert opened.wait_until(lambda: running.pages == 1)
+    yield opened
+    opened.page.close()
+
+
+@pytest.fixture
+def page(shared_page: Page, viewer: Viewer) -> Page:
+    shared_page.settle(1200)
+    return shared_page
+
+
+def test_the_page_shows_the_map_and_asks_nobody_else(page: Page, viewer: Viewer) -> None:
+    assert page.wait_until(lambda: not is_blank(page.picture()))
+    # lines and points have the colours that they were given
+    assert page.wait_until(lambda: colour_count(page.picture(), colours.MISSIONS[0]) > 200)
+    assert page.outside_requests(viewer.url) == []
+    assert page.errors == []
+    assert page.page.get_by_text("1 mission").count() == 1
+
+
+def test_checkboxes_toggle_layers(page: Page, viewer: Viewer) -> None:
+    before = page.picture()
+    page.checkbox("Landmarks 300").click()
+    assert page.wait_until(lambda: "landmarks" not in viewer.visible_layers)
+    pale = colours.mixed(colours.MISSIONS[0], colours.REFERENCE, 0.45)
+    many = colour_count(before, pale, 12)
+    assert page.wait_until(lambda: colour_count(page.picture(), pale, 12) < 0.5 * many)
+    page.checkbox("Landmarks 300").click()
+    assert page.wait_until(lambda: "landmarks" in viewer.visible_layers)
+    assert page.wait_until(lambda: colour_count(page.picture(), pale, 12) > 0.8 * many)
+
+
+@pytest.mark.parametrize("row", [2, 7, 11])
+def test_a_click_picks_the_vertex_under_it(page: Page, viewer: Viewer, row: int) -> None:
+    viewer.set_layer("loop_closures", False)
+    page.page.mouse.click(*place_on_page(viewer, MAP.T_G_I[row, 4:]))
+    assert page.wait_until(lambda: viewer.selection.picked is not None)
+    picked = viewer.selection.picked
+    assert picked is not None
+    assert (picked.entity, picked.row) == (Entity.VERTEX, row)
+    assert page.wait_until(lambda: page.page.get_by_text(f"{row + 1} of 14").count() == 1)
+    assert page.wait_until(lambda: colour_count(page.picture(), colours.PICKED, 70) > 50)
+
+
+def test_a_click_picks_the_landmark_under_it(page: Page, viewer: Viewer) -> None:
+    viewer.set_layer("loop_closures", False)
+    viewer.set_layer("vertices", False)
+    row = int(np.argmin(np.linalg.norm(MAP.p_G - MAP.p_G.mean(axis=0), axis=1)))
+    page.page.mouse.click(*place_on_page(viewer, MAP.p_G[row]))
+    assert page.wait_until(lambda: viewer.selection.picked is not None)
+    picked = viewer.selection.picked
+    assert picked is not None
+    assert (picked.entity, picked.row) == (Entity.LANDMARK, row)
+
+
+def test_two_picks_measure_a_distance(page: Page, viewer: Viewer) -> None:
+    viewer.set_layer("loop_closures", False)
+    viewer.set_measuring(True)
+    for row in (2, 11):
+        page.page.mouse.click(*place_on_page(viewer, MAP.T_G_I[row, 4:]))
+        assert page.wait_until(
+            lambda row=row: (
+                viewer.selection.picked is not None and viewer.selection.picked.row == row
+            )
+        )
+    expected = float(np.linalg.norm(MAP.T_G_I[11, 4:] - MAP.T_G_I[2, 4:]))
+    assert viewer.selection.distance_m == pytest.approx(expected, abs=1e-4)
+    assert page.wait_until(lambda: page.page.get_by_text(f"{expected:.3f} m").count() >= 1)
+
+
+def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> None:
+    page.page.get_by_text("Playback").click()
+    page.settle()
+    slider = page.page.get_by_role("slider").first
+    slider.focus()
+    page.page.keyboard.press("Home")
+    assert page.wait_until(lambda: viewer.player is not None and viewer.player.step == 0)
+    page.settle()
+    beginning = colour_count(page.picture(), colours.MISSIONS[0])
+    for _ in range(12):
+        page.page.keyboard.press("ArrowRight")
+    assert page.wait_until(lambda: viewer.player is not None and viewer.player.step >= 10)
+    assert page.wait_until(lambda: colour_count(page.picture(), colours.MISSIONS[0]) > beginning)
+    page.page.keyboard.press("End")
+    assert page.wait_until(lambda: viewer.player is None)
+
+
+def test_the_theme_and_the_view_can_be_changed(page: Page, viewer: Viewer) -> None:
+    assert page.wait_until(lambda: page.picture().mean() > 200)
+    page.page.get_by_text("View", exact=True).click()
+    page.settle(400)
+    page.page.get_by_text("top", exact=True).click()
+    client = next(iter(viewer.server.get_clients().values()))
+    assert page.wait_until(
+        lambda: (
+            abs(client.camera.position[0] - client.camera.look_at[0]) < 0.2
+            and client.camera.position[2] - client.camera.look_at[2] > 3.0
+        )
+    )
+    viewer.set_dark(True)
+    assert page.wait_until(lambda: page.picture().mean() < 80)
+
+
+def test_the_page_follows_the_map(page: Page, viewer: Viewer) -> None:
+    before = page.picture()
+    T = np.array(MAP.vertices.T_M_I)
+    T[:, 5] += np.linspace(0.0, 2.0, len(T))
+    moved = MAP.replace(vertices=MAP.vertices.replace(T_M_I=T))
+    assert viewer.follow_live(lambda: moved)  # somebody looks, and it was long ago
+    assert page.wait_until(lambda: np.abs(page.picture().astype(int) - before).max() > 100)
+    page.settle()
+    during = page.picture().mean()
+    viewer.follow(SUBJECT.replace(vi_map=moved))
+    assert viewer.wait(10.0)
+    assert page.wait_until(lambda: abs(page.picture().mean() - during) < 3.0)
