@@ -1,0 +1,1 @@
+"""Self-calibration on informative motion segments: select segments, keep them, calibrate on them."""

@@ -1,0 +1,85 @@
+"""Where the information is: trajectories from above, coloured by segment, as SVG (thesis fig. 7.1)."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.vimap import VIMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_SIZE_PX = 640.0
+_MARGIN_PX = 40.0
+_COLOURS = np.array([[26, 120, 60], [240, 200, 60], [190, 30, 40]], dtype=np.float64)
+"""Most, medium and least informative."""
+
+
+def draw(vi_map: VIMap, segments: list[I64], information: F64, title: str) -> str:
+    """Return an SVG of the trajectory; segments (vertex rows) are coloured by rank of their score.
+
+    Args:
+        vi_map: The map.
+        segments: Vertex rows.
+        information: Scores (S,); less is more.
+        title: Heading.
+    """
+    p = vi_map.T_G_I[:, 4:6]
+    low, high = p.min(axis=0), p.max(axis=0)
+    scale = (_SIZE_PX - 2.0 * _MARGIN_PX) / max(float((high - low).max()), 1e-3)
+    pixel = np.column_stack(
+        [
+            _MARGIN_PX + (p[:, 0] - low[0]) * scale,
+            _SIZE_PX - _MARGIN_PX - (p[:, 1] - low[1]) * scale,
+        ]
+    )
+    rank = np.empty(len(segments))
+    rank[np.argsort(information, kind="stable")] = np.linspace(0.0, 1.0, len(segments))
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_SIZE_PX:g} {_SIZE_PX + 30:g}" '
+        'font-family="sans-serif" font-size="14">',
+        f'<rect width="{_SIZE_PX:g}" height="{_SIZE_PX + 30:g}" fill="#ffffff"/>',
+        f'<text x="{_SIZE_PX / 2:g}" y="24" text-anchor="middle">{title}</text>',
+    ]
+    for number in np.argsort(-rank, kind="stable").tolist():
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixel[segments[number]])
+        lines.append(
+            f'<polyline points="{points}" fill="none" stroke="{colour(float(rank[number]))}" '
+            'stroke-width="4" stroke-linecap="round"/>'
+        )
+    lines += _legend()
+    return "\n".join([*lines, "</svg>"]) + "\n"
+
+
+def colour(rank: float) -> str:
+    """Return the colour of a rank between 0 (most informative) and 1."""
+    position = rank * (len(_COLOURS) - 1)
+    first = min(int(position), len(_COLOURS) - 2)
+    mixed = _COLOURS[first] + (position - first) * (_COLOURS[first + 1] - _COLOURS[first])
+    return "#" + "".join(f"{round(float(part)):02x}" for part in mixed)
+
+
+def _legend() -> list[str]:
+    steps, width = 24, 8.0
+    lines = [
+        f'<rect x="{_MARGIN_PX + 130 + k * width:g}" y="{_SIZE_PX + 4:g}" width="{width:g}" '
+        f'height="12" fill="{colour(k / (steps - 1))}"/>'
+        for k in range(steps)
+    ]
+    y = _SIZE_PX + 15
+    lines.append(f'<text x="{_MARGIN_PX:g}" y="{y:g}">most informative</text>')
+    right = _MARGIN_PX + 140 + steps * width
+    return [*lines, f'<text x="{right:g}" y="{y:g}">least</text>']
+
+
+def as_csv(rows: list[tuple[str, int, int, float]]) -> str:
+    """Return the file that the viewer reads: mission, begin and end of every segment, information."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("mission", "start_ns", "end_ns", "information"))
+    writer.writerows(rows)
+    return text.getvalue()

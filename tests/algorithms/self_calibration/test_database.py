@@ -1,0 +1,139 @@
+"""The segment database: sessions, capacity, file, outdated segments."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.self_calibration.collection import collect
+from maplab_py.algorithms.self_calibration.database import SegmentDatabase
+from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
+from maplab_py.algorithms.self_calibration.outdated import fits
+from maplab_py.errors import UserError
+from maplab_py.sensors import CameraRig
+from maplab_py.vimap import VIMap
+from tests.algorithms.self_calibration.scenes import OPTIONS, assert_only_gaps, device, scene_map
+
+
+@cache
+def collected() -> SegmentDatabase:
+    return collect(scene_map(vertices=61, noise=1.0), OPTIONS)[0]
+
+
+def test_a_file_returns_the_database(tmp_path: Path) -> None:
+    database, path = collected(), tmp_path / "device.segments"
+    save_database(database, path)
+    again = load_database(path)
+    assert again.records == database.records
+    assert (again.tables, again.metric, again.capacity) == (
+        dict(database.tables),
+        database.metric,
+        database.capacity,
+    )
+    for name in ("vertices", "keypoints", "landmarks", "imu_edges", "imu_samples"):
+        for column, values in getattr(database.vi_map, name).columns().items():
+            np.testing.assert_array_equal(getattr(getattr(again.vi_map, name), column), values)
+    save_database(again, tmp_path / "again.segments")
+    assert (tmp_path / "again.segments").read_bytes() == path.read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["again.segments", "device.segments"]
+
+
+def test_a_save_that_fails_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "device.segments"
+    save_database(collected(), path)
+    before = path.read_bytes()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(UserError, match="No space left"):
+        save_database(collected(), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_damaged_foreign_and_newer_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "device.segments"
+    with pytest.raises(UserError, match="no such segment database"):
+        load_database(path)
+    save_database(collected(), path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match="damaged"):
+        load_database(path)
+    header = json.dumps({"format": "maplab-py segment database", "version": 99}).encode()
+    with path.open("wb") as file:
+        np.savez(file, header=np.frombuffer(header, dtype=np.uint8))
+    with pytest.raises(UserError, match="version 99"):
+        load_database(path)
+
+
+def second_session() -> VIMap:
+    """Another walk with the same device."""
+    other = scene_map(vertices=61, noise=1.0, seed=2)
+    first = scene_map(vertices=61, noise=1.0)
+    sensor_id = first.missions.sensor_id
+    return other.replace(
+        sensors=first.sensors, missions=other.missions.replace(sensor_id=sensor_id)
+    )
+
+
+def test_sessions_compete_and_the_size_stays() -> None:
+    database = collected()
+    grown, report = collect(second_session(), OPTIONS, database)
+    assert_only_gaps(grown.vi_map)
+    assert len(grown) <= 3 * OPTIONS.segments_per_group
+    assert report.dropped + len(database) - report.segments_kept + report.from_this_map == (
+        2 * report.dropped
+    )
+    for table in grown.tables:
+        best = sorted(one.scores[table] for one in grown.records)[: grown.capacity]
+        assert [one.scores[table] for one in grown.ranked(table)] == best
+    np.testing.assert_array_equal(grown.sigma_ref, database.sigma_ref)
+
+
+def test_a_mission_that_comes_again_replaces_its_segments() -> None:
+    database = collected()
+    again, _ = collect(scene_map(vertices=61, noise=1.0), OPTIONS, database)
+    assert {one.key for one in again.records} == {one.key for one in database.records}
+    assert len(again.vi_map.vertices) == len(database.vi_map.vertices)
+
+
+def test_other_states_need_another_database() -> None:
+    with pytest.raises(UserError, match="--sc_states"):
+        collect(second_session(), dataclasses.replace(OPTIONS, states="imu"), collected())
+
+
+def test_pruning_keeps_the_best() -> None:
+    database = collected()
+    one = database.pruned(1)
+    assert len(one) <= 3
+    for table in one.tables:
+        assert one.ranked(table)[0].key == database.ranked(table)[0].key
+
+
+@pytest.mark.slow
+def test_segments_of_a_device_that_changed_are_found() -> None:
+    database = collected()
+    assert not any(one.is_outdated for one in fits(database, database.vi_map.sensors, OPTIONS))
+    _, rig = device(database.vi_map)
+    camera = rig.cameras[0]
+    knocked = dataclasses.replace(
+        camera, intrinsics=camera.intrinsics + np.array([12.0, 12.0, 20.0, -15.0])
+    )
+    changed = dataclasses.replace(
+        database.vi_map.sensors,
+        sensors={
+            **database.vi_map.sensors.sensors,
+            rig.id: CameraRig(rig.id, (knocked,), rig.T_B_C),
+        },
+    )
+    assert all(one.is_outdated for one in fits(database, changed, OPTIONS))

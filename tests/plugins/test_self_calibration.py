@@ -1,0 +1,113 @@
+"""The self-calibration commands, through the session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.sensors.sensors_yaml import read_sensors
+from maplab_py.storage.native import save_map
+from tests.algorithms.self_calibration.scenes import device, scene_map, uncalibrated
+
+FLAGS = {
+    "sc_segment_keyframes": 10,
+    "sc_segments_per_group": 2,
+    "sc_min_parallax_deg": 0.0,
+    "sc_keep_unobservable_at_prior": True,
+}
+
+
+@pytest.fixture
+def session() -> Session:
+    session = Session(load_registry())
+    session.maps.add("walk", uncalibrated(scene_map(vertices=61, noise=1.0)))
+    return session
+
+
+def focal_px(session: Session) -> float:
+    return float(device(session.vi_map)[1].cameras[0].intrinsics[0])
+
+
+def test_a_dry_run_changes_nothing_and_the_command_does(session: Session, tmp_path: Path) -> None:
+    database = tmp_path / "device.segments"
+    before = focal_px(session)
+    planned = session.run("self-calibrate", dry_run=True, database=database, **FLAGS)
+    assert focal_px(session) == before
+    assert not database.exists()
+    done = session.run("self_calibrate", database=database, **FLAGS)
+    assert done.parameters == planned.parameters
+    focal = next(one for one in done.parameters if one.parameter == "camera focal length u")
+    assert focal_px(session) == pytest.approx(focal.after)
+    assert abs(focal_px(session) - 310.0) < abs(before - 310.0)
+    assert database.is_file()
+
+
+def test_batch_uses_everything(session: Session) -> None:
+    report = session.run("self_calibrate", batch=True, **FLAGS)
+    assert report.keyframes == 61
+    assert abs(focal_px(session) - 310.0) <= 1.0
+
+
+def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
+    database = tmp_path / "device.segments"
+    collected = session.run("collect_segments", database=database, **FLAGS)
+    shown = session.run("segment_database_stats", database=database)
+    assert shown.sessions == 1
+    assert len(shown.segments) == collected.segments_kept
+    assert {one.table: one.segments for one in shown.tables} == {
+        "imu": 2,
+        "camera": 2,
+        "extrinsics": 2,
+    }
+    pruned = session.run("prune_segments", database=database, segments_per_group=1, **FLAGS)
+    assert pruned.segments_after < pruned.segments_before == collected.segments_kept
+    session.run("export_segments", database=database, map_folder=tmp_path / "map")
+    session.run("load", map_folder=tmp_path / "map")
+    assert len(session.vi_map.vertices) > 10
+    with pytest.raises(UserError, match="no segment"):
+        session.run("prune_segments", database=database, missions="abc", **FLAGS)
+
+
+def test_information_is_drawn_and_written(session: Session, tmp_path: Path) -> None:
+    plot, csv = tmp_path / "information.svg", tmp_path / "information.csv"
+    report = session.run("evaluate_segment_information", plot=plot, csv=csv, **FLAGS)
+    assert len(report.segments) == 7
+    assert plot.read_text().count("<polyline") == 7
+    lines = csv.read_text().splitlines()
+    assert lines[0] == "mission,start_ns,end_ns,information"
+    assert [float(line.split(",")[3]) for line in lines[1:]] == [one.imu for one in report.segments]
+
+
+def test_calibrations_are_exported_compared_and_applied(session: Session, tmp_path: Path) -> None:
+    truth = scene_map(vertices=61, noise=1.0)
+    save_map(truth, tmp_path / "true")
+    compared = session.run("compare_calibrations", calibration=tmp_path / "true")
+    focal = next(one for one in compared.parameters if one.parameter == "camera focal length u")
+    assert (focal.first, focal.second) == pytest.approx((313.0, 310.0))
+    session.run("apply_calibration", calibration=tmp_path / "true")
+    assert focal_px(session) == 310.0
+    again = session.run("compare_calibrations", calibration=tmp_path / "true")
+    assert max(abs(one.difference) for one in again.parameters) <= 1e-9
+    assert again.largest_pixel_shift_px <= 1e-6
+    written = session.run("export_calibration", folder=tmp_path / "out", format="maplab")
+    sensors = read_sensors(written.files[0])
+    np.testing.assert_allclose(
+        sensors.imu(device(truth)[0].id).intrinsics.T_a, device(truth)[0].intrinsics.T_a
+    )
+    assert len(session.run("export_calibration", folder=tmp_path / "k", format="kalibr").files) == 2
+
+
+def test_mistakes_are_explained(session: Session, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--sc_states"):
+        session.run("self_calibrate", sc_states="lens")
+    with pytest.raises(UserError, match="--sc_groups"):
+        session.run("self_calibrate", sc_groups="imu,lens")
+    with pytest.raises(UserError, match="no such calibration"):
+        session.run("apply_calibration", calibration=tmp_path / "nothing.yaml")
+    with pytest.raises(EstimationError, match="sc_segment_keyframes"):
+        session.run("collect_segments", database=tmp_path / "d", sc_segment_keyframes=1000)
