@@ -17,7 +17,18 @@ SOURCES = sorted(
     for path in (REPOSITORY / folder).rglob("*.py")
     if not path.name.endswith("_pb2.py")
 )
-HEAVY = ("casadi", "scipy", "numba", "cv2", "pycolmap", "viser", "rich", "prompt_toolkit", "yaml")
+HEAVY = (
+    "casadi",
+    "scipy",
+    "numba",
+    "cv2",
+    "pycolmap",
+    "viser",
+    "rich",
+    "prompt_toolkit",
+    "yaml",
+    "matplotlib",
+)
 
 HOMES = {
     "casadi": ("estimation",),
@@ -25,7 +36,8 @@ HOMES = {
     "pycolmap": ("interop",),
     "viser": ("viewer",),
     "prompt_toolkit": ("console",),
-    "rich": ("console",),
+    "matplotlib": ("plotting",),
+    "rich": ("console", "viewer/display"),
 }
 
 

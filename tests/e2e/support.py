@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -14,17 +15,21 @@ import pyte
 
 PROGRAM = [sys.executable, "-m", "maplab_py"]
 ROWS, COLUMNS = 40, 120
+CURSOR_QUESTION = "\x1b[6n"
 
 
 def environment(home: Path, **extra: str) -> dict[str, str]:
     """Return the environment of a user whose files lie under `home`."""
     kept = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "MAPLAB_PLUGINS")}
+    cache = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
     return {
         **kept,
+        "XDG_CACHE_HOME": cache,  # kernels need not be compiled anew for every user
         "HOME": str(home),
         "XDG_STATE_HOME": str(home / "state"),
         "XDG_CONFIG_HOME": str(home / "config"),
         "TERM": "xterm-256color",
+        "MAPLAB_PAGER": "cat",
         **extra,
     }
 
@@ -72,8 +77,11 @@ class Console:
 
     @property
     def last_line(self) -> str:
-        """The lowest line that is not empty."""
-        return self.text.splitlines()[-1] if self.text else ""
+        """The lowest line that is not empty, the toolbar apart."""
+        lines = [line for line in self.text.splitlines() if line.strip()]
+        if len(lines) > 1 and " · " in lines[-1]:
+            lines.pop()
+        return lines[-1] if lines else ""
 
     def type(self, text: str) -> None:
         """Type at a person's pace."""
@@ -102,6 +110,11 @@ class Console:
         """Wait until the last line is an empty prompt."""
         return self.wait_for(lambda _: self.last_line == prompt)
 
+    def processor_seconds(self) -> float:
+        """Return the processor time that the program has used so far."""
+        fields = Path(f"/proc/{self.child.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def status(self) -> int:
         """Wait for the end and return the exit status."""
         self.child.expect(pexpect.EOF)
@@ -110,7 +123,12 @@ class Console:
 
     def _read(self, seconds: float) -> None:
         try:
-            self._stream.feed(self.child.read_nonblocking(65536, timeout=seconds))
+            text = self.child.read_nonblocking(65536, timeout=seconds)
+            for part in re.split(r"(\x1b\[6n)", text):
+                self._stream.feed(part)
+                if part == CURSOR_QUESTION:
+                    cursor = self.screen.cursor
+                    self.child.send(f"\x1b[{cursor.y + 1};{cursor.x + 1}R")
         except pexpect.TIMEOUT:
             return
         except pexpect.EOF:

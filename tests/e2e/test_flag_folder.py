@@ -7,11 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.lines import split_commands
+from maplab_py.algorithms.self_calibration.database import device_of
+from maplab_py.console.lines import typed_commands
 from maplab_py.console.registry import load_registry
 from maplab_py.console.session import Session
 from maplab_py.console.settings import Layer
+from maplab_py.storage.native import save_map
+from maplab_py.vimap.tables import LandmarkQuality
 from tests.e2e.support import run_program
+from tests.registry.workspace import make_workspace
+from tests.simulation.small import simulated
 from tests.support.data import REPOSITORY, shared_data
 
 FLAGS = REPOSITORY / "flags"
@@ -22,10 +27,10 @@ PLACES = ["--maps_folder=maps", "--map_folder=out"]
 def test_every_line_of_a_script_is_a_command_with_its_flags(script: Path) -> None:
     session = Session(load_registry())
     session.settings.assign(PLACES, Layer.START_UP, "start-up")
-    commands = split_commands(script.read_text())
+    commands = typed_commands(script.read_text(), lambda name: f"value_of_{name}")
     assert len(commands) > 5
-    for words in commands:
-        call = session.parse(words)
+    for command in commands:
+        call = session.parse(command.words)
         call.arguments()
 
 
@@ -54,3 +59,60 @@ def test_scripts_on_real_maps(tmp_path: Path, script: str, maps: str) -> None:
     assert [report["command"] for report in reports][-1] == "save"
     again = run_program(tmp_path, "--json", "-c", f"load {tmp_path / 'out'}; check_map_consistency")
     assert again.returncode == 0, again.stderr
+
+
+def simulated_maps(folder: Path) -> None:
+    """Write two small maps below a folder."""
+    for number, vi_map in enumerate(simulated().maps):
+        save_map(vi_map, folder / f"walk_{number}")
+
+
+@pytest.mark.slow
+def test_localization_map(tmp_path: Path) -> None:
+    make_workspace(tmp_path)
+    places = {"MAP": "maps/v1_01", "RESULT": "small"}
+    script = str(FLAGS / "localization_map.maplab")
+    done = run_program(tmp_path, "--json", "run", script, extra=places, seconds=300)
+    assert done.returncode == 0, done.stderr
+    with Session(load_registry()) as session:
+        session.run("load", map_folder=tmp_path / "maps" / "v1_01")
+        before = session.vi_map
+        session.run("load", map_folder=tmp_path / "small")
+        after = session.vi_map
+    assert 0 < len(after.vertices) < len(before.vertices)
+    assert (after.landmarks.quality == LandmarkQuality.GOOD).all()
+
+
+@pytest.mark.slow
+def test_calibration(tmp_path: Path) -> None:
+    places = {"MAP": str(shared_data("maplab_maps/tango_handheld")), "RESULT": "calibrated"}
+    script = str(FLAGS / "calibration.maplab")
+    done = run_program(tmp_path, "--json", "run", script, extra=places, seconds=300)
+    assert done.returncode == 0, done.stderr
+    reports = {
+        line["command"]: line["report"] for line in map(json.loads, done.stdout.splitlines())
+    }
+    found = {one["parameter"]: one for one in reports["self_calibrate"]["parameters"]}
+    focal = found["camera focal length u"]
+    assert focal["before"] != focal["after"]
+    again = run_program(tmp_path, "--json", "-c", "load calibrated; check_map_consistency")
+    assert again.returncode == 0, again.stderr
+    with Session(load_registry()) as session:
+        session.run("load", map_folder=tmp_path / "calibrated")
+        rig_id = device_of(session.vi_map)[1]
+        camera = session.vi_map.sensors.camera_rig(rig_id).cameras[0]
+    assert camera.intrinsics[0] == pytest.approx(focal["after"], abs=1e-6)
+
+
+@pytest.mark.slow
+def test_batch_over_a_folder(tmp_path: Path) -> None:
+    simulated_maps(tmp_path / "maps")
+    batch = str(FLAGS / "batch.yaml")
+    done = run_program(tmp_path, "batch", batch, "--json", extra={"MAPS": "maps"}, seconds=300)
+    assert done.returncode == 0, done.stderr
+    reports = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [report["command"] for report in reports].count("save") == 2
+    assert len(list(tmp_path.glob("maps/*/vertex_poses_velocities_biases.csv"))) == 2
+    done = run_program(tmp_path, "batch", batch, extra={"MAPS": "nowhere"})
+    assert done.returncode == 2
+    assert "no folder matches" in done.stderr

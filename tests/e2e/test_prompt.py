@@ -114,3 +114,76 @@ def test_no_color_is_respected(tmp_path: Path) -> None:
     cells = [cell for row in console.screen.buffer.values() for cell in row.values()]
     assert {cell.fg for cell in cells} == {"default"}
     console.child.close(force=True)
+
+
+def test_the_prompt_comes_soon(tmp_path: Path) -> None:
+    """Time of the processor until the prompt; the second start is the warm one."""
+    seconds = []
+    for _ in range(2):
+        console = Console(tmp_path)
+        console.wait_for_prompt()
+        seconds.append(console.processor_seconds())
+        console.child.close(force=True)
+    assert min(seconds) <= 0.8
+
+
+def test_the_toolbar_shows_the_selected_map(console: Console) -> None:
+    console.enter("create_new_map euroc")
+    screen = console.wait_for_text("map euroc · 0 missions")
+    assert screen.splitlines()[-1].startswith("map euroc")
+
+
+def test_the_shell_is_one_mark_away(console: Console, tmp_path: Path) -> None:
+    (tmp_path / "a_file_in_the_folder").touch()
+    console.enter("!ls")
+    console.wait_for_text("a_file_in_the_folder")
+    console.enter("help | grep -c transcript")
+    console.wait_for(lambda _: re.search(r"^1$", console.text, re.MULTILINE) is not None)
+
+
+def test_a_job_announces_its_end_above_the_prompt(console: Console) -> None:
+    console.enter("watch timing --every=0.2 --repetitions=3 &")
+    console.wait_for_text("[1] watch timing")
+    console.type("create_new")
+    console.wait_for_text("[1] watch: done after")
+    console.wait_for(lambda _: console.last_line.endswith("$ create_new"))
+    console.type(CTRL_C)
+    console.enter("join")
+    console.wait_for_text("3 runs")
+
+
+def test_leaving_with_a_running_job_asks(console: Console) -> None:
+    console.enter("watch timing --every=30 &")
+    console.wait_for_text("[1] watch timing")
+    console.type(CTRL_D)
+    console.wait_for_text("leave and stop it? [y/N]")
+    console.enter("y")
+    assert console.status() == 0
+
+
+def test_long_output_goes_through_the_pager(tmp_path: Path) -> None:
+    console = Console(tmp_path, MAPLAB_PAGER="more")
+    console.wait_for_prompt()
+    console.enter("help")
+    console.wait_for_text("--More--")
+    console.type("q")
+    console.wait_for_prompt()
+    console.child.close(force=True)
+
+
+def test_a_command_that_says_nothing_for_a_second_shows_that_it_lives(console: Console) -> None:
+    console.enter("watch timing --every=30")
+    console.wait_for(lambda screen: "watch" in screen and "0:00:0" in screen)
+    console.type(CTRL_C)
+    console.wait_for_text("stopped after 1 runs")
+    console.wait_for_prompt()
+
+
+def test_ctrl_c_at_a_question_is_no(console: Console) -> None:
+    console.enter("create_new_map a")
+    console.wait_for_prompt("maplab <a>:/$")
+    console.enter("delete_map")
+    console.wait_for_text("drop map 'a' from memory? [y/N]")
+    console.type(CTRL_C)
+    console.wait_for_text("delete_map: cancelled")
+    console.wait_for_prompt("maplab <a>:/$")

@@ -45,14 +45,14 @@ def test_euroc_submaps_as_one_mission(session: Session) -> None:
     assert ape_m(session, C_TRUTH).ape_m.rmse == pytest.approx(0.115, abs=1e-3)
     session.run("elq")
     session.run("optvi")
-    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.050
-    assert ape_m(session, C_TRUTH).ape_m.rmse <= 0.042
+    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.044
+    assert ape_m(session, C_TRUTH).ape_m.rmse <= 0.037
     session.run("lc")
     session.run("optvi")
-    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.041
+    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.038
     corrected = ape_m(session, C_TRUTH)
-    assert corrected.ape_m.rmse <= 0.026
-    assert corrected.ape_sim3_m.rmse <= 0.013
+    assert corrected.ape_m.rmse <= 0.020
+    assert corrected.ape_sim3_m.rmse <= 0.011
     assert abs(corrected.scale - 1.0) <= 0.02
 
 
@@ -84,8 +84,8 @@ def test_euroc_submaps_as_eight_scrambled_missions(session: Session, seed: int) 
     assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.08
     session.run("lc")
     session.run("optvi")
-    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.042
-    assert ape_m(session, C_TRUTH).ape_m.rmse <= 0.026
+    assert ape_m(session, O_TRUTH).ape_m.rmse <= 0.038
+    assert ape_m(session, C_TRUTH).ape_m.rmse <= 0.019
 
 
 def test_tango_walk_is_optimised_and_its_loop_closed(session: Session) -> None:
@@ -100,9 +100,9 @@ def test_tango_walk_is_optimised_and_its_loop_closed(session: Session) -> None:
     session.run("lc")
     closed = session.run("optvi")
     kept_closed = closed.observations - closed.observations_not_used - closed.observations_rejected
-    assert kept_closed >= 0.98 * kept
+    assert kept_closed >= 0.99 * kept
     again = session.run("lc", lc_insert_lc_edge_instead_of_merging=True)
-    assert again.median_correction_m <= 0.02
+    assert again.median_correction_m <= 0.006
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
@@ -133,3 +133,19 @@ def test_threads_do_not_change_the_result() -> None:
         if field.name in ("T_M_I", "v_M", "gyro_bias", "accel_bias"):
             one, two = (getattr(result.vertices, field.name) for result in results)
             np.testing.assert_allclose(one, two, atol=1e-9)
+
+
+def test_threads_do_not_change_loop_closures(tmp_path: Path) -> None:
+    import numba
+
+    saved = []
+    for threads in (1, 2):
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        session = Session(load_registry())
+        session.run("load_merge_all_submaps", maps_folder=shared_data(SUBMAPS))
+        assert session.run("lc").landmarks_merged > 100
+        session.run("save", map_folder=tmp_path / str(threads))
+        files = sorted((tmp_path / str(threads) / "vi_map").iterdir())
+        saved.append({path.name: path.read_bytes() for path in files})
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert saved[0] == saved[1]

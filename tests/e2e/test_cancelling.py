@@ -1,0 +1,79 @@
+"""Ctrl-C in long commands on a large map: the prompt is back within a second, the map untouched."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.support import Console, run_program
+from tests.registry.workspace import folder_digest
+
+pytestmark = pytest.mark.slow
+
+CTRL_C = "\x03"
+SECONDS_TO_THE_PROMPT = 1.0
+LARGE = """
+name: large
+world: {rooms: 2, landmarks_per_room: 10000}
+measurement: {frame_rate_hz: 10.0, max_keypoints: 400}
+sessions:
+  - {kind: room_scan, duration_s: 60.0, turns: 2.0}
+"""
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a simulated map of 600 vertices and some 200 000 observations."""
+    home = tmp_path_factory.mktemp("large")
+    (home / "large.yaml").write_text(LARGE)
+    script = (
+        "simulate --scenario=large.yaml --map_folder=maps;"
+        "load_merge_all_maps maps --target_map_key=big; elq; save --map_folder=map"
+    )
+    done = run_program(home, "-c", script, seconds=500)
+    assert done.returncode == 0, done.stderr
+    return home
+
+
+LINES = (
+    ("optvi", (0.3, 1.0)),
+    ("lc", (1.0,)),
+    ("landmark_sparsify --num_landmarks_to_keep=2000", (0.5,)),
+    ("load --map_folder=map --map_key=again", (0.1,)),
+)
+
+
+def test_ctrl_c(large: Path, tmp_path: Path) -> None:
+    console = Console(large)
+    console.wait_for_prompt()
+    console.enter("load --map_folder=map")
+    console.wait_for_prompt("maplab <map>:/$")
+    for line, pauses in LINES:
+        for pause_s in pauses:
+            interrupt(console, line, pause_s)
+    console.enter(f"save --map_folder={tmp_path}/saved")
+    console.wait_for(lambda screen: "save: " in screen, 60.0)  # what was left behind still runs
+    console.wait_for_prompt("maplab <map>:/$")
+    console.enter("quit")
+    assert console.status() == 0
+    assert folder_digest(tmp_path / "saved") == folder_digest(large / "map")
+
+
+def interrupt(console: Console, line: str, pause_s: float) -> None:
+    """Type a line, press Ctrl-C after a while, and see the prompt come back in time."""
+    console.enter(line)
+    end = time.monotonic() + pause_s
+    console.wait_for(lambda _: time.monotonic() >= end)
+    start = time.monotonic()
+    console.child.send(CTRL_C)
+    console.wait_for(lambda _: console.last_line.endswith("<map>:/$"), 20.0)
+    passed = time.monotonic() - start
+    assert "cancelled; the maps are as before" in console.text, console.text
+    assert passed <= SECONDS_TO_THE_PROMPT, f"{line} after {pause_s} s: {passed:.2f} s"
+    name = line.split(maxsplit=1)[0]
+    print(f"{name} interrupted after {pause_s} s: prompt after {passed:.2f} s")
+    console.enter("!clear")
+    console.wait_for(lambda screen: screen.startswith("maplab <map>:/$") and "^C" not in screen)
+    console.wait_for_prompt("maplab <map>:/$")
