@@ -59,7 +59,7 @@ def optimize_robustly(
     """
     loss = LOSSES[options.robustness]
     final = options.switch_prior
-    optimizer = PoseGraphOptimizer(is_free, trajectory, loops, tilt, loss)
+    optimizer = PoseGraphOptimizer(is_free, trajectory, loops, tilt, options.robustness)
     largest = float(np.max(loops.squared_errors(T_G_I)))
     stages = int(np.ceil(np.log(max(largest / final, 1.0)) / np.log(_PRICE_RATIO)))
     if options.robustness == "none":
