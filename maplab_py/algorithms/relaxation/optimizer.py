@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import dataclasses
 
 import numpy as np
@@ -24,6 +26,7 @@ _LARGEST_DAMPING = 1e8
 _REMAINING = 1e-7  # relative decrease of the cost that is not worth another iteration
 _SLOW = 0.02  # of the last decrease: second derivatives pay
 _NEAR = 0.05  # relative decrease of the cost; farther off they lead astray
+_UNDAMPED = (1e-12, 1e-9, 1e-6)  # enough for parts that no closure holds any more
 _EYE = np.eye(6)
 
 
@@ -82,6 +85,13 @@ class PoseGraphOptimizer:
             np.concatenate([*rows, nodes]), np.concatenate([*cols, nodes]), size, 6
         )
 
+    def plain(self) -> PoseGraphOptimizer:
+        """Return the same graph without a loss, which shares memory with this one."""
+        other = copy.copy(self)
+        other._loss = LOSSES["none"]
+        other._trust = self._trust.copy()
+        return other
+
     def trust(self, loops: NDArray[np.bool_]) -> None:
         """Leave out the closures (L,) that are False."""
         self._trust[self._num_trajectory :] = loops
@@ -94,6 +104,34 @@ class PoseGraphOptimizer:
             edge_kernels.robust_cost(*graph, self._loss.code, price)
             + kernels.tilt_cost(T_G_I, tilt.vertex, tilt.q_G_I, tilt.sigma_rad)
         )
+
+    def closure_uncertainty(self, T_G_I: F64) -> F64:
+        """Return how uncertain closures' errors are by the poses alone: W J Sigma J^T W^T (L, 6, 6).
+
+        With the identity added it is the covariance of the errors of closures that are left out;
+        taken from the identity it is that of those which count.
+
+        Raises:
+            EstimationError: The poses are not determined.
+        """
+        linear = self._linearize(T_G_I, 1.0, bend=False)
+        for damping in _UNDAMPED:
+            self._own += (damping * linear.diagonal)[:, :, None] * _EYE
+            with contextlib.suppress(NotPositiveDefinite):
+                self._solver.factor(self._blocks)
+                break
+        else:
+            raise EstimationError("relaxation: the closures do not determine the poses")
+        edges = self._edges.take(np.arange(self._num_trajectory, len(self._edges)))
+        _, J_a, J_b = edges.linearized(T_G_I)
+        slot = self._slot[self._num_trajectory :]
+        inverse = np.concatenate([self._solver.inverse_blocks(), np.zeros((1, 6, 6))])
+        aa, bb, ba = (inverse[slot[:, part]] for part in range(3))  # the last one, where none is
+        turned = slot[:, 2] < -1
+        ba[turned] = np.swapaxes(inverse[-2 - slot[turned, 2]], 1, 2)
+        cross = J_b @ ba @ np.swapaxes(J_a, 1, 2)
+        own = J_a @ aa @ np.swapaxes(J_a, 1, 2) + J_b @ bb @ np.swapaxes(J_b, 1, 2)
+        return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
 
     def run(
         self, T_G_I: F64, price: float, max_iterations: int, progress: Progress

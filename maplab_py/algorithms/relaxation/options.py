@@ -22,11 +22,11 @@ class RelaxationOptions:
     flag_prefix: ClassVar[str] = "relax_"
 
     robustness: str = option(
-        "dcs",
+        "gnc",
         help="How false loop closures are kept from doing harm: 'switchable' estimates a switch "
         "variable for each one, 'dcs' (dynamic covariance scaling) lets them go in closed form but "
         "trusts good ones fully, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
-        choices=("switchable", "dcs", "cauchy", "none"),
+        choices=("gnc", "switchable", "dcs", "cauchy", "none"),
     )
     switch_prior: float = option(
         20.0,
