@@ -15,6 +15,7 @@ from maplab_py.algorithms.relaxation.pose_graph import RelativePoses, TiltPriors
 from maplab_py.errors import EstimationError
 from maplab_py.estimation import relative_pose_kernels as edge_kernels
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
+from maplab_py.estimation.linear.ordering import exact_minimum_degree
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.progress import Progress
 
@@ -23,7 +24,7 @@ I64 = NDArray[np.int64]
 
 _FIRST_DAMPING = 1e-8
 _LARGEST_DAMPING = 1e8
-_REMAINING = 1e-7  # relative decrease of the cost that is not worth another iteration
+_REMAINING = 1e-8  # relative decrease of the cost that is not worth another iteration
 _SLOW = 0.02  # of the last decrease: second derivatives pay
 _NEAR = 0.05  # relative decrease of the cost; farther off they lead astray
 _UNDAMPED = (1e-12, 1e-9, 1e-6)  # enough for parts that no closure holds any more
@@ -82,7 +83,11 @@ class PoseGraphOptimizer:
         self._blocks = np.zeros((first + size, 6, 6))
         self._own = self._blocks[first:]
         self._solver = BlockCholesky(
-            np.concatenate([*rows, nodes]), np.concatenate([*cols, nodes]), size, 6
+            np.concatenate([*rows, nodes]),
+            np.concatenate([*cols, nodes]),
+            size,
+            6,
+            ordering=exact_minimum_degree,
         )
 
     def plain(self) -> PoseGraphOptimizer:
@@ -169,8 +174,11 @@ class PoseGraphOptimizer:
             ratio = min(decrease / before, 0.999) if before > 0.0 else 0.5
             if decrease * ratio / (1.0 - ratio) <= _REMAINING * cost:
                 return T_G_I, iteration + 1
-            near = decrease < _NEAR * cost
-            bend = bend or (before > 0.0 and near and ratio > _SLOW)
+            bend = bend or (
+                self._loss.code == edge_kernels.QUADRATIC
+                and decrease < _NEAR * cost
+                and ratio > _SLOW
+            )
         return T_G_I, max_iterations
 
     def _linearize(self, T_G_I: F64, price: float, bend: bool) -> _Linearization:

@@ -111,19 +111,28 @@ class _Graph:
     def consistent(self) -> Solution:
         """Find the closures that agree, and trust those fully and the others not at all.
 
-        Begins in several ways, if the first does not trust all; the most closures in agreement win.
+        Begins in several ways, if the first does not trust all. The least truncated cost wins: what
+        the trusted ones cost, and the limit for each of the others.
         """
         solutions: list[Solution] = []
+        limits: list[float] = []
         for share in _STARTS:
             T, iterations = self._anneal(share, self.options.switch_prior)
-            solutions.append(self._judged(T, iterations))
-            if np.all(solutions[-1].weight == 1.0):
+            solution, limit = self._judged(T, iterations)
+            solutions.append(solution)
+            limits.append(limit)
+            if np.all(solution.weight == 1.0):
                 break
-        best = max(solutions, key=lambda s: (int(np.sum(s.weight)), -s.cost_after))
+        off = max(limits)
+        best = min(solutions, key=lambda s: s.cost_after + off * float(np.sum(1.0 - s.weight)))
         return dataclasses.replace(best, iterations=sum(s.iterations for s in solutions))
 
-    def _judged(self, T: F64, iterations: int) -> Solution:
-        """Find a set of closures that is the set of those which agree with its own optimum."""
+    def _judged(self, T: F64, iterations: int) -> tuple[Solution, float]:
+        """Find a set of closures that is the set of those which agree with its own optimum.
+
+        Returns:
+            The solution, and the limit of the squared errors of those which agree.
+        """
         prior = self.options.switch_prior
         u = self.loops.squared_errors(T)
         price = prior
@@ -136,25 +145,32 @@ class _Graph:
             iterations += used
             u = self.loops.squared_errors(T)
         kept = u < 2.0 * price
-        optimizer = self.optimizer.plain()
+        optimizer, limit = self.optimizer.plain(), prior
         for _ in range(_VERDICTS):
-            T, used, u, factor = self._measured(optimizer, T, kept)
+            T, used, u, limit = self._measured(optimizer, T, kept)
             iterations += used
-            before, kept = kept, with_tail(u, prior * factor)
+            before, kept = kept, with_tail(u, limit)
+            core = u <= limit
+            if np.any(kept & ~core):  # true ones with larger errors, or false ones that bend all?
+                T, used, u, limit = self._measured(optimizer, T, core)
+                iterations += used
+                kept = with_tail(u, limit)
             if np.array_equal(before, kept):
                 break
+        optimizer.trust(kept)
+        T, used = optimizer.run(T, 1.0, self.options.num_iterations, self.progress)
         first, last = (optimizer.cost(x, 1.0) for x in (self.T_G_I, T))
-        return Solution(T, before * 1.0, iterations, first, last)
+        return Solution(T, kept * 1.0, iterations + used, first, last), limit
 
     def _measured(
         self, optimizer: PoseGraphOptimizer, T: F64, kept: NDArray[np.bool_]
     ) -> tuple[F64, int, F64, float]:
-        """Optimise with some closures; return poses, iterations, errors, and variance factor."""
+        """Optimise with some closures; return poses, iterations, independent errors, their limit."""
         optimizer.trust(kept)
         T, iterations = optimizer.run(T, 1.0, self.options.num_iterations, self.progress)
         uncertainty = optimizer.closure_uncertainty(T)
         u = independent_errors(self.loops.errors(T), uncertainty, kept)
-        return T, iterations, u, variance_factor(u[kept])
+        return T, iterations, u, self.options.switch_prior * variance_factor(u[kept])
 
     def _anneal(self, share: float, price: float) -> tuple[F64, int]:
         """Go down in price until just above the one given."""

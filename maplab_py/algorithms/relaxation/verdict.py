@@ -21,7 +21,7 @@ _NOTHING_ELSE = 1e-3
 """Redundancy below which other closures do not control one."""
 _GAP = 2.0
 """Ratio of neighbouring squared errors that separates true from false ones."""
-_TAIL = 0.2
+_TAIL = 0.25
 """Share of the closures below the limit that may be added as their tail."""
 _WIDEST = 100.0
 """Times the limit: that far from it nothing is a tail."""
