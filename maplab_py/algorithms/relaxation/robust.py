@@ -30,6 +30,7 @@ _STAGE_ITERATIONS = 4
 _STARTS = (1.0, 0.5)
 """Shares of the closures that count in the beginning. All of them: right where drift is large. Half
 of them: right where false ones would turn the graph inside out."""
+_TRUSTED = 0.5  # weight
 _VERDICTS = 8
 
 
@@ -101,12 +102,17 @@ class _Graph:
         return self._solution(T, np.ones(len(self.loops)), iterations, 1.0)
 
     def annealed(self) -> Solution:
-        """Lower the price of switching off from the dearest closure's error to the one asked for."""
+        """Lower the price of switching off to the one asked for; of all starts the least cost wins."""
         price = self.options.switch_prior
-        T, iterations = self._anneal(1.0, price)
-        T, more = self._run(T, price, self.options.num_iterations)
-        weight = self.loss(self.loops.squared_errors(T), price)[1]
-        return self._solution(T, weight, iterations + more, price)
+        solutions: list[Solution] = []
+        for share in _STARTS:
+            T, iterations = self._anneal(share, price)
+            T, more = self._run(T, price, self.options.num_iterations)
+            weight = self.loss(self.loops.squared_errors(T), price)[1]
+            solutions.append(self._solution(T, weight, iterations + more, price))
+            if np.all(weight > _TRUSTED):
+                break
+        return _best(solutions, [s.cost_after for s in solutions])
 
     def consistent(self) -> Solution:
         """Find the closures that agree, and trust those fully and the others not at all.
@@ -124,8 +130,7 @@ class _Graph:
             if np.all(solution.weight == 1.0):
                 break
         off = max(limits)
-        best = min(solutions, key=lambda s: s.cost_after + off * float(np.sum(1.0 - s.weight)))
-        return dataclasses.replace(best, iterations=sum(s.iterations for s in solutions))
+        return _best(solutions, [s.cost_after + off * np.sum(1.0 - s.weight) for s in solutions])
 
     def _judged(self, T: F64, iterations: int) -> tuple[Solution, float]:
         """Find a set of closures that is the set of those which agree with its own optimum.
@@ -160,7 +165,7 @@ class _Graph:
         optimizer.trust(kept)
         T, used = optimizer.run(T, 1.0, self.options.num_iterations, self.progress)
         first, last = (optimizer.cost(x, 1.0) for x in (self.T_G_I, T))
-        return Solution(T, kept * 1.0, iterations + used, first, last), limit
+        return Solution(T, kept.astype(np.float64), iterations + used, first, last), limit
 
     def _measured(
         self, optimizer: PoseGraphOptimizer, T: F64, kept: NDArray[np.bool_]
@@ -189,3 +194,8 @@ class _Graph:
     def _solution(self, T: F64, weight: F64, iterations: int, price: float) -> Solution:
         before, after = (self.optimizer.cost(x, price) for x in (self.T_G_I, T))
         return Solution(T, weight, iterations, before, after)
+
+
+def _best(solutions: list[Solution], cost: list[float]) -> Solution:
+    best = solutions[int(np.argmin(cost))]
+    return dataclasses.replace(best, iterations=sum(s.iterations for s in solutions))

@@ -16,7 +16,7 @@ F64 = NDArray[np.float64]
 
 _SMALLEST_FACTOR, _LARGEST_FACTOR = 1e-6, 4.0
 _MEDIAN = 5.348  # of chi-squared with six degrees of freedom
-_FEW = 5  # closures that do not show the graph's accuracy
+_GIVEN = 50  # closures that weigh as much as the covariances as given
 _NOTHING_ELSE = 1e-3
 """Redundancy below which other closures do not control one."""
 _GAP = 2.0
@@ -30,11 +30,14 @@ _WIDEST = 100.0
 def variance_factor(u: F64) -> float:
     """Return the variance factor that independent errors of agreeing closures (E,) show.
 
-    By their median, which some false ones among them change little.
+    By their median, which some false ones among them change little. Few closures show little: the
+    covariances as given count as much as fifty closures would, in terms of logarithms.
     """
-    if len(u) < _FEW:
+    if len(u) == 0:
         return 1.0
-    return float(np.clip(np.median(u) / _MEDIAN, _SMALLEST_FACTOR, _LARGEST_FACTOR))
+    shown = max(float(np.median(u)) / _MEDIAN, 1e-300)
+    factor = shown ** (len(u) / (len(u) + _GIVEN))
+    return float(np.clip(factor, _SMALLEST_FACTOR, _LARGEST_FACTOR))
 
 
 def independent_errors(error: F64, uncertainty: F64, counts: NDArray[np.bool_]) -> F64:
