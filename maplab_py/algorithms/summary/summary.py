@@ -16,6 +16,7 @@ from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
 from maplab_py.vision.projection import DescriptorProjection
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -54,25 +55,34 @@ def make_summary_map(
         rows = _spread(rows, features, options.max_observations_per_landmark)
     landmarks, landmark = np.unique(features.descriptors.label[rows], return_inverse=True)
     vertices, observer = np.unique(features.vertex[rows], return_inverse=True)
-    projected = features.descriptors.projected[rows]
-    if options.descriptor_step:
-        step = np.float32(options.descriptor_step)
-        projected = np.round(projected / step) * step
     covariance = None
     if options.covariances:
-        covariance = landmark_covariances(judged, features)[landmarks].astype(np.float32)
+        covariance = _of_three_digits(landmark_covariances(judged, features)[landmarks])
     return SummaryMap(
-        p_G=judged.p_G[landmarks].astype(np.float32),
-        p_G_observer=judged.T_G_I[vertices, 4:].astype(np.float32),
-        descriptors=np.ascontiguousarray(projected, dtype=np.float32),
+        p_G=_rounded(judged.p_G[landmarks], options.position_step_m),
+        p_G_observer=_rounded(judged.T_G_I[vertices, 4:], options.position_step_m),
+        descriptors=_rounded(features.descriptors.projected[rows], options.descriptor_step),
         landmark=landmark.reshape(-1).astype(np.uint32),
         observer=observer.reshape(-1).astype(np.uint32),
-        landmark_id=judged.landmarks.id[landmarks],
+        landmark_id=judged.landmarks.id[landmarks] if options.landmark_ids else None,
         observer_id=judged.vertices.id[vertices],
         landmark_covariance=covariance,
         projection=projection.matrix,
         sensors=judged.sensors,
     )
+
+
+def _rounded(values: F64 | F32, step: float) -> F32:
+    """Round to multiples of a step; the zero bits that it leaves pack away. 0 = leave as it is."""
+    if step:
+        values = np.round(values / step) * step
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _of_three_digits(values: F64) -> F32:
+    """Keep 8 bits of the mantissas, a relative error of at most 2^-9; the other bits are zero."""
+    mantissa, exponent = np.frexp(values)
+    return np.ldexp(np.round(mantissa * 256.0) / 256.0, exponent).astype(np.float32)
 
 
 def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:

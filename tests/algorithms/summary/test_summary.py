@@ -24,7 +24,8 @@ def vi_map() -> VIMap:
 
 
 def test_a_summary_holds_the_good_landmarks_as_seen_from_g(vi_map):
-    summary = make_summary_map(vi_map, SummaryMapOptions(descriptor_step=0.0))
+    options = SummaryMapOptions(descriptor_step=0.0, position_step_m=0.0, landmark_ids=True)
+    summary = make_summary_map(vi_map, options)
     findable = findable_landmarks(vi_map)
     rows = IdIndex(vi_map.landmarks.id).rows(summary.landmark_id)
     np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(findable))
@@ -48,6 +49,26 @@ def test_rounded_descriptors_are_near_the_exact_ones(vi_map):
     rounded = make_summary_map(vi_map, SummaryMapOptions())
     assert np.abs(exact.descriptors - rounded.descriptors).max() <= 1.0 / 64.0 + 1e-5
     assert np.all(rounded.descriptors * 32.0 == np.round(rounded.descriptors * 32.0))
+
+
+def test_rounded_positions_and_covariances_are_near_the_exact_ones(vi_map):
+    exact = make_summary_map(vi_map, SummaryMapOptions(position_step_m=0.0))
+    rounded = make_summary_map(vi_map, SummaryMapOptions())
+    for name in ("p_G", "p_G_observer"):
+        difference = np.abs(getattr(exact, name) - getattr(rounded, name))
+        assert 0.0 < difference.max() <= 0.5 / 1024.0 + 1e-5
+    features, _ = map_features(vi_map, np.array([0]))
+    with_ids = make_summary_map(vi_map, SummaryMapOptions(landmark_ids=True))
+    rows = IdIndex(vi_map.landmarks.id).rows(with_ids.landmark_id)
+    whole = landmark_covariances(vi_map, features)[rows]
+    assert np.all(np.abs(rounded.landmark_covariance - whole) <= np.abs(whole) / 256.0)
+    # rounding is far below what they say: they stay covariances
+    assert np.linalg.eigvalsh(rounded.landmark_covariance.astype(np.float64)).min() > 0.0
+
+
+def test_ids_of_landmarks_are_written_when_asked_for(vi_map):
+    assert make_summary_map(vi_map, SummaryMapOptions()).landmark_id is None
+    assert make_summary_map(vi_map, SummaryMapOptions()).observer_id is not None
 
 
 def test_observations_can_be_limited(vi_map):
