@@ -35,7 +35,7 @@ from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import choose, coverage_problem
 from maplab_py.algorithms.summary.options import SummaryMapOptions
-from maplab_py.algorithms.summary.summary import make_summary_map
+from maplab_py.algorithms.summary.summary import make_summary_map, rounded
 from maplab_py.console.session import Session
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.simulation.scenario_file import load_scenario
@@ -169,7 +169,6 @@ def restricted(summary: SummaryMap, chosen: NDArray[np.bool_]) -> SummaryMap:
         summary,
         p_G=summary.p_G[chosen],
         landmark_id=None,
-        landmark_covariance=summary.landmark_covariance[chosen],
         p_G_observer=summary.p_G_observer[observers],
         observer_id=summary.observer_id[observers],
         descriptors=summary.descriptors[kept],
@@ -191,10 +190,9 @@ class Variant:
     def of(cls, vi_map: VIMap, projection: DescriptorProjection) -> Variant:
         """Summarise a map."""
         good = np.flatnonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD)
-        written = SummaryMapOptions(landmark_ids=True)
         plain = SummaryMapOptions(descriptor_step=0.0, position_step_m=0.0, landmark_ids=True)
-        both = [make_summary_map(vi_map, o, projection=projection) for o in (written, plain)]
-        return cls(vi_map, good, *both)
+        exact = make_summary_map(vi_map, plain, projection=projection)
+        return cls(vi_map, good, rounded(exact, SummaryMapOptions()), exact)
 
     def pruned(self, share: float, method: str) -> tuple[SummaryMap, SummaryMap]:
         """Return the summary maps, as written and not rounded, of what a method keeps."""

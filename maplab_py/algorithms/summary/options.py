@@ -30,11 +30,13 @@ class SummaryMapOptions:
         help="Positions are rounded to multiples of this; 0 = not rounded.",
         unit="m",
     )
-    covariances: bool = option(True, help="Write a covariance for every landmark, to three digits.")
+    covariances: bool = option(
+        False, help="Write a covariance for every landmark, 24 bytes that hardly pack."
+    )
     landmark_ids: bool = option(
         False,
-        help="Write the ids of the landmarks, 16 bytes each that cannot be packed; those of the "
-        "observing vertices are written in any case.",
+        help="Write the ids of the landmarks, 16 bytes that do not pack; those of the observing "
+        "vertices are written in any case.",
     )
 
     def __post_init__(self) -> None:

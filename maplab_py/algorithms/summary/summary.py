@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,11 +59,11 @@ def make_summary_map(
     vertices, observer = np.unique(features.vertex[rows], return_inverse=True)
     covariance = None
     if options.covariances:
-        covariance = _of_three_digits(landmark_covariances(judged, features)[landmarks])
-    return SummaryMap(
-        p_G=_rounded(judged.p_G[landmarks], options.position_step_m),
-        p_G_observer=_rounded(judged.T_G_I[vertices, 4:], options.position_step_m),
-        descriptors=_rounded(features.descriptors.projected[rows], options.descriptor_step),
+        covariance = landmark_covariances(judged, features)[landmarks].astype(np.float32)
+    summary = SummaryMap(
+        p_G=judged.p_G[landmarks].astype(np.float32),
+        p_G_observer=judged.T_G_I[vertices, 4:].astype(np.float32),
+        descriptors=np.ascontiguousarray(features.descriptors.projected[rows], dtype=np.float32),
         landmark=landmark.reshape(-1).astype(np.uint32),
         observer=observer.reshape(-1).astype(np.uint32),
         landmark_id=judged.landmarks.id[landmarks] if options.landmark_ids else None,
@@ -70,19 +72,24 @@ def make_summary_map(
         projection=projection.matrix,
         sensors=judged.sensors,
     )
+    return rounded(summary, options)
 
 
-def _rounded(values: F64 | F32, step: float) -> F32:
-    """Round to multiples of a step; the zero bits that it leaves pack away. 0 = leave as it is."""
-    if step:
-        values = np.round(values / step) * step
-    return np.ascontiguousarray(values, dtype=np.float32)
+def rounded(summary: SummaryMap, options: SummaryMapOptions) -> SummaryMap:
+    """Round positions and descriptors as the options say; the zero bits that it leaves pack away."""
+    return dataclasses.replace(
+        summary,
+        p_G=_to_multiples(summary.p_G, options.position_step_m),
+        p_G_observer=_to_multiples(summary.p_G_observer, options.position_step_m),
+        descriptors=_to_multiples(summary.descriptors, options.descriptor_step),
+    )
 
 
-def _of_three_digits(values: F64) -> F32:
-    """Keep 8 bits of the mantissas, a relative error of at most 2^-9; the other bits are zero."""
-    mantissa, exponent = np.frexp(values)
-    return np.ldexp(np.round(mantissa * 256.0) / 256.0, exponent).astype(np.float32)
+def _to_multiples(values: F32, step: float) -> F32:
+    """Round to multiples of a step; 0 = leave as it is."""
+    if not step:
+        return values
+    return np.asarray(np.round(values / np.float32(step)) * np.float32(step), dtype=np.float32)
 
 
 def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:
