@@ -218,7 +218,8 @@ def _measured(
 ) -> dict[str, Any]:
     small, count = _segments(scenario, data, method, per_group)
     began = time.process_time()
-    error, sigma, nees, facts = data.off.copy(), np.full(len(data.off), np.nan), np.nan, {}
+    error, sigma, nees = data.off.copy(), np.full(len(data.off), np.nan), float("nan")
+    facts: dict[str, Any] = {}
     sensors = data.vi_map.sensors
     try:
         result, report = calibrate(small, OPTIONS)
