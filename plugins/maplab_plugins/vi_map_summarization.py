@@ -19,7 +19,7 @@ _SUMMARY = SummaryMapOptions()
     "summary_map",
     example="summary_map --summary_map_save_path=office_summary",
     see_also=("create_localization_summary_map", "landmark_sparsify", "localize"),
-    acts_outside=True,
+    writes_files=True,
 )
 def generate_summary_map_and_save_to_disk(
     context: CommandContext,

@@ -17,7 +17,7 @@ from maplab_py.algorithms.loop_closure.record import USES, LoopRecord, read_reco
 from maplab_py.algorithms.loop_closure.report import Verdict
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.text_table import write_text
+from maplab_py.output_files import write_text
 from maplab_py.report import to_json
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdArray, IdIndex, to_hex, to_hex_list
