@@ -17,6 +17,9 @@ from maplab_py.algorithms.self_calibration.reports import (
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from maplab_py.algorithms.self_calibration.database import SegmentDatabase
     from maplab_py.sensors import SensorSet
 
@@ -99,6 +102,7 @@ def self_calibrate(
     options: SelfCalibrationOptions = _OPTIONS,
     database: Path | None = None,
     batch: bool = False,
+    joint_ekf: bool = False,
     dry_run: bool = False,
     map_mission: str = "",
     map_mission_list: str = "",
@@ -108,6 +112,8 @@ def self_calibrate(
     Args:
         database: Segment database: segments of earlier sessions take part, the map's are added.
         batch: Use all data of the missions instead of segments.
+        joint_ekf: For comparison: estimate IMU and mounting by a Kalman filter that runs along the
+            missions; camera intrinsics are held.
         dry_run: Only report; neither the map nor the database changes.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
         map_mission_list: Several missions, separated by commas.
@@ -115,11 +121,18 @@ def self_calibrate(
     from maplab_py.algorithms.self_calibration import workflow
     from maplab_py.algorithms.self_calibration.database_file import save_database
 
+    missions = context.mission_rows(map_mission, map_mission_list)
+    if (batch or joint_ekf) and database is not None:
+        raise UserError("--database goes with segments, neither with --batch nor with --joint_ekf")
+    if batch and joint_ekf:
+        raise UserError("choose one of --batch and --joint_ekf")
+    if joint_ekf:
+        return _filter(context, options, missions, dry_run=dry_run)
     sensors, collected, _, report = workflow.self_calibrate(
         context.vi_map,
         options,
         database=_existing(database),
-        missions=context.mission_rows(map_mission, map_mission_list),
+        missions=missions,
         batch=batch,
         progress=context.progress,
     )
@@ -128,6 +141,22 @@ def self_calibrate(
         if database is not None and collected is not None:
             save_database(collected, database)
     return report
+
+
+def _filter(
+    context: CommandContext,
+    options: SelfCalibrationOptions,
+    missions: NDArray[np.int64] | None,
+    *,
+    dry_run: bool,
+) -> SelfCalibrationReport:
+    from maplab_py.algorithms.self_calibration.ekf_report import report_of
+    from maplab_py.algorithms.self_calibration.joint_ekf import filter_jointly
+
+    result = filter_jointly(context.vi_map, options, missions=missions, progress=context.progress)
+    if not dry_run:
+        context.commit(context.vi_map.replace(sensors=result.sensors))
+    return report_of(result)
 
 
 @command(
