@@ -26,6 +26,8 @@ def report_of(result: FilteredCalibration) -> SelfCalibrationReport:
         keyframes=len(result.history),
         landmarks=result.tracks,
         observations=result.observations,
+        inconsistent_landmarks=result.tracks_rejected,
+        keypoint_noise_factor=1.0,  # the filter believes what the map says
         cost_before=float("nan"),
         cost_after=float("nan"),
         chi_square_per_freedom=result.mean_square,
