@@ -124,7 +124,7 @@ def _run_visual(
         visual.refresh(states)
     else:
         visual = VisualTerms(visual_kernels(models), observations, cameras, 2)
-    visual.node_system(states, 1e-4)
+    visual.node_system(states, 1e-4, np.empty((len(visual.block_nodes(states)[0]), 3, 3)))
     visual.take_step(states, np.zeros((states.num_nodes, 3)), states, 1e-4)
     visual.errors(states)
 
