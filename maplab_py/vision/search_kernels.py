@@ -89,6 +89,20 @@ def _word_distances(point, offset, centres, result):  # type: ignore[no-untyped-
         result[w] = total
 
 
+@compiled()
+def _nearest_first(distance, order):  # type: ignore[no-untyped-def]
+    """Fill in the words of the smallest distances, nearest first; few of many, so nothing is sorted."""
+    size = len(order)
+    for word in range(len(distance)):
+        place = min(word, size - 1)
+        if word >= size and distance[word] >= distance[order[place]]:
+            continue
+        while place > 0 and distance[order[place - 1]] > distance[word]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = word
+
+
 @compiled(inline="always")
 def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type: ignore[no-untyped-def]
     """Return the rank of the next word of a in the multi-sequence walk, -1 at its end.
@@ -126,7 +140,10 @@ def search_cells(  # type: ignore[no-untyped-def]
         distance_b = np.empty(words_b, dtype=np.float32)
         _word_distances(q_points[q], 0, centres_a, distance_a)
         _word_distances(q_points[q], 1, centres_b, distance_b)
-        order_a, order_b = np.argsort(distance_a), np.argsort(distance_b)
+        order_a = np.empty(min(cells_per_query, words_a), dtype=np.int64)
+        order_b = np.empty(min(cells_per_query, words_b), dtype=np.int64)
+        _nearest_first(distance_a, order_a)
+        _nearest_first(distance_b, order_b)
         next_b = np.zeros(words_a, dtype=np.int32)
         reach = 1
         labels = np.full(k, -1, dtype=np.int64)
@@ -136,7 +153,7 @@ def search_cells(  # type: ignore[no-untyped-def]
                 break
             cell = order_a[best] * words_b + order_b[next_b[best]]
             next_b[best] += 1
-            if best == reach - 1 and reach < words_a:
+            if best == reach - 1 and reach < len(order_a):
                 reach += 1
             for d in range(start[cell], start[cell + 1]):
                 if rank_by_bits:
