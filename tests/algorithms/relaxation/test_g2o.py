@@ -131,7 +131,10 @@ def _rms(T, reference):
 def test_false_edges_are_switched_off_and_true_ones_kept(name, seed):
     graph = read_g2o(shared_data(f"g2o/{name}.g2o"))
     wrong, without, is_false = _disturbed(graph, seed)
-    tight = {"function_tolerance": 1e-10, "num_iterations": 100}  # the garage hangs together loosely
+    tight = {
+        "function_tolerance": 1e-10,
+        "num_iterations": 100,
+    }  # the garage hangs together loosely
     plain = RelaxationOptions(robustness="none", **tight)
     robust = optimize_graph(wrong, RelaxationOptions(**tight))
     bent = optimize_graph(wrong, PLAIN)

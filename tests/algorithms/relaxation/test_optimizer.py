@@ -33,10 +33,10 @@ def _system(optimizer, T, bend):
     H = np.zeros((size, size, 6, 6))
     for row, col, block in zip(pattern.rows, pattern.cols, optimizer._blocks, strict=True):
         if row == col:  # the lower triangle counts
-            block = np.tril(block) + np.tril(block, -1).T
+            H[row, col] += np.tril(block) + np.tril(block, -1).T
         else:
+            H[row, col] += block
             H[col, row] += block.T
-        H[row, col] += block
     return linear.gradient.reshape(-1), H.transpose(0, 2, 1, 3).reshape(6 * size, 6 * size)
 
 
