@@ -20,16 +20,14 @@ the leaves (Takahashi 1973; Erisman and Tinney 1975): with Y = L21 L11^-1 and Z 
 
 where Z22 is part of what the parent has computed already.
 
-Matrices are column-major as BLAS wants them: a numpy view `panel[column, row]`. Fronts follow each
-other in a fixed order; large ones are worked on by several threads in parts that do not depend on
-their number. So results are the same bits each time.
+Matrices are column-major as BLAS wants them: a numpy view `panel[column, row]`. Everything here is
+sequential and ordered, so results are the same bits each time.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,9 +41,6 @@ I64 = NDArray[np.int64]
 LEFT, RIGHT = 0, 1  # places in Blas.letters
 PLAIN, TRANSPOSED = 2, 3
 ONE, MINUS_ONE, ZERO = 0, 1, 2  # places in Blas.factors
-
-_LARGE, _PARTS = 3_000_000, 4
-"""From so many multiplications on, a front is worth sharing among threads, in so many parts."""
 
 
 class Blas(NamedTuple):
@@ -114,11 +109,11 @@ def _solve_triangle(
 
 @compiled()
 def _subtract_square(
-    blas: Blas, factor: F64, leading: int, rows: int, cols: int, result: F64, result_leading: int
+    blas: Blas, factor: F64, leading: int, rows: int, cols: int, result: F64
 ) -> None:
     """Lower triangle of result (rows, rows) -= factor factor^T, for factor (rows, cols)."""
     letters, sizes = blas.letters, blas.sizes
-    sizes[0], sizes[1], sizes[2], sizes[3] = rows, cols, leading, result_leading
+    sizes[0], sizes[1], sizes[2], sizes[3] = rows, cols, leading, rows
     dsyrk(
         letters[LEFT:].ctypes,
         letters[PLAIN:].ctypes,
@@ -130,37 +125,6 @@ def _subtract_square(
         blas.factors[ONE:].ctypes,
         result.ctypes,
         sizes[3:].ctypes,
-    )
-
-
-@compiled()
-def _subtract_outer(
-    blas: Blas,
-    shape: tuple[int, int, int],
-    a: F64,
-    b: F64,
-    leading: int,
-    result: F64,
-    result_leading: int,
-) -> None:
-    """Overwrite result by result - a b^T; shape = rows of a, rows of b, columns of both."""
-    letters, factors, sizes = blas.letters, blas.factors, blas.sizes
-    sizes[0], sizes[1], sizes[2] = shape
-    sizes[3], sizes[4] = leading, result_leading
-    dgemm(
-        letters[PLAIN:].ctypes,
-        letters[TRANSPOSED:].ctypes,
-        sizes[0:].ctypes,
-        sizes[1:].ctypes,
-        sizes[2:].ctypes,
-        factors[MINUS_ONE:].ctypes,
-        a.ctypes,
-        sizes[3:].ctypes,
-        b.ctypes,
-        sizes[3:].ctypes,
-        factors[ONE:].ctypes,
-        result.ctypes,
-        sizes[4:].ctypes,
     )
 
 
@@ -220,8 +184,6 @@ def _add_matrix_blocks(plan: FrontPlan, supernode: int, values: F64, panel: F64)
 def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -> None:
     """Add a child's update matrix to a front ("extend-add").
 
-    Nodes that are neighbours in both matrices are added in one go.
-
     Args:
         panel: First columns of the front, [column, row] (w, w + n).
         update: The others, [column, row] (n, n).
@@ -229,49 +191,18 @@ def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -
         place: Local node of the front for every node of the child's matrix, ascending.
         d: Rows of a node.
     """
-    width, count = panel.shape[0], len(place)
-    run_end = np.empty(count, np.int64)  # where the neighbours of a node end
-    for i in range(count - 1, -1, -1):
-        goes_on = i + 1 < count and place[i + 1] == place[i] + 1
-        run_end[i] = run_end[i + 1] if goes_on else i + 1
-    for j in range(count):
-        for c in range(j * d, (j + 1) * d):
-            col = c + (place[j] - j) * d
-            first, i = c, j
-            while i < count:
-                end, shift = run_end[i] * d, (place[i] - i) * d
-                if col < width:
-                    for r in range(first, end):
-                        panel[col, r + shift] += child[c, r]
-                else:
-                    for r in range(first, end):
-                        update[col - width, r + shift - width] += child[c, r]
-                i = run_end[i]
-                first = i * d
-
-
-@compiled(parallel=True)
-def _eliminate_in_parts(blas: Blas, triangle: F64, below: F64, w: int, n: int, front: F64) -> None:
-    """Compute L21 and U of a large front in parts that threads share: rows, then columns.
-
-    The parts are the same for any number of threads, and so are the results.
-    """
-    sizes = np.zeros((_PARTS, len(blas.sizes)), np.int32)
-    for part in numba.prange(_PARTS):
-        own = Blas(blas.letters, blas.factors, sizes[part])
-        low, high = n * part // _PARTS, n * (part + 1) // _PARTS
-        rows = below[low:]
-        _solve_triangle(own, RIGHT, TRANSPOSED, triangle, w + n, rows, high - low, w, w + n)
-    for part in numba.prange(_PARTS):
-        own = Blas(blas.letters, blas.factors, sizes[part])
-        # columns of a triangle, cut so that areas are about equal
-        low = int(n * (1.0 - np.sqrt(1.0 - part / _PARTS)))
-        high = int(n * (1.0 - np.sqrt(1.0 - (part + 1) / _PARTS)))
-        square = front[low * n + low :]
-        _subtract_square(own, below[low:], w + n, high - low, w, square, n)
-        if high < n:
-            shape, rest = (n - high, high - low, w), front[low * n + high :]
-            _subtract_outer(own, shape, below[high:], below[low:], w + n, rest, n)
+    width = panel.shape[0]
+    for j in range(len(place)):
+        col = place[j] * d
+        for i in range(j, len(place)):
+            row = place[i] * d
+            for c in range(d):
+                for r in range(c if i == j else 0, d):
+                    value = child[j * d + c, i * d + r]
+                    if col < width:
+                        panel[col + c, row + r] += value
+                    else:
+                        update[col - width + c, row - width + r] += value
 
 
 @compiled()
@@ -297,8 +228,7 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
         panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + n)
         panel[:] = 0.0
         update = front[: n * n].reshape(n, n)
-        for c in range(n):
-            update[c, c:] = 0.0  # only lower triangles are read
+        update[:] = 0.0
         _add_matrix_blocks(plan, s, values, panel)
         for _ in range(plan.child_count[s]):
             num_waiting -= 1
@@ -314,14 +244,9 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
             return int(plan.first_node[s] + (bad_column - 1) // d)
         if n > 0:
             below = factor[plan.panel_start[s] + w :]  # L21 starts below L11 in every column
-            if w * n * (w + n) < _LARGE:
-                _solve_triangle(blas, RIGHT, TRANSPOSED, triangle, w + n, below, n, w, w + n)
-                _subtract_square(blas, below, w + n, n, w, front, n)
-            else:
-                _eliminate_in_parts(blas, triangle, below, w, n, front)
-            waiting_update = stack[top : top + n * n].reshape(n, n)
-            for c in range(n):
-                waiting_update[c, c:] = update[c, c:]
+            _solve_triangle(blas, RIGHT, TRANSPOSED, triangle, w + n, below, n, w, w + n)
+            _subtract_square(blas, below, w + n, n, w, front)
+            stack[top : top + n * n] = front[: n * n]
             top += n * n
             waiting[num_waiting] = s
             num_waiting += 1

@@ -30,9 +30,6 @@ from maplab_py.estimation.linear.protocol import FactorStatistics
 
 I64 = NDArray[np.int64]
 
-_WIDEST = 192
-"""Scalar columns of a supernode at most."""
-
 
 class FrontPlan(NamedTuple):
     """What the numeric kernels need to know. S supernodes in postorder.
@@ -257,8 +254,7 @@ def supernodes(structure_start: I64, parent: I64, node_size: int) -> I64:
 
     A column joins the supernode of the column before it when that one is its child and either
     the structures agree, or few zeros have to be stored: less than 80 % of a panel up to
-    16 scalar columns wide, 10 % up to 48, 5 % beyond. None is wider than _WIDEST: what lies below
-    a panel can be shared among threads, its triangle cannot.
+    16 scalar columns wide, 10 % up to 48, 5 % beyond.
     """
     n = len(parent)
     first_node = np.empty(n + 1, np.int64)
@@ -284,7 +280,7 @@ def supernodes(structure_start: I64, parent: I64, node_size: int) -> I64:
             total = width * (width + 1) / 2 + width * height
             share = stored / total
             columns = width * node_size
-            if columns > _WIDEST or not (
+            if not (
                 extra == 0
                 or (columns <= 16 and share < 0.8)
                 or (columns <= 48 and share < 0.1)
