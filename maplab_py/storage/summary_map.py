@@ -59,6 +59,11 @@ def summary_map_file(path: Path) -> Path | None:
     return inside if inside.is_file() else None
 
 
+def summary_map_bytes(summary: SummaryMap) -> bytes:
+    """Return the content of the file; the same summary gives the same bytes."""
+    return gzip.compress(_message(summary).SerializeToString(), _GZIP_LEVEL, mtime=0)
+
+
 def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = False) -> Path:
     """Write `localization_summary_map` into a folder; it is there completely or not at all.
 
@@ -67,8 +72,7 @@ def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = Fa
     """
     path = folder / FILE_NAME
     check_writable(path, overwrite=overwrite)
-    data = gzip.compress(_message(summary).SerializeToString(), _GZIP_LEVEL, mtime=0)
-    write_bytes(path, [data], overwrite=overwrite)
+    write_bytes(path, [summary_map_bytes(summary)], overwrite=overwrite)
     return path
 
 

@@ -189,7 +189,7 @@ def export_mission_info(
         mission_info_export_path: File to write.
         overwrite: Replace the file if it exists.
     """
-    from maplab_py.interop.text_table import write_text
+    from maplab_py.output_files import write_text
     from maplab_py.sensors.yaml_text import dump_yaml
     from maplab_py.vimap import ids
 

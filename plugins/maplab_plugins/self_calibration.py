@@ -6,78 +6,31 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from maplab_py.algorithms.self_calibration.database_reports import (
+    DatabaseParameter,
+    DatabaseReport,
+    DatabaseTable,
+    PrunedSegment,
+    PruneReport,
+)
+from maplab_py.algorithms.self_calibration.limits import checked
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import (
     CalibrationComparison,
     CollectionReport,
     InformationReport,
-    KeptSegment,
     SelfCalibrationReport,
 )
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from maplab_py.algorithms.self_calibration.database import SegmentDatabase
     from maplab_py.sensors import SensorSet
 
 _OPTIONS = SelfCalibrationOptions()
-
-
-@dataclasses.dataclass(frozen=True)
-class DatabaseTable:
-    """One table of a segment database."""
-
-    table: str
-    segments: int
-    best_score: float
-    worst_score: float
-
-
-@dataclasses.dataclass(frozen=True)
-class DatabaseParameter:
-    """How certain segments make one parameter."""
-
-    parameter: str
-    reference_sigma: float  # usual deviation after one segment
-    best_sigma: float  # after the best segment
-
-
-@dataclasses.dataclass(frozen=True)
-class DatabaseReport(Report):
-    """What a segment database holds."""
-
-    file: Path
-    metric: str
-    selection: str
-    capacity: int  # segments per table
-    sessions: int
-    keyframes: int
-    landmarks: int
-    imu_samples: int
-    tables: tuple[DatabaseTable, ...]
-    parameters: tuple[DatabaseParameter, ...]
-    segments: tuple[KeptSegment, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class PrunedSegment:
-    """A segment that was tested."""
-
-    mission: str
-    first_vertex: str
-    distance: float
-    limit: float
-    chi_square_per_freedom: float
-    outdated: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class PruneReport(Report):
-    """What was removed from a database."""
-
-    segments_before: int
-    segments_after: int
-    tested: tuple[PrunedSegment, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +52,9 @@ def self_calibrate(
     options: SelfCalibrationOptions = _OPTIONS,
     database: Path | None = None,
     batch: bool = False,
+    joint_ekf: bool = False,
+    max_camera_shift_m: float = 0.025,
+    parts: int = 0,
     dry_run: bool = False,
     map_mission: str = "",
     map_mission_list: str = "",
@@ -108,18 +64,35 @@ def self_calibrate(
     Args:
         database: Segment database: segments of earlier sessions take part, the map's are added.
         batch: Use all data of the missions instead of segments.
+        joint_ekf: For comparison: estimate IMU and mounting by a Kalman filter that runs along the
+            missions; camera intrinsics are held.
+        max_camera_shift_m: When the data would move a camera on the IMU farther than this, its
+            position is kept and the rest calibrated again; 0 = believe the data.
+        parts: Calibrate on so many parts of the data too; deviations are then at least what the
+            spread of the results says, and errors of the model show. 0 = formal deviations.
         dry_run: Only report; neither the map nor the database changes.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
         map_mission_list: Several missions, separated by commas.
     """
-    from maplab_py.algorithms.self_calibration import workflow
     from maplab_py.algorithms.self_calibration.database_file import save_database
+    from maplab_py.algorithms.self_calibration.plausibility import calibrate_plausibly
 
-    sensors, collected, _, report = workflow.self_calibrate(
+    missions = context.mission_rows(map_mission, map_mission_list)
+    if (batch or joint_ekf) and database is not None:
+        raise UserError("--database goes with segments, neither with --batch nor with --joint_ekf")
+    if batch and joint_ekf:
+        raise UserError("choose one of --batch and --joint_ekf")
+    if not max_camera_shift_m >= 0.0:
+        raise UserError(f"--max_camera_shift_m={max_camera_shift_m:g}: wants 0 or more")
+    if joint_ekf:
+        return _filter(context, checked(options), missions, dry_run=dry_run)
+    sensors, collected, report = calibrate_plausibly(
         context.vi_map,
-        options,
+        checked(options),
+        max_camera_shift_m=max_camera_shift_m,
+        parts=parts,
         database=_existing(database),
-        missions=context.mission_rows(map_mission, map_mission_list),
+        missions=missions,
         batch=batch,
         progress=context.progress,
     )
@@ -128,6 +101,22 @@ def self_calibrate(
         if database is not None and collected is not None:
             save_database(collected, database)
     return report
+
+
+def _filter(
+    context: CommandContext,
+    options: SelfCalibrationOptions,
+    missions: NDArray[np.int64] | None,
+    *,
+    dry_run: bool,
+) -> SelfCalibrationReport:
+    from maplab_py.algorithms.self_calibration.ekf_report import report_of
+    from maplab_py.algorithms.self_calibration.joint_ekf import filter_jointly
+
+    result = filter_jointly(context.vi_map, options, missions=missions, progress=context.progress)
+    if not dry_run:
+        context.commit(context.vi_map.replace(sensors=result.sensors))
+    return report_of(result)
 
 
 @command(
@@ -158,7 +147,7 @@ def collect_segments(
 
     collected, report = collect(
         context.vi_map,
-        options,
+        checked(options),
         _existing(database),
         missions=context.mission_rows(map_mission, map_mission_list),
         progress=context.progress,
@@ -253,7 +242,9 @@ def prune_segments(
         result = result.without_missions(gone)
     if outdated:
         sensors = before.vi_map.sensors if calibration is None else _sensors_of(calibration)
-        tested = fits(result, sensors, options, probability=probability, progress=context.progress)
+        tested = fits(
+            result, sensors, checked(options), probability=probability, progress=context.progress
+        )
         bad = {one.first_vertex for one in tested if one.is_outdated}
         result = result.without({r.key for r in result.records if r.first_vertex in bad})
     if segments_per_group:
@@ -332,7 +323,7 @@ def evaluate_segment_information(
 
     report, segments = workflow.segment_information(
         context.vi_map,
-        options,
+        checked(options),
         missions=context.mission_rows(map_mission, map_mission_list),
         progress=context.progress,
     )

@@ -75,6 +75,13 @@ def list_closures(
     )
 
 
+def describe_closure(vi_map: VIMap, row: int) -> ClosureLine:
+    """Return one recorded closure (a row of what `read_record` returns)."""
+    record = read_record(vi_map)
+    chosen = record.closures.take(np.array([row]))
+    return _lines(vi_map, dataclasses.replace(record, closures=chosen))[0]
+
+
 def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0.0) -> IdArray:
     """Return the ids (N, 2) of recorded closures by the beginnings of their ids.
 

@@ -106,8 +106,12 @@ def load_database(path: Path) -> SegmentDatabase:
         raise UserError(f"{path}: there is no such segment database") from None
     except MaplabError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is damaged or not a segment database: {error}") from None
+    except IsADirectoryError:
+        raise UserError(f"{path} is a folder; a segment database is a file") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path} is damaged or not a segment database (collect_segments writes them)"
+        ) from error
 
 
 def _table(archive: Any, name: str) -> Table:

@@ -79,7 +79,8 @@ def spectrum(covariance: F64, parameters: Parameters) -> Spectrum:
     the prior's variance. This is the truncation of a rank-revealing decomposition.
     """
     scale = parameters.prior_sigma
-    share, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
+    with single_blas_thread():
+        share, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
     return Spectrum(directions, np.clip(share, 0.0, 1.0))
 
 

@@ -78,11 +78,11 @@ def self_calibrate(
     result, report = calibrate(
         collected.vi_map, options, segments=len(collected), progress=progress
     )
-    sensors = _into(vi_map, collected.vi_map, result.sensors, missions)
+    sensors = into_map(vi_map, collected.vi_map, result.sensors, missions)
     return sensors, collected, result, report
 
 
-def _into(
+def into_map(
     vi_map: VIMap,
     collected: VIMap,
     calibrated: SensorSet,

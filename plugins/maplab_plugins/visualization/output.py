@@ -28,7 +28,7 @@ class ExportedView(Report):
 
 
 @command(
-    "save_view", example="save_view --file=map.png", see_also=("export_view",), writes_files=True
+    "save_view", example="save_view --file=map.png", see_also=("export_view",), acts_outside=True
 )
 def save_view(
     context: CommandContext,
