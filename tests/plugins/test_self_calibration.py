@@ -53,6 +53,17 @@ def test_batch_uses_everything(session: Session) -> None:
     assert abs(focal_px(session) - 310.0) <= 1.0
 
 
+def test_the_joint_filter_leaves_the_lens_alone(session: Session) -> None:
+    before = device(session.vi_map)[1]
+    report = session.run("self_calibrate", joint_ekf=True, dry_run=True, **FLAGS)
+    assert device(session.vi_map)[1] is before
+    assert not [one for one in report.parameters if "focal" in one.parameter]
+    session.run("self_calibrate", joint_ekf=True, **FLAGS)
+    after = device(session.vi_map)[1]
+    np.testing.assert_array_equal(after.cameras[0].intrinsics, before.cameras[0].intrinsics)
+    assert np.abs(after.T_B_C - before.T_B_C).max() > 1e-5
+
+
 def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
     database = tmp_path / "device.segments"
     collected = session.run("collect_segments", database=database, **FLAGS)
@@ -107,6 +118,19 @@ def test_mistakes_are_explained(session: Session, tmp_path: Path) -> None:
         session.run("self_calibrate", sc_states="lens")
     with pytest.raises(UserError, match="--sc_groups"):
         session.run("self_calibrate", sc_groups="imu,lens")
+    with pytest.raises(UserError, match="neither with --batch"):
+        session.run("self_calibrate", batch=True, database=tmp_path / "d")
+    with pytest.raises(UserError, match="one of"):
+        session.run("self_calibrate", batch=True, joint_ekf=True)
+    with pytest.raises(UserError, match="max_camera_shift_m"):
+        session.run("self_calibrate", max_camera_shift_m=-1.0)
+    with pytest.raises(UserError, match="sc_segments_per_group"):
+        session.run("self_calibrate", sc_segments_per_group=0)
+    (tmp_path / "notes.txt").write_text("no database")
+    with pytest.raises(UserError, match="not a segment database"):
+        session.run("segment_database_stats", database=tmp_path / "notes.txt")
+    with pytest.raises(UserError, match="is a folder"):
+        session.run("segment_database_stats", database=tmp_path)
     with pytest.raises(UserError, match="no such calibration"):
         session.run("apply_calibration", calibration=tmp_path / "nothing.yaml")
     with pytest.raises(EstimationError, match="sc_segment_keyframes"):
