@@ -16,12 +16,13 @@ from maplab_py.console.maps import key_of_folder
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.estimation.extension import ResidualRows, residual
 from maplab_py.options import option
+from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import Progress
 from maplab_py.report import Message, Report
 from maplab_py.viewer.extension import LayerLines, LayerPoints, viewer_layer
 from maplab_py.vimap import VIMap
 
-API_VERSION = (1, 1)
+API_VERSION = (1, 2)
 """Version of what this file exports: (breaking changes, additions)."""
 
 __all__ = [
@@ -39,10 +40,13 @@ __all__ = [
     "ResidualRows",
     "UserError",
     "VIMap",
+    "check_writable",
     "command",
     "importer",
     "key_of_folder",
     "option",
     "residual",
     "viewer_layer",
+    "write_bytes",
+    "write_text",
 ]

@@ -1,10 +1,12 @@
 """Measure the self-calibration on simulated sessions of one device (scenario ar_room or navigation).
 
 python docs/scripts/evaluate_self_calibration.py measure --scenario=ar_room --sets=15 --out=ar_room.jsonl
-python docs/scripts/evaluate_self_calibration.py report --results ar_room.jsonl
+python docs/scripts/evaluate_self_calibration.py consistency --seeds=50 --out=clean.jsonl
+python docs/scripts/evaluate_self_calibration.py consistency --seeds=50 --swaps=0.03 --out=swaps.jsonl
+python docs/scripts/self_calibration_page.py --results=ar_room.jsonl --consistency=clean.jsonl,swaps.jsonl
 
-`measure` appends one line per data set and method and goes on where it stopped. All data sets are
-recorded with the same device in the same room; motion, noise and appearance differ. `report`
+Each appends one line per data set and method and goes on where it stopped. All data sets are
+recorded with the same device in the same room; motion, noise and appearance differ. The last one
 writes docs/self_calibration_results.md.
 """
 
@@ -22,13 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
-from maplab_py.algorithms.self_calibration.collection import Evaluation, evaluate, records_of
+from maplab_py.algorithms.self_calibration.collection import (
+    Evaluation,
+    collect,
+    evaluate,
+    records_of,
+)
 from maplab_py.algorithms.self_calibration.information_gain import select_by_gain
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.problem import pose
 from maplab_py.algorithms.self_calibration.segments import restricted
+from maplab_py.algorithms.self_calibration.workflow import applied
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import EstimationError
 from maplab_py.sensors import SensorSet
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
@@ -40,9 +49,24 @@ from maplab_py.vimap import VIMap
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-DOCS = Path(__file__).resolve().parents[1]
 OPTIONS = SelfCalibrationOptions(keep_unobservable_at_prior=True)
-METHODS = ("informative", "batch", "random", "least informative", "single group")
+WHOLE = "imu+camera+extrinsics"
+FEW = 8
+"""Segments of the comparisons at equal numbers, as in the thesis."""
+METHODS = (
+    "informative",
+    "batch",
+    "two sessions",
+    "8: A-optimality",
+    "8: D-optimality",
+    "8: E-optimality",
+    "8: A-optimality by groups",
+    "8: entropy by groups",
+    "8: random",
+    "8: least informative",
+)
+JUDGED = ("informative", "batch", "8: A-optimality", "8: random", "8: least informative")
+"""Their calibrations are also tried on another session."""
 
 
 def data_set(scenario: Scenario, number: int) -> SimulatedData:
@@ -55,11 +79,12 @@ def data_set(scenario: Scenario, number: int) -> SimulatedData:
 
 
 def evaluation_session(scenario: Scenario) -> SimulatedData:
-    """Record the session on which calibrations are judged."""
+    """Record the session on which calibrations are judged: 0.5 m/s and 40 deg/s, as the thesis'."""
+    lively = {"wall_distance_m": 2.2, "shake_m": 0.05, "shake_rad": 0.15, "shake_hz": 0.7}
     session = SessionOptions(
         phases=(
-            MotionOptions(kind="room_scan", duration_s=18.0, turns=0.35, wall_distance_m=2.6),
-            MotionOptions(kind="figure_8", duration_s=14.0, turns=0.3, wall_distance_m=2.6),
+            MotionOptions(kind="room_scan", duration_s=15.0, turns=0.6, **lively),
+            MotionOptions(kind="figure_8", duration_s=15.0, turns=0.6, **lively),
         )
     )
     seeds = dataclasses.replace(scenario.seeds, motion=9, measurement=9, appearance=9)
@@ -69,205 +94,243 @@ def evaluation_session(scenario: Scenario) -> SimulatedData:
 def map_error_m(data: SimulatedData, sensors: SensorSet) -> float:
     """Return the position error [m] of the evaluation session, optimised with a calibration."""
     options = VIOptimizationOptions(num_iterations=15, hide_iterations_console_output=True)
-    result, _ = optimize(data.maps[0].replace(sensors=sensors), options)
+    result, _ = optimize(applied(data.maps[0], sensors), options)
     return float(evaluate_map(result, data.truth).ate_each_m)
 
 
-def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> list[I64]:
-    """Return the segments (vertex rows) that a method takes; all take as many as `informative`."""
-    own = dataclasses.replace(OPTIONS, segments_per_group=per_group)
+def scores_of(evaluation: Evaluation, metric: str, groups: str) -> dict[str, F64]:
+    """Return the scores (S,) of all segments by table."""
+    own = dataclasses.replace(OPTIONS, metric=metric, groups=groups)
     scores = [one.scores for one in records_of(evaluation, own, evaluation.sigma_ref())]
-    table = {name: np.array([one[name] for one in scores]) for name in scores[0]}
-    best = set[int]()
-    for values in table.values():
-        best |= set(np.argsort(values, kind="stable")[:per_group].tolist())
-    count = len(best)
-    if method == "random":
+    return {name: np.array([one[name] for one in scores]) for name in scores[0]}
+
+
+def in_turn(tables: dict[str, F64], count: int) -> list[int]:
+    """Return so many segments: the best of each table, the second best, and so on."""
+    orders = [np.argsort(values, kind="stable") for values in tables.values()]
+    chosen = dict.fromkeys(int(k) for rank in zip(*orders, strict=True) for k in rank)
+    return list(chosen)[:count]
+
+
+def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> list[I64]:
+    """Return the segments (vertex rows) that a method takes."""
+    count = min(FEW, len(evaluation.segments))
+    what = method.removeprefix("8: ")
+    if what == "informative":
+        tables = scores_of(evaluation, "a_optimality", OPTIONS.groups)
+        best = {
+            int(k) for one in tables.values() for k in np.argsort(one, kind="stable")[:per_group]
+        }
+    elif what == "random":
         rng = np.random.default_rng(number)
-        best = set(rng.choice(len(scores), size=count, replace=False).tolist())
-    elif method in ("single group", "least informative"):
-        single = dataclasses.replace(own, groups="imu+camera+extrinsics")
-        records = records_of(evaluation, single, evaluation.sigma_ref())
-        total = np.array([one.scores["imu+camera+extrinsics"] for one in records])
-        order = np.argsort(total if method == "single group" else -total, kind="stable")
-        best = set(order[:count].tolist())
+        best = set(rng.choice(len(evaluation.segments), size=count, replace=False).tolist())
+    elif what == "least informative":
+        total = scores_of(evaluation, "a_optimality", WHOLE)[WHOLE]
+        best = set(np.argsort(-total, kind="stable")[:count].tolist())
+    else:
+        metric = what.split(" by ")[0].replace("-", "_").lower()
+        groups = OPTIONS.groups if what.endswith("by groups") else WHOLE
+        best = set(in_turn(scores_of(evaluation, metric, groups), count))
     return [evaluation.segments[k].rows for k in sorted(best)]
 
 
-def measure(scenario_name: str, sets: int, per_group: int, methods: list[str], out: Path) -> None:
+@dataclasses.dataclass(frozen=True, eq=False)
+class DataSet:
+    """A session with its truth and the information of its segments."""
+
+    number: int
+    vi_map: VIMap
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    off: F64  # (k,) of the nominal calibration from the truth
+    truth: Any
+    true_sensors: SensorSet
+    evaluation: Evaluation
+    selection_s: float  # CPU time per segment
+
+    @classmethod
+    def of(cls, scenario: Scenario, number: int) -> DataSet:
+        """Record and evaluate."""
+        data = data_set(scenario, number)
+        vi_map = data.maps[0]
+        true = true_map(vi_map, data.truth)
+        truth = pose(true, OPTIONS, robust=False).posed.states.blocks
+        nominal = pose(vi_map, OPTIONS, robust=False)
+        began = time.process_time()
+        evaluation = evaluate(vi_map, OPTIONS)
+        return cls(
+            number,
+            vi_map,
+            nominal.parameters.names,
+            tuple(one.unit for one in nominal.parameters.each),
+            nominal.parameters.difference(nominal.posed.states.blocks, truth),
+            truth,
+            true.sensors,
+            evaluation,
+            (time.process_time() - began) / len(evaluation.segments),
+        )
+
+
+def measure(scenario_name: str, sets: range, per_group: int, methods: list[str], out: Path) -> None:
     """Calibrate every data set with every method; append a line each."""
     scenario = load_scenario(scenario_name)
-    done = {(row["set"], row["method"]) for row in _lines(out)}
+    done = {(row["set"], row["method"]) for row in lines_of(out)}
     judge = evaluation_session(scenario)
-    for number in range(sets):
+    first = DataSet.of(scenario, sets[0]) if (-1, "truth") not in done else None
+    if first is not None:
+        for method, sensors in (("nominal", first.vi_map.sensors), ("truth", first.true_sensors)):
+            row = {"set": -1, "method": method, "map_m": map_error_m(judge, sensors)}
+            _append(out, row)
+    for number in sets:
         missing = [method for method in methods if (number, method) not in done]
         if not missing:
             continue
-        data = data_set(scenario, number)
-        vi_map = data.maps[0]
-        truth = pose(true_map(vi_map, data.truth), OPTIONS, robust=False).posed.states.blocks
-        began = time.process_time()
-        evaluation = evaluate(vi_map, OPTIONS)
-        selection_s = (time.process_time() - began) / len(evaluation.segments)
+        data = DataSet.of(scenario, number)
         for method in missing:
-            row = _measured(vi_map, evaluation, method, number, per_group, truth, judge)
-            row["selection_s_per_segment"] = selection_s
-            with out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            row = _measured(scenario, data, method, per_group, judge)
+            row["selection_s_per_segment"] = data.selection_s
+            _append(out, row)
+            map_m = row["map_m"] or float("nan")
             sys.stdout.write(
-                f"{number:3d} {method:18s} NEES {row['nees']:8.1f}  map error {row['map_m']:.4f} m\n"
+                f"{number:3d} {method:26s} NEES {row['nees']:8.1f}  map error {map_m:.4f} m\n"
             )
+            sys.stdout.flush()
+
+
+def _segments(scenario: Scenario, data: DataSet, method: str, per_group: int) -> tuple[VIMap, int]:
+    """Return what a method calibrates on, and the number of its segments."""
+    if method == "batch":
+        return data.vi_map, len(data.evaluation.segments)
+    if method == "two sessions":
+        options = dataclasses.replace(OPTIONS, segments_per_group=per_group)
+        database, _ = collect(data_set(scenario, data.number + 1).maps[0], options)
+        database, _ = collect(data.vi_map, options, database)
+        return database.vi_map, len(database)
+    if method == "information gain":
+        rows = list(select_by_gain(data.vi_map, OPTIONS, max_segments=FEW).kept)
+    else:
+        rows = chosen(data.evaluation, method, data.number, per_group)
+    return restricted(data.vi_map, np.unique(np.concatenate(rows))), len(rows)
 
 
 def _measured(
-    vi_map: VIMap,
-    evaluation: Evaluation,
-    method: str,
-    number: int,
-    per_group: int,
-    truth: Any,
-    judge: SimulatedData,
+    scenario: Scenario, data: DataSet, method: str, per_group: int, judge: SimulatedData
 ) -> dict[str, Any]:
+    small, count = _segments(scenario, data, method, per_group)
     began = time.process_time()
-    if method == "batch":
-        small, count = vi_map, len(evaluation.segments)
-    elif method == "information gain":
-        most = len(chosen(evaluation, "informative", number, per_group))
-        rows = list(select_by_gain(vi_map, OPTIONS, max_segments=most).kept)
-        small, count = restricted(vi_map, np.unique(np.concatenate(rows))), len(rows)
+    error, sigma, nees = data.off.copy(), np.full(len(data.off), np.nan), float("nan")
+    facts: dict[str, Any] = {}
+    sensors = data.vi_map.sensors
+    try:
+        result, report = calibrate(small, OPTIONS)
+    except EstimationError as refusal:
+        facts = {"refused": str(refusal)}
     else:
-        rows = chosen(evaluation, method, number, per_group)
-        small, count = restricted(vi_map, np.unique(np.concatenate(rows))), len(rows)
-    if method != "information gain":
-        began = time.process_time()
-    result, report = calibrate(small, OPTIONS)
+        # what a selection says nothing about stays as it was
+        rows = [data.names.index(name) for name in result.parameters.names]
+        found = result.parameters.difference(result.states.blocks, data.truth)
+        error[rows], sigma[rows] = found, np.sqrt(np.diag(result.covariance))
+        nees = float(found @ np.linalg.solve(result.covariance, found))
+        sensors = result.sensors
+        facts = {
+            "iterations": report.iterations,
+            "chi_square": report.chi_square_per_freedom,
+            "noise_factor": report.keypoint_noise_factor,
+            "inconsistent": report.inconsistent_landmarks,
+            "unobservable": list(report.unobservable),
+        }
     seconds = time.process_time() - began
-    error = result.parameters.difference(result.states.blocks, truth)
     return {
-        "set": number,
+        "set": data.number,
         "method": method,
-        "names": list(result.parameters.names),
-        "units": [one.unit for one in result.parameters.each],
+        "names": list(data.names),
+        "units": list(data.units),
         "error": error.tolist(),
-        "sigma": np.sqrt(np.diag(result.covariance)).tolist(),
-        "nees": float(error @ np.linalg.solve(result.covariance, error)),
+        "sigma": sigma.tolist(),
+        "nees": nees,
         "segments": count,
-        "of_segments": len(evaluation.segments),
+        "of_segments": len(data.evaluation.segments),
         "cpu_s": seconds,
-        "iterations": report.iterations,
-        "chi_square": report.chi_square_per_freedom,
-        "unobservable": len(report.unobservable),
-        "map_m": map_error_m(judge, result.sensors),
+        "map_m": map_error_m(judge, sensors) if method in JUDGED else None,
+        **facts,
     }
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
+SHORT = (
+    MotionOptions(kind="room_scan", duration_s=10.0, turns=0.2, wall_distance_m=2.6, height_m=1.4),
+    MotionOptions(
+        kind="figure_8",
+        duration_s=10.0,
+        turns=0.25,
+        wall_distance_m=2.6,
+        shake_m=0.06,
+        shake_rad=0.15,
+    ),
+    MotionOptions(kind="hover", duration_s=6.0, shake_m=0.08, shake_rad=0.3),
+)
+"""A motion that excites everything, short enough for 50 seeds."""
+
+
+def consistency(scenario_name: str, seeds: range, swaps: float, out: Path) -> None:
+    """Compare errors with announced deviations over many short batches; append a line each."""
+    scenario = load_scenario(scenario_name)
+    measurement = dataclasses.replace(scenario.measurement, identity_swap_share=swaps)
+    scenario = dataclasses.replace(
+        scenario, measurement=measurement, sessions=(SessionOptions(phases=SHORT),)
+    )
+    done = {row["set"] for row in lines_of(out)}
+    for seed in seeds:
+        if seed in done:
+            continue
+        data = data_set(scenario, seed)
+        truth = pose(true_map(data.maps[0], data.truth), OPTIONS, robust=False).posed.states.blocks
+        result, report = calibrate(data.maps[0], OPTIONS)
+        error = result.parameters.difference(result.states.blocks, truth)
+        row = {
+            "set": seed,
+            "swaps": swaps,
+            "names": list(result.parameters.names),
+            "error": error.tolist(),
+            "sigma": np.sqrt(np.diag(result.covariance)).tolist(),
+            "nees": float(error @ np.linalg.solve(result.covariance, error)),
+            "noise_factor": report.keypoint_noise_factor,
+            "inconsistent": report.inconsistent_landmarks,
+        }
+        _append(out, row)
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    """Return the results in a file; none where there is no file."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-THESIS_SIGMA = {
-    "focal length": (0.35, 1.0, "px"),
-    "centre": (0.7, 1.0, "px"),
-    "distortion": (5e-4, 1.0, ""),
-    "gyroscope scale": (1e-3, 1.0, ""),
-    "accelerometer scale": (2.5e-3, 1.0, ""),
-    "gyroscope misalignment": (1e-3, 1.0, ""),
-    "accelerometer misalignment": (5e-3, 1.0, ""),
-    "accelerometer rotation": (0.15, float(np.rad2deg(1.0)), "deg"),
-    "camera position": (3.0, 1e3, "mm"),
-    "camera rotation": (0.07, float(np.rad2deg(1.0)), "deg"),
-}
-"""Level of the thesis' table 6.1, factor to its unit, unit."""
-
-
-def kind_of(name: str) -> str:
-    """Return the row of the table that a parameter belongs to."""
-    words = name.split()
-    if words[0] == "camera" and words[1] in ("position", "rotation"):
-        return " ".join(words[:2])
-    if words[0] == "camera":
-        return "focal length" if words[1] == "focal" else words[1]
-    return f"{words[0]} {words[1] if words[1] == 'rotation' else words[2]}"
-
-
-def report(results: list[Path]) -> str:
-    """Return the page of results."""
-    lines = [
-        "# Self-calibration: results",
-        "",
-        "Made by `docs/scripts/evaluate_self_calibration.py`; simulated sessions of one device with an",
-        "unknown calibration, beginning at the nominal one (sensors and motion as in the thesis).",
-        "Numbers of the thesis are from its table 6.1: recordings of a real tablet, no truth.",
-        "",
-    ]
-    for path in results:
-        lines += _of_scenario(path.stem, _lines(path))
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _of_scenario(name: str, rows: list[dict[str, Any]]) -> list[str]:
-    methods = [m for m in (*METHODS, "information gain") if any(r["method"] == m for r in rows)]
-    by_method = {m: [r for r in rows if r["method"] == m] for m in methods}
-    lines = [f"## Scenario {name}", "", "### Cost and quality", ""]
-    lines += [
-        "| selection | data sets | segments | of | CPU time [s] | NEES (of 26) | map error [mm] |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for method, own in by_method.items():
-        column = {
-            key: np.median([row[key] for row in own])
-            for key in ("segments", "of_segments", "cpu_s", "nees", "map_m")
-        }
-        lines.append(
-            f"| {method} | {len(own)} | {column['segments']:.0f} | {column['of_segments']:.0f} | "
-            f"{column['cpu_s']:.1f} | {column['nees']:.0f} | {1e3 * column['map_m']:.1f} |"
-        )
-    each = np.median([row["selection_s_per_segment"] for row in rows])
-    lines += [
-        "",
-        f"Medians. Evaluating a segment takes {each:.2f} s of CPU time. The map error is that of",
-        "another session of 32 s, optimised with the calibration held.",
-        "",
-        "### Error of the parameters (RMS over the data sets, against truth)",
-        "",
-        "| parameter | unit | thesis (std) | " + " | ".join(methods) + " |",
-        "|---|---|---|" + "---|" * len(methods),
-    ]
-    names = rows[0]["names"]
-    for kind, (level, factor, unit) in THESIS_SIGMA.items():
-        own = [k for k, one in enumerate(names) if kind_of(one) == kind]
-        cells = []
-        for method in methods:
-            error = np.array([row["error"] for row in by_method[method]])[:, own] * factor
-            cells.append(f"{np.sqrt(np.mean(error**2)):.2g}")
-        lines.append(f"| {kind} | {unit} | {level:.2g} | " + " | ".join(cells) + " |")
-    return [*lines, ""]
-
-
 def main() -> int:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("measure", "report"))
+    parser.add_argument("what", choices=("measure", "consistency"))
     parser.add_argument("--scenario", default="ar_room")
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", type=int, default=15)
-    parser.add_argument("--segments_per_group", type=int, default=8)
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--swaps", type=float, default=0.0)
+    parser.add_argument("--segments_per_group", type=int, default=OPTIONS.segments_per_group)
     parser.add_argument("--methods", default=",".join(METHODS))
-    parser.add_argument("--out", type=Path, default=Path("self_calibration.jsonl"))
-    parser.add_argument("--results", type=Path, nargs="*", default=[])
+    parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    if arguments.what == "measure":
-        methods = arguments.methods.split(",")
-        measure(
-            arguments.scenario,
-            arguments.sets,
-            arguments.segments_per_group,
-            methods,
-            arguments.out,
-        )
+    if arguments.what == "consistency":
+        seeds = range(arguments.first, arguments.first + arguments.seeds)
+        consistency(arguments.scenario, seeds, arguments.swaps, arguments.out)
     else:
-        (DOCS / "self_calibration_results.md").write_text(report(arguments.results))
+        sets = range(arguments.first, arguments.first + arguments.sets)
+        methods = arguments.methods.split(",")
+        measure(arguments.scenario, sets, arguments.segments_per_group, methods, arguments.out)
     return 0
 
 

@@ -1,6 +1,6 @@
 """Rebuild Fig. 5.6 of the thesis: how small a map may become before localisation suffers.
 
-python docs/scripts/map_maintenance.py [--work=FOLDER]
+python docs/scripts/map_maintenance.py [--work=FOLDER] [--optimised]
 
 Four simulated sessions make a map; a fifth is localised in summary maps of it, keyframed or not,
 with 0 to 98 % of the landmarks pruned by different methods. Writes docs/map_maintenance.json,
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import gzip
 import json
 import tempfile
@@ -19,55 +20,42 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from map_maintenance_page import METHODS, Point, findings, plot, table
+from numpy.typing import NDArray
 
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.localization.database import database_of_summary
 from maplab_py.algorithms.localization.localization import Reference, describe, localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.algorithms.sparsification.sparsify import choose, coverage_problem
 from maplab_py.algorithms.summary.options import SummaryMapOptions
-from maplab_py.algorithms.summary.summary import make_summary_map
+from maplab_py.algorithms.summary.summary import make_summary_map, rounded
 from maplab_py.console.session import Session
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.true_map import true_map
 from maplab_py.simulation.truth import Truth
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.summary_map import SummaryMap, write_summary_map
 from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.edits import remove_vertices
+from maplab_py.vimap.edits import merge_landmarks, remove_vertices
 from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap.merge import merge_maps
 from maplab_py.vision.projection import DescriptorProjection
 
 DOCS = Path(__file__).resolve().parents[1]
-FRACTIONS = (0.0, 0.5, 0.75, 0.9, 0.95, 0.98)
-METHODS = ("ilp", "most_observed", "random")
-QUERY_EVERY = 20
+QUERY_EVERY = 10
+UNITED_SHARE = 0.6
+"""Of the tracks, that are united with others of the same point."""
 MIN_ANGLE_DEG = 2.0
-COLOURS = {"ilp": "#0b6fb8", "most_observed": "#c8501e", "random": "#888888"}
-NAMES = {"ilp": "integer programme", "most_observed": "most observed", "random": "random"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """One map variant."""
-
-    keyframed: bool
-    pruned: float
-    method: str
-    landmarks: int
-    observations: int
-    maplab_megabytes: float | None  # maplab's fields only, as exact as it writes them
-    megabytes: float  # our file
-    recall: float
-    wrong: int
-    median_error_m: float
 
 
 def sessions(work: Path) -> None:
@@ -81,17 +69,35 @@ def sessions(work: Path) -> None:
     data.truth.save(work / "truth.npz")
 
 
-def full_map(work: Path) -> VIMap:
-    """Return the map of the first four sessions, merged by the usual commands."""
-    if not (work / "full").is_dir():
-        session = Session()
-        session.run("load_merge_all_maps", maps_folder=work / "sessions", target_map_key="full")
-        for command in ("elq", "optvi", "sbk", "aam", "relax", "lc", "rtl"):
-            session.run(command)
-        session.run("save", map_folder=work / "full")
+def full_map(work: Path, truth: Truth, *, optimised: bool) -> VIMap:
+    """Return the map of the first four sessions.
+
+    Args:
+        work: Where the sessions are.
+        truth: The truth about them.
+        optimised: Build it by the usual commands. Otherwise it gets the true poses, and tracks of
+            the same point are united by the truth, as many as `lc` unites; landmarks are
+            triangulated from the noisy keypoints.
+    """
     # distant landmarks help as well: accept smaller angles than mapping does
     options = LandmarkQualityOptions(min_observation_angle_deg=MIN_ANGLE_DEG)
-    return evaluate_quality(load_map(work / "full")[0], options)[0]
+    if optimised:
+        if not (work / "full").is_dir():
+            session = Session()
+            session.run("load_merge_all_maps", maps_folder=work / "sessions", target_map_key="full")
+            for command in ("elq", "optvi", "sbk", "aam", "relax", "lc", "rtl"):
+                session.run(command)
+            session.run("save", map_folder=work / "full")
+        return evaluate_quality(load_map(work / "full")[0], options)[0]
+    parts = [true_map(load_map(f)[0], truth) for f in sorted((work / "sessions").iterdir())]
+    vi_map = functools.reduce(lambda a, b: merge_maps(a, b)[0], parts)
+    point = truth.landmark_point[IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)]
+    united = np.random.default_rng(0).uniform(size=len(point)) < UNITED_SHARE
+    rows = np.flatnonzero(united & (point >= 0))
+    points, first = np.unique(point[rows], return_index=True)
+    into = rows[first[np.searchsorted(points, point[rows])]]
+    vi_map = merge_landmarks(vi_map, rows[rows != into], into[rows != into])
+    return retriangulate(vi_map, options)[0]
 
 
 def maplab_megabytes(summary: SummaryMap) -> float:
@@ -117,13 +123,19 @@ class Experiment:
         self._truth, self._index = truth, IdIndex(truth.vertex_id)
         self._projection = projection
 
-    def measure(self, vi_map: VIMap, *, keyframed: bool, pruned: float, method: str) -> Point:
-        """Localise the query in the summary map of one variant."""
+    def measure(
+        self,
+        summary: SummaryMap,
+        exact: SummaryMap,
+        *,
+        keyframed: bool,
+        pruned: float,
+        method: str,
+    ) -> Point:
+        """Localise the query in the summary map of one variant, as written and not rounded."""
         plain = None
         if method == METHODS[0]:
-            exact = SummaryMapOptions(descriptor_step=0.0, covariances=False)
-            plain = make_summary_map(vi_map, exact, projection=self._projection)
-        summary = make_summary_map(vi_map, SummaryMapOptions(), projection=self._projection)
+            plain = maplab_megabytes(exact)
         with tempfile.TemporaryDirectory() as folder:
             size = write_summary_map(summary, Path(folder)).stat().st_size * 1e-6
         database = database_of_summary(summary)
@@ -140,113 +152,96 @@ class Experiment:
             method=method,
             landmarks=report.map_landmarks,
             observations=report.map_observations,
-            maplab_megabytes=None if plain is None else maplab_megabytes(plain),
+            maplab_megabytes=plain,
             megabytes=size,
+            queries=report.queries_with_reference,
             recall=report.success_share,
             wrong=report.wrong,
             median_error_m=error.median if error is not None else float("nan"),
         )
 
 
-def run(work: Path) -> list[Point]:
+def restricted(summary: SummaryMap, chosen: NDArray[np.bool_]) -> SummaryMap:
+    """Return a summary map of some of the landmarks (L,): what the sparsified map would give."""
+    kept = chosen[summary.landmark]
+    observers, observer = np.unique(summary.observer[kept], return_inverse=True)
+    return dataclasses.replace(
+        summary,
+        p_G=summary.p_G[chosen],
+        landmark_id=None,
+        p_G_observer=summary.p_G_observer[observers],
+        observer_id=summary.observer_id[observers],
+        descriptors=summary.descriptors[kept],
+        landmark=(np.cumsum(chosen) - 1)[summary.landmark[kept]].astype(np.uint32),
+        observer=observer.reshape(-1).astype(np.uint32),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Variant:
+    """A map, keyframed or not, with what all of its variants share."""
+
+    vi_map: VIMap
+    good: NDArray[np.int64]  # landmark rows
+    summary: SummaryMap  # of all good landmarks
+    exact: SummaryMap  # the same, not rounded
+
+    @classmethod
+    def of(cls, vi_map: VIMap, projection: DescriptorProjection) -> Variant:
+        """Summarise a map."""
+        good = np.flatnonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD)
+        plain = SummaryMapOptions(descriptor_step=0.0, position_step_m=0.0, landmark_ids=True)
+        exact = make_summary_map(vi_map, plain, projection=projection)
+        return cls(vi_map, good, rounded(exact, SummaryMapOptions()), exact)
+
+    def pruned(self, share: float, method: str) -> tuple[SummaryMap, SummaryMap]:
+        """Return the summary maps, as written and not rounded, of what a method keeps."""
+        chosen = self.good
+        if share > 0.0:
+            options = SparsificationOptions(method=method)
+            keep = round((1.0 - share) * len(self.good))
+            problem, _ = coverage_problem(self.vi_map, self.good, keep, options)
+            chosen = self.good[choose(problem, options)[0].chosen]
+        kept = IdIndex(self.vi_map.landmarks.id[chosen]).rows(self.summary.landmark_id) >= 0
+        return restricted(self.summary, kept), restricted(self.exact, kept)
+
+
+def run(work: Path, *, optimised: bool) -> list[Point]:
     """Measure all variants."""
     sessions(work)
-    full = full_map(work)
-    _, projection = map_features(full, np.arange(len(full.missions)))
     truth = Truth.load(work / "truth.npz")
+    full = full_map(work, truth, optimised=optimised)
+    _, projection = map_features(full, np.arange(len(full.missions)))
     experiment = Experiment(load_map(work / "query")[0], truth, projection)
-    thin, _ = keyframe(full, KeyframingOptions())
     known = work / "points.json"
     stored = json.loads(known.read_text()) if known.is_file() else []
     points = [Point(**values) for values in stored]
-    for keyframed, pruned, method in variants():
-        if any((p.keyframed, p.pruned, p.method) == (keyframed, pruned, method) for p in points):
+    for keyframed in (True, False):
+        missing = [
+            (pruned, method)
+            for pruned, method in variants()
+            if not any(
+                (p.keyframed, p.pruned, p.method) == (keyframed, pruned, method) for p in points
+            )
+        ]
+        if not missing:
             continue
-        vi_map = thin if keyframed else full
-        good = int(np.count_nonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD))
-        if pruned:
-            options = SparsificationOptions(method=method)
-            vi_map, _, _ = sparsify(vi_map, round((1.0 - pruned) * good), options)
-        points.append(experiment.measure(vi_map, keyframed=keyframed, pruned=pruned, method=method))
-        known.write_text(json.dumps([dataclasses.asdict(point) for point in points]))
-        print(points[-1], flush=True)  # noqa: T201
+        vi_map = keyframe(full, KeyframingOptions())[0] if keyframed else full
+        variant = Variant.of(vi_map, projection)
+        for pruned, method in missing:
+            maps = variant.pruned(pruned, method)
+            points.append(
+                experiment.measure(*maps, keyframed=keyframed, pruned=pruned, method=method)
+            )
+            known.write_text(json.dumps([dataclasses.asdict(point) for point in points]))
+            print(points[-1], flush=True)  # noqa: T201
     return points
 
 
-def variants() -> list[tuple[bool, float, str]]:
+def variants() -> list[tuple[float, str]]:
     """Return all variants, those first that tell most."""
-    whole = [(keyframed, 0.0, METHODS[0]) for keyframed in (True, False)]
-    pruned = [(kf, f, m) for kf in (True, False) for m in METHODS for f in FRACTIONS[1:]]
-    return whole + pruned
-
-
-def table(points: list[Point]) -> list[str]:
-    """Return the lines of the table: keyframed maps in brackets, a dash where nothing was measured."""
-    lines = [
-        "| pruned | landmarks | MB as maplab writes it | MB as we write it | recall: integer "
-        "programme | most observed | random |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for pruned in FRACTIONS:
-        pair = [_find(points, keyframed, pruned, METHODS[0]) for keyframed in (False, True)]
-        cells = [f"{100 * pruned:.0f} %"]
-        cells.append(_cell([str(p.landmarks) if p else None for p in pair]))
-        cells.append(_cell([f"{p.maplab_megabytes:.3f}" if p else None for p in pair]))
-        cells.append(_cell([f"{p.megabytes:.3f}" if p else None for p in pair]))
-        for method in METHODS:
-            found = [_find(points, keyframed, pruned, method) for keyframed in (False, True)]
-            cells.append(_cell([f"{100 * p.recall:.1f} %" if p else None for p in found]))
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
-
-
-def _cell(values: list[str | None]) -> str:
-    return f"{values[0] or '-'} ({values[1] or '-'})"
-
-
-def _find(points: list[Point], keyframed: bool, pruned: float, method: str) -> Point | None:
-    """Return a variant; without pruning all methods are the same."""
-    wanted = (keyframed, pruned, method if pruned else METHODS[0])
-    found = [p for p in points if (p.keyframed, p.pruned, p.method) == wanted]
-    return found[0] if found else None
-
-
-def plot(points: list[Point]) -> str:
-    """Return the figure as SVG: recall over the pruned part; dashed = keyframed."""
-    left, top, width, height = 60.0, 20.0, 560.0, 300.0
-
-    def at(pruned: float, recall: float) -> str:
-        # the axis is the logarithm of what is kept, so that 98 % is not squeezed into a corner
-        x = left + width * np.log(1.0 - pruned) / np.log(1.0 - FRACTIONS[-1])
-        return f"{x:.1f},{top + height * (1.0 - recall):.1f}"
-
-    size = 'width="660" height="400" viewBox="0 0 660 400"'
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="12">',
-        '<rect width="100%" height="100%" fill="white"/>',
-    ]
-    for step in range(0, 101, 20):
-        y = top + height * (1.0 - step / 100.0)
-        lines.append(f'<path d="M{left} {y} h{width}" stroke="#dddddd"/>')
-        lines.append(f'<text x="{left - 8}" y="{y + 4}" text-anchor="end">{step} %</text>')
-    for pruned in FRACTIONS:
-        x = at(pruned, 0.0).split(",")[0]
-        y = top + height + 18
-        lines.append(f'<text x="{x}" y="{y}" text-anchor="middle">{100 * pruned:.0f} %</text>')
-    middle = left + width / 2
-    lines.append(f'<text x="{middle}" y="358" text-anchor="middle">landmarks pruned</text>')
-    for number, method in enumerate(METHODS):
-        for keyframed in (False, True):
-            found = [_find(points, keyframed, pruned, method) for pruned in FRACTIONS]
-            path = " ".join(at(p.pruned, p.recall) for p in found if p is not None)
-            dash = ' stroke-dasharray="6 4"' if keyframed else ""
-            style = f'stroke="{COLOURS[method]}" stroke-width="2" fill="none"{dash}'
-            lines.append(f'<polyline points="{path}" {style}/>')
-        x = left + 190 * number
-        lines.append(f'<path d="M{x} 380 h24" stroke="{COLOURS[method]}" stroke-width="2"/>')
-        lines.append(f'<text x="{x + 30}" y="384">{NAMES[method]}</text>')
-    lines.append(f'<text x="{left + width}" y="384" text-anchor="end">dashed: keyframed</text>')
-    return "\n".join([*lines, "</svg>", ""])
+    pruned = (0.9, 0.75, 0.5, 0.95, 0.98)
+    return [(0.0, METHODS[0]), *((f, m) for f in pruned for m in METHODS)]
 
 
 def write(points: list[Point]) -> None:
@@ -256,10 +251,13 @@ def write(points: list[Point]) -> None:
     (DOCS / "map_maintenance.json").write_text(f"[\n{text}\n]\n")
     (DOCS / "images" / "map_maintenance.svg").write_text(plot(points))
     page = DOCS / "map_maintenance.md"
-    before, _, rest = page.read_text().partition("<!-- table -->\n")
-    _, _, after = rest.partition("<!-- end of table -->\n")
-    lines = "\n".join(table(points))
-    page.write_text(f"{before}<!-- table -->\n{lines}\n<!-- end of table -->\n{after}")
+    text = page.read_text()
+    for name, lines in (("table", table(points)), ("findings", findings(points))):
+        before, _, rest = text.partition(f"<!-- {name} -->\n")
+        _, _, after = rest.partition(f"<!-- end of {name} -->\n")
+        inner = "\n".join(lines)
+        text = f"{before}<!-- {name} -->\n{inner}\n<!-- end of {name} -->\n{after}"
+    page.write_text(text)
 
 
 def main() -> None:
@@ -267,15 +265,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--work", type=Path, default=None)
     parser.add_argument("--write_only", action="store_true")
+    parser.add_argument(
+        "--optimised", action="store_true", help="optimise the map, which takes long"
+    )
     arguments = parser.parse_args()
     if arguments.write_only:
         stored = json.loads((arguments.work / "points.json").read_text())
         write([Point(**values) for values in stored])
     elif arguments.work is not None:
-        write(run(arguments.work))
+        write(run(arguments.work, optimised=arguments.optimised))
     else:
         with tempfile.TemporaryDirectory() as folder:
-            write(run(Path(folder)))
+            write(run(Path(folder), optimised=arguments.optimised))
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ class Command:
     needs_map: bool = True
     raw_arguments: bool = False
     acts_outside: bool = False  # does something that dropping the draft of the maps does not undo
+    writes_files: bool = False  # all that it does outside the maps is to write output files
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,6 +79,7 @@ def command(
     needs_map: bool = True,
     raw_arguments: bool = False,
     acts_outside: bool = False,
+    writes_files: bool = False,
 ) -> Callable[[FunctionT], FunctionT]:
     """Make a function a command of the console; the function itself stays as it is.
 
@@ -93,8 +95,11 @@ def command(
         see_also: Related commands for the help page.
         needs_map: The command is refused while no map is selected.
         raw_arguments: The words behind the command go to `*words` unread, flags included.
-        acts_outside: The command writes files or changes the session. Then it is never left
-            behind half done by Ctrl-C, and has --dry_run only if it defines that flag itself.
+        acts_outside: The command changes the session, or files in a way of its own. Then it is
+            never left behind half done by Ctrl-C, and has --dry_run only if it defines that flag.
+        writes_files: All that the command does outside the maps is to write files through
+            `maplab_py.output_files`. It is never left behind half done either; --dry_run tells
+            which files it would write.
 
     Raises:
         TypeError: The signature cannot be a command: a type that no flag can have, or the same
@@ -111,6 +116,7 @@ def command(
             needs_map=needs_map,
             raw_arguments=raw_arguments,
             acts_outside=acts_outside,
+            writes_files=writes_files,
         )
         setattr(function, COMMAND_ATTRIBUTE, described)
         return function

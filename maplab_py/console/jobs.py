@@ -64,6 +64,10 @@ class JobTerminal:
     def show(self, report: Report, command: str) -> None:
         """Show nothing; `join` shows the job's report."""
 
+    def note(self, text: str) -> None:
+        """Keep it for `join`."""
+        self._job.notes.append(text)
+
     def progress(
         self,
         command: str,  # noqa: ARG002
@@ -93,6 +97,7 @@ class Job:
     error: BaseException | None = None
     result: MapsState | None = None
     conflicts: tuple[Conflict, ...] = ()
+    notes: list[str] = dataclasses.field(default_factory=list)  # said beside the report
     was_told: bool = False  # join has shown its report
     _finished: threading.Event = dataclasses.field(default_factory=threading.Event)
     _settled: threading.Event = dataclasses.field(default_factory=threading.Event)

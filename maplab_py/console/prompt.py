@@ -149,10 +149,18 @@ def run_prompt(runner: Runner) -> Status:
             runner.wants_exit = True
             line = ""
         if line.strip():
-            runner.run_text(line)
+            _run_line(runner, line)
         if runner.wants_exit and _may_leave(runner):
             return Status.OK
         runner.wants_exit = False
+
+
+def _run_line(runner: Runner, line: str) -> None:
+    """Run a line; Ctrl-C between commands, where none hears it, must not end the program."""
+    try:
+        runner.run_text(line)
+    except KeyboardInterrupt:
+        runner.terminal.error("cancelled")
 
 
 def _may_leave(runner: Runner) -> bool:

@@ -146,7 +146,7 @@ class Runner:
                 report = run_in_foreground(
                     call.command.name,
                     lambda: self.session.execute(call),
-                    may_be_abandoned=not call.command.acts_outside,
+                    may_be_abandoned=not (call.command.acts_outside or call.command.writes_files),
                     while_waiting=self.terminal.tick,
                 )
                 name = call.command.name

@@ -23,6 +23,7 @@ from maplab_py.console.settings import Layer, Setting, Settings
 from maplab_py.console.terminal import SilentTerminal, Terminal
 from maplab_py.console.watchers import Watchers
 from maplab_py.errors import Cancelled
+from maplab_py.output_files import planning
 from maplab_py.report import Message, Report
 from maplab_py.vimap import VIMap
 
@@ -150,7 +151,7 @@ class Session:
                 context = CommandContext(
                     draft, progress, terminal, command.name, is_trial=call.is_trial
                 )
-                report = command.function(context, *_by_position(call, arguments), **arguments)
+                report = _called(call, context, arguments)
                 if context.has_drafts:
                     progress.check()
             context.apply_drafts()
@@ -192,6 +193,18 @@ class Session:
         inside = copy.copy(self)
         inside.maps, inside.terminal, inside.lock = maps, terminal, threading.RLock()
         return inside
+
+
+def _called(call: Call, context: CommandContext, arguments: dict[str, Any]) -> Any:
+    """Call the function; a trial writes no files but tells of them."""
+    words = _by_position(call, arguments)
+    if not call.is_trial:
+        return call.command.function(context, *words, **arguments)
+    with planning() as planned:
+        report = call.command.function(context, *words, **arguments)
+    for file in planned:
+        context.terminal.note(str(file))
+    return report
 
 
 def _by_position(call: Call, arguments: dict[str, Any]) -> list[Any]:

@@ -23,6 +23,9 @@ class Terminal(Protocol):
     def show(self, report: Report, command: str) -> None:
         """Show the report of a command."""
 
+    def note(self, text: str) -> None:
+        """Say something beside the report."""
+
     def progress(self, command: str, verbosity: int = 0) -> AbstractContextManager[Progress]:
         """Return the progress display around one command."""
 
@@ -44,6 +47,9 @@ class SilentTerminal:
 
     def show(self, report: Report, command: str) -> None:
         """Show nothing: the program has the report."""
+
+    def note(self, text: str) -> None:
+        """Say nothing."""
 
     def progress(
         self,

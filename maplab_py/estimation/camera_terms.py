@@ -18,7 +18,6 @@ from maplab_py.estimation.visual_terms import (
     VisualTerms,
     node_blocks,
     pose_part,
-    split_blocks,
 )
 
 I64 = NDArray[np.int64]
@@ -66,7 +65,7 @@ class CalibratingVisualTerms(VisualTerms):
         count, width = len(cameras.T_I_C), camera_columns(cameras.parameters.shape[1] - 1)
         self._model = cameras.parameters[:, :1]
         self._border = np.empty((self.num_chunks, count, num_vertices, width, 6))
-        self._square = np.empty((self.num_chunks, count, count, width, width))
+        self._camera_square = np.empty((self.num_chunks, count, count, width, width))
         self._camera_gradient = np.empty((self.num_chunks, count, width))
         self._camera_diagonal = np.empty((self.num_chunks, count, width))
         self._uv_motion = np.zeros((len(observations), 2))
@@ -99,7 +98,7 @@ class CalibratingVisualTerms(VisualTerms):
 
     def block_nodes(self, states: States) -> tuple[I64, I64]:
         """Return node row and column (B,) of every block of the system."""
-        row, col = node_blocks(self.pair_row, self.pair_col)
+        row, col = node_blocks(self.plan.rows, self.plan.cols)
         nodes = self.camera_nodes(states)
         poses = pose_nodes(np.arange(len(states.T_G_I)))
         border_row = np.broadcast_to(nodes[:, None, :, None], (*self._border_shape(nodes), 2))
@@ -118,16 +117,18 @@ class CalibratingVisualTerms(VisualTerms):
         row, col = np.nonzero(flat[:, None] >= flat[None, :])
         return flat[row], flat[col]
 
-    def node_system(self, states: States, damping: float) -> NodeSystem:
-        """Eliminate the landmarks and return what is left, by node."""
-        cost = np.empty(self.num_chunks)
+    def node_system(self, states: States, damping: float, values: F64) -> NodeSystem:
+        """Eliminate the landmarks; what is left goes, by node, to values (B, 3, 3) and the result."""
+        cost, poses = np.empty(self.num_chunks), values[: 4 * len(self.plan.cols)]
+        blocks = poses.reshape(-1, 6, 6)
         self._kernels.eliminate_calibrating(
             *self._measured(), states.T_G_I, *self._calibration(states), states.p_G,
-            self._prior, self._uv_motion, states.blocks[TIME_OFFSET].values, self._pair_start,
-            self._pair_block, self._diagonal_block, damping, self._move_points, self._chunk_start,
-            self._blocks, self._gradient, self._diagonal, self._border, self._square, self._camera_gradient,
-            self._camera_diagonal, cost,
+            self._prior, self._uv_motion, states.blocks[TIME_OFFSET].values, self.plan, damping,
+            self._move_points, self._Y, self._square, self._gradient, self._diagonal,
+            self._border, self._camera_square, self._camera_gradient, self._camera_diagonal,
+            cost, blocks,
         )  # fmt: skip
+        self._kernels.cut_blocks(self.plan, blocks, poses)
         nodes = self.camera_nodes(states)
         gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))
         pose_part(gradient, states)[:] = self._gradient[0]
@@ -135,16 +136,14 @@ class CalibratingVisualTerms(VisualTerms):
         gradient[nodes] = self._camera_gradient[0].reshape(*nodes.shape, 3)
         diagonal[nodes] = self._camera_diagonal[0].reshape(*nodes.shape, 3)
         border = self._border[0].reshape(*self._border_shape(nodes), 3, 2, 3)
-        values = [
-            split_blocks(self._blocks[0], self._is_diagonal),
-            border.transpose(0, 1, 2, 4, 3, 5).reshape(-1, 3, 3),
-            self._square_values(nodes),
-        ]
-        return NodeSystem(np.concatenate(values), gradient, diagonal, 0.5 * float(cost[0]))
+        by_node = border.transpose(0, 1, 2, 4, 3, 5).reshape(-1, 3, 3)
+        values[len(poses) : len(poses) + len(by_node)] = by_node
+        values[len(poses) + len(by_node) :] = self._square_values(nodes)
+        return NodeSystem(gradient, diagonal, 0.5 * float(cost[0]))
 
     def _square_values(self, nodes: I64) -> F64:
         count, each = nodes.shape
-        square = self._square[0].reshape(count, count, each, 3, each, 3)
+        square = self._camera_square[0].reshape(count, count, each, 3, each, 3)
         by_node = square.transpose(0, 2, 1, 4, 3, 5).reshape(count * each, count * each, 3, 3)
         flat = nodes.reshape(-1)
         return np.asarray(by_node[np.nonzero(flat[:, None] >= flat[None, :])])
@@ -159,7 +158,7 @@ class CalibratingVisualTerms(VisualTerms):
             *self._measured(), states.T_G_I, *self._calibration(states), states.p_G,
             self._prior, self._uv_motion, states.blocks[TIME_OFFSET].values,
             np.ascontiguousarray(pose_part(step, states)), step[nodes].reshape(len(nodes), -1),
-            damping, self._move_points, self._chunk_start, moved.T_G_I,
+            damping, self._move_points, self.plan.step_start, moved.T_G_I,
             *self._calibration(moved), moved.blocks[TIME_OFFSET].values, new_p_G, sums,
         )  # fmt: skip
         return new_p_G, 0.5 * float(sums[0, 0]), 0.5 * float(sums[0, 1])

@@ -9,9 +9,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Protocol
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.estimation.linear.jit import compiled
 from maplab_py.estimation.loss import Loss, robust
 from maplab_py.estimation.states import F64, States
 
@@ -39,9 +41,8 @@ class FactorTerm(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FactorSystem:
-    """Normal equations of one term, one block per pair of nodes of each factor."""
+    """Normal equations of one term; the blocks are where `linearize` was told."""
 
-    blocks: F64  # (N * n (n + 1) / 2, 3, 3)
     gradient: F64  # (N, n, 3)
     diagonal: F64  # (N, n, 3)
     cost: float
@@ -56,33 +57,73 @@ def cost(term: FactorTerm, states: States) -> float:
     )
 
 
-def linearize(term: FactorTerm, states: States) -> tuple[FactorSystem, F64, F64]:
-    """Return the normal equations, and the weighted residuals and Jacobians they came from."""
+def linearize(term: FactorTerm, states: States, blocks: F64) -> tuple[FactorSystem, F64, F64]:
+    """Return the normal equations, and the weighted residuals and Jacobians they came from.
+
+    Args:
+        term: Term of N factors with n nodes each.
+        states: Where to linearise.
+        blocks: Result (N n (n + 1) / 2, 3, 3): one block per pair of nodes, at `block_places`.
+    """
     residual, jacobian = term.evaluate(states)
     loss, scale = term.loss
     rho, weight = robust(loss, scale * scale, np.einsum("nm,nm->n", residual, residual))
-    root = np.sqrt(weight)
-    residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
-    count = len(jacobian)
-    num = term.nodes.shape[1]
-    normal = np.matmul(jacobian.transpose(0, 2, 1), jacobian).reshape(count, num, 3, num, 3)
-    b, a = np.tril_indices(num)
-    blocks = normal[:, b, :, a, :]  # advanced indexing puts the pair axis first
-    system = FactorSystem(
-        blocks=np.ascontiguousarray(blocks.transpose(1, 0, 2, 3)).reshape(-1, 3, 3),
-        gradient=np.einsum("nmk,nm->nk", jacobian, residual).reshape(count, num, 3),
-        diagonal=np.einsum("nmk,nmk->nk", jacobian, jacobian).reshape(count, num, 3),
-        cost=0.5 * float(np.sum(rho)),
-    )
-    return system, residual, jacobian
+    if loss is not Loss.NONE:
+        root = np.sqrt(weight)
+        residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
+    gradient, diagonal = np.empty((*term.nodes.shape, 3)), np.empty((*term.nodes.shape, 3))
+    normal_equations(
+        np.ascontiguousarray(residual), np.ascontiguousarray(jacobian), term.nodes,
+        blocks.reshape(len(residual), -1, 3, 3), gradient, diagonal,
+    )  # fmt: skip
+    return FactorSystem(gradient, diagonal, 0.5 * float(np.sum(rho))), residual, jacobian
 
 
-def block_places(nodes: I64) -> tuple[I64, I64, NDArray[np.bool_]]:
-    """Return node row and column of every block of a term, and which ones to transpose.
+@compiled(parallel=True)
+def normal_equations(
+    residual: F64, jacobian: F64, nodes: I64, blocks: F64, gradient: F64, diagonal: F64
+) -> None:
+    """Compute J' J by pairs of nodes, J' r, and the diagonal of J' J, of every factor.
+
+    Args:
+        residual: (N, m).
+        jacobian: (N, m, 3 n).
+        nodes: (N, n).
+        blocks: Result (N, n (n + 1) / 2, 3, 3), see `block_places`.
+        gradient: Result (N, n, 3).
+        diagonal: Result (N, n, 3).
+    """
+    for factor in numba.prange(len(residual)):
+        pair = 0
+        for b in range(nodes.shape[1]):
+            for i in range(3):
+                square, product = 0.0, 0.0
+                for m in range(residual.shape[1]):
+                    entry = jacobian[factor, m, 3 * b + i]
+                    square += entry * entry
+                    product += entry * residual[factor, m]
+                diagonal[factor, b, i] = square
+                gradient[factor, b, i] = product
+            for a in range(b + 1):
+                is_mirrored = nodes[factor, b] < nodes[factor, a]
+                for i in range(3):
+                    for j in range(3):
+                        total = 0.0
+                        for m in range(residual.shape[1]):
+                            total += jacobian[factor, m, 3 * b + i] * jacobian[factor, m, 3 * a + j]
+                        if is_mirrored:
+                            blocks[factor, pair, j, i] = total
+                        else:
+                            blocks[factor, pair, i, j] = total
+                pair += 1
+
+
+def block_places(nodes: I64) -> tuple[I64, I64]:
+    """Return node row and column of every block of a term.
 
     A block joins nodes b, a with a <= b in the factor's order; where node a is the later one in
     the system's order the block goes to the mirrored place, transposed.
     """
     b, a = np.tril_indices(nodes.shape[1])
     row, col = nodes[:, b].reshape(-1), nodes[:, a].reshape(-1)
-    return np.maximum(row, col), np.minimum(row, col), row < col
+    return np.maximum(row, col), np.minimum(row, col)

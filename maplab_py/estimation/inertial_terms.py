@@ -33,7 +33,7 @@ a new integration."""
 
 
 class InertialTerm:
-    """Preintegrated edges between vertices; re-integrated when a bias has moved far."""
+    """Preintegrated edges between vertices; each is re-integrated when its bias has moved far."""
 
     name = "inertial"
     loss = (Loss.NONE, 1.0)
@@ -52,17 +52,23 @@ class InertialTerm:
         self.nodes = np.stack(columns, axis=1)
 
     def integrate(self, states: States) -> bool:
-        """Integrate anew if the biases are far from where they were; tell whether it was done."""
+        """Integrate anew where biases are far from where they were; tell whether any are."""
         b_g, b_a = states.gyro_bias[self._a], states.accel_bias[self._a]
         old = self._measured
-        if old is not None:
-            moved_g = np.abs(b_g - old.gyro_bias).max(initial=0.0) > _GYRO_MOVED_RADPS
-            moved_a = np.abs(b_a - old.accel_bias).max(initial=0.0) > _ACCEL_MOVED_MPS2
-            if not moved_g and not moved_a:
-                return False
-        new = integrate(self._data, b_g, b_a)
-        self._whitening = np.linalg.inv(np.linalg.cholesky(new.covariance + FLOOR))
-        self._set_measured(new)
+        if old is None:
+            new = integrate(self._data, b_g, b_a)
+            self._whitening = _whitening(new)
+            self._set_measured(new)
+            return True
+        has_moved = (np.abs(b_g - old.gyro_bias) > _GYRO_MOVED_RADPS).any(axis=1)
+        has_moved |= (np.abs(b_a - old.accel_bias) > _ACCEL_MOVED_MPS2).any(axis=1)
+        rows = np.flatnonzero(has_moved)
+        if not len(rows):
+            return False
+        new = integrate(self._data.of_edges(rows), b_g[rows], b_a[rows])
+        self._whitening = self._whitening.copy()
+        self._whitening[rows] = _whitening(new)
+        self._set_measured(old.updated(rows, new))
         return True
 
     def _set_measured(self, new: Preintegrated, *more: F64) -> None:
@@ -131,6 +137,11 @@ class BiasWalkTerm:
         """Return whitened residuals (E, 6) and Jacobians (E, 6, 12)."""
         biases = np.concatenate([states.gyro_bias, states.accel_bias], axis=1)
         return (biases[self._b] - biases[self._a]) * self._weight, self._jacobian
+
+
+def _whitening(measured: Preintegrated) -> F64:
+    """Return square roots (E, 9, 9) of the information of preintegrated edges."""
+    return np.linalg.inv(np.linalg.cholesky(measured.covariance + FLOOR))
 
 
 def column_major(matrices: F64) -> F64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.estimation.linear.superlu import SuperLUSolver
 from maplab_py.estimation.states import F64, NODE_NAMES, NODES_PER_VERTEX, States
 from maplab_py.estimation.visual_terms import VisualTerms
+from maplab_py.vimap.table import starts_of_counts
 
 I64 = NDArray[np.int64]
 
@@ -22,7 +23,10 @@ _SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Linearization:
-    """The normal equations at some states, and what is needed to judge a step."""
+    """The normal equations at some states, and what is needed to judge a step.
+
+    The next linearisation of the same problem writes into the same `values`.
+    """
 
     values: F64  # 3 x 3 blocks of the system matrix, damping not included
     gradient: F64  # (nodes, 3)
@@ -55,19 +59,15 @@ class Problem:
         self.num_nodes = states.num_nodes
         self.visual, self.factors = visual, tuple(factors)
         every = np.arange(self.num_nodes, dtype=np.int64)
-        rows, cols = [every], [every]
+        places = [(every, every)]
         if visual is not None:
-            row, col = visual.block_nodes(states)
-            rows.append(row)
-            cols.append(col)
-        self._transposed = []
-        for term in self.factors:
-            row, col, transposed = factor_terms.block_places(term.nodes)
-            rows.append(row)
-            cols.append(col)
-            self._transposed.append(transposed)
-        self._rows, self._cols = np.concatenate(rows), np.concatenate(cols)
+            places.append(visual.block_nodes(states))
+        places += [factor_terms.block_places(term.nodes) for term in self.factors]
+        self._rows, self._cols = (np.concatenate(part) for part in zip(*places, strict=True))
+        self._part_start = starts_of_counts(np.array([len(rows) for rows, _ in places]))
         self._solver = linear_solver(self._rows, self._cols, self.num_nodes, 3)
+        self._values = np.zeros((len(self._rows), 3, 3))
+        self._damped = np.empty_like(self._values)
         self._projector = np.tile(np.eye(3), (self.num_nodes, 1, 1))
         self._restricted = np.zeros(self.num_nodes, dtype=np.bool_)
         self.restrict(*states.blocks.padding(states.num_vertex_nodes))
@@ -104,24 +104,26 @@ class Problem:
         """Form the normal equations; `damping` enters the elimination of the landmarks."""
         gradient = np.zeros((self.num_nodes, 3))
         diagonal = np.zeros((self.num_nodes, 3))
-        values, costs = [np.zeros((self.num_nodes, 3, 3))], {}
+        costs: dict[str, float] = {}
+        parts = self._parts()
         if self.visual is not None:
-            system = self.visual.node_system(states, damping)
-            values.append(system.values)
+            system = self.visual.node_system(states, damping, next(parts))
             gradient += system.gradient
             diagonal += system.diagonal
             costs["visual"] = system.cost
         evaluated = []
-        for term, transposed in zip(self.factors, self._transposed, strict=True):
-            factor, residual, jacobian = factor_terms.linearize(term, states)
-            blocks = factor.blocks
-            blocks[transposed] = blocks[transposed].transpose(0, 2, 1)
-            values.append(blocks)
+        for term, blocks in zip(self.factors, parts, strict=True):
+            factor, residual, jacobian = factor_terms.linearize(term, states, blocks)
             np.add.at(gradient, term.nodes, factor.gradient)
             np.add.at(diagonal, term.nodes, factor.diagonal)
             evaluated.append((term.nodes, residual, jacobian))
             costs[term.name] = costs.get(term.name, 0.0) + factor.cost
-        return Linearization(np.concatenate(values), gradient, diagonal, evaluated, costs)
+        return Linearization(self._values, gradient, diagonal, evaluated, costs)
+
+    def _parts(self) -> Iterator[F64]:
+        """Yield the values of the visual terms, if there are any, and of each factor term."""
+        for first, end in zip(self._part_start[1:-1], self._part_start[2:], strict=True):
+            yield self._values[first:end]
 
     def costs(self, states: States) -> dict[str, float]:
         """Return the cost of every term, without forming any equations."""
@@ -169,7 +171,8 @@ class Problem:
 
     def _factorise(self, linear: Linearization, damping: float) -> F64:
         """Factorise the projected, damped equations; return the projected gradient."""
-        values = linear.values.copy()
+        values = self._damped
+        np.copyto(values, linear.values)
         added = damping * np.clip(linear.diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
         values[: self.num_nodes] = added[:, :, None] * np.eye(3)
         gradient = linear.gradient.copy()

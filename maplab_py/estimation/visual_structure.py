@@ -1,126 +1,169 @@
-"""Which blocks of the reduced system the landmarks fill.
+"""Which blocks of the reduced system the landmarks fill, and in which order they are eliminated.
 
 Eliminating a landmark with n observations touches one block for each of its n (n + 1) / 2 pairs of
 observations. There are some ten times as many pairs as observations and a hundred times as many as
-blocks, so they are counted off row by row, without ever being listed or sorted.
+blocks, so they are never listed or sorted: a pair belongs to the block row of its later vertex, and
+rows are walked through by the VIEWS of their vertex, the observations made from there.
+
+Landmarks are eliminated SLAB by slab. What a landmark leaves with each of its observations (Y of
+`templates/visual`) is needed by all rows that see it, so it is kept for one slab: memory is bounded,
+and what a slab leaves is still in the processor's cache when the rows ask for it.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.estimation.linear.jit import compiled
+from maplab_py.vimap.table import starts_of_counts
 
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
 
 _ABSENT = -1
+_SMALL_SLAB, _MOST_SLABS = 65_536, 64
+"""A slab has at least so many observations, and more where there would be too many slabs."""
+_CHUNKS, _PIECES = 4, 16
 
 
-@compiled()
-def observations_by_vertex(vertex: I32, num_vertices: int) -> tuple[I64, I64]:
-    """Return offsets (V + 1,) and the observations (O,) of every vertex, ascending."""
-    start = np.zeros(num_vertices + 1, np.int64)
-    for v in vertex:
-        start[v + 1] += 1
-    for v in range(num_vertices):
-        start[v + 1] += start[v]
-    free = start[:-1].copy()
-    order = np.empty(len(vertex), np.int64)
-    for o in range(len(vertex)):
-        order[free[vertex[o]]] = o
-        free[vertex[o]] += 1
-    return start, order
+class EliminationPlan(NamedTuple):
+    """Structure of the reduced system and order of the work. B blocks, S slabs of O observations.
 
-
-@compiled()
-def count_blocks(
-    vertex: I32, first: I64, by_vertex_start: I64, by_vertex: I64, num_vertices: int
-) -> I64:
-    """Return the number of blocks (V,) in each block row: the diagonal, and lower ones in use."""
-    count = np.ones(num_vertices, np.int64)
-    last_row = np.full(num_vertices, _ABSENT, np.int64)  # the row in which a column was met last
-    for row in range(num_vertices):
-        last_row[row] = row
-        for place in range(by_vertex_start[row], by_vertex_start[row + 1]):
-            own = by_vertex[place]
-            for other in range(first[own], own):
-                col = vertex[other]
-                if last_row[col] != row:
-                    last_row[col] = row
-                    count[row] += 1
-    return count
-
-
-@compiled()
-def place_pairs(
-    vertex: I32,
-    first: I64,
-    pair_start: I64,
-    by_vertex_start: I64,
-    by_vertex: I64,
-    row_start: I64,
-    cols: I64,
-    pair_block: I32,
-) -> None:
-    """Fill the columns of all blocks and the block of every pair.
-
-    Args:
-        vertex: Vertex (O,) of every observation, ascending within a landmark.
-        first: First observation (O,) of every observation's landmark.
-        pair_start: First pair (O,) of every observation's landmark.
-        by_vertex_start: Offsets (V + 1,) into by_vertex.
-        by_vertex: Observations (O,) of every vertex.
-        row_start: Offsets (V + 1,) of the block rows.
-        cols: Result (B,): columns, ascending within a row.
-        pair_block: Result (P,): blocks of the pairs (b, a), a <= b, of every landmark.
+    Landmarks of a slab are evaluated in chunks, block rows are summed up in pieces, each by one
+    thread. Chunks have sums of their own, so their number is fixed; pieces share nothing.
     """
-    num_vertices = len(row_start) - 1
-    block_of = np.full(num_vertices, _ABSENT, np.int64)
-    for row in range(num_vertices):
-        low, high = row_start[row], row_start[row + 1]
-        met = low
-        cols[met], block_of[row] = row, low
-        for place in range(by_vertex_start[row], by_vertex_start[row + 1]):
-            own = by_vertex[place]
-            for other in range(first[own], own):
-                col = vertex[other]
-                if block_of[col] < low:
-                    met += 1
-                    cols[met], block_of[col] = col, met
-        cols[low:high].sort()
-        for block in range(low, high):
-            block_of[cols[block]] = block
-        for place in range(by_vertex_start[row], by_vertex_start[row + 1]):
-            own = by_vertex[place]
-            rank = own - first[own]
-            pair = pair_start[own] + rank * (rank + 1) // 2
-            for other in range(first[own], own + 1):
-                pair_block[pair] = block_of[vertex[other]]
-                pair += 1
+
+    row_start: I64  # (V + 1,) offsets of the block rows
+    cols: I64  # (B,) ascending within a row; the last one is the diagonal
+    slab_start: I64  # (S + 1,) landmarks
+    chunk_start: I64  # (S, chunks + 1) landmarks
+    first: I32  # (O,) first observation of every observation's landmark
+    view_start: I64  # (S, V + 1) offsets into views
+    views: I32  # (O,) observations by slab, then vertex
+    piece_start: I64  # (S, pieces + 1) block rows
+    step_start: I64  # (chunks + 1,) landmarks: chunks of all, for the pass that steps them
+    largest_slab: int  # observations
+
+    @property
+    def rows(self) -> I64:
+        """Row (B,) of every block."""
+        return np.repeat(np.arange(len(self.row_start) - 1), np.diff(self.row_start))
 
 
-def reduced_blocks(
-    start: I64, vertex: I32, pair_start: I64, num_vertices: int
-) -> tuple[I64, I64, I32, I64]:
-    """Return row and column vertex of every block, the block of each pair, and the diagonal blocks.
-
-    Blocks are in order of row, then column; the diagonal block of every vertex is among them.
+def elimination_plan(start: I64, vertex: I32, num_vertices: int) -> EliminationPlan:
+    """Find the blocks and share out the work.
 
     Args:
         start: Offsets (L + 1,) of the landmarks' observations.
         vertex: Vertex (O,) of every observation, ascending within a landmark.
-        pair_start: Offsets (L + 1,) of the landmarks' pairs (b, a), a <= b.
         num_vertices: V.
     """
     counts = np.diff(start)
-    first, first_pair = np.repeat(start[:-1], counts), np.repeat(pair_start[:-1], counts)
-    by_vertex_start, by_vertex = observations_by_vertex(vertex, num_vertices)
-    in_row = count_blocks(vertex, first, by_vertex_start, by_vertex, num_vertices)
-    row_start = np.concatenate([[0], np.cumsum(in_row)])
-    cols = np.empty(row_start[-1], dtype=np.int64)
-    pair_block = np.empty(int(pair_start[-1]), dtype=np.int32)
-    place_pairs(vertex, first, first_pair, by_vertex_start, by_vertex, row_start, cols, pair_block)
-    rows = np.repeat(np.arange(num_vertices), in_row)
-    return rows, cols, pair_block, row_start[1:] - 1
+    first = np.repeat(start[:-1], counts).astype(np.int32)
+    slab_start = _cut_evenly(start, max(_SMALL_SLAB, -(-len(vertex) // _MOST_SLABS)))
+    view_start, views = sort_views(start[slab_start], vertex, num_vertices)
+    in_row = count_blocks(vertex, first, view_start, views)
+    row_start = starts_of_counts(in_row)
+    slabs = range(len(slab_start) - 1)
+    return EliminationPlan(
+        row_start=row_start,
+        cols=block_columns(vertex, first, view_start, views, row_start),
+        slab_start=slab_start,
+        chunk_start=np.stack([_chunks(start, *slab_start[s : s + 2]) for s in slabs]),
+        first=first,
+        view_start=view_start,
+        views=views,
+        piece_start=np.stack([_pieces(first, views, view_start[s]) for s in slabs]),
+        step_start=_chunks(start, 0, len(counts)),
+        largest_slab=int(np.diff(start[slab_start]).max(initial=0)),
+    )
+
+
+def _cut_evenly(start: I64, size: int) -> I64:
+    """Cut landmarks into slabs of about so many observations: offsets (S + 1,), S at least 1."""
+    count = max(1, round(float(start[-1]) / size))
+    cuts = np.searchsorted(start, np.linspace(0, start[-1], count + 1)[1:-1])
+    return np.concatenate([[0], cuts, [len(start) - 1]]).astype(np.int64)
+
+
+def _chunks(start: I64, low: int, high: int) -> I64:
+    """Cut the landmarks low .. high - 1 into chunks of about as many observations."""
+    wanted = np.linspace(start[low], start[high], _CHUNKS + 1)[1:-1]
+    cuts = low + np.searchsorted(start[low : high + 1], wanted)
+    return np.concatenate([[low], cuts, [high]]).astype(np.int64)
+
+
+def _pieces(first: I32, views: I32, view_start: I64) -> I64:
+    """Cut the block rows into pieces with about as many pairs of observations of a slab."""
+    own = views[view_start[0] : view_start[-1]]
+    work = np.concatenate([[0], np.cumsum(own - first[own] + 2)])
+    of_rows = work[view_start - view_start[0]]
+    cuts = np.searchsorted(of_rows, np.linspace(0, of_rows[-1], _PIECES + 1)[1:-1])
+    return np.concatenate([[0], cuts, [len(view_start) - 1]]).astype(np.int64)
+
+
+@compiled()
+def sort_views(slab_start: I64, vertex: I32, num_vertices: int) -> tuple[I64, I32]:
+    """Sort observations by slab, then vertex: (offsets (S, V + 1), observations (O,)).
+
+    Args:
+        slab_start: First observation of every slab, and O at the end.
+        vertex: Vertex (O,) of every observation.
+        num_vertices: V.
+    """
+    num_slabs = len(slab_start) - 1
+    view_start = np.zeros((num_slabs, num_vertices + 1), np.int64)
+    views = np.empty(len(vertex), np.int32)
+    free = np.empty(num_vertices, np.int64)
+    for slab in range(num_slabs):
+        for o in range(slab_start[slab], slab_start[slab + 1]):
+            view_start[slab, vertex[o] + 1] += 1
+        view_start[slab, 0] = slab_start[slab]
+        for v in range(num_vertices):
+            free[v] = view_start[slab, v]
+            view_start[slab, v + 1] += view_start[slab, v]
+        for o in range(slab_start[slab], slab_start[slab + 1]):
+            views[free[vertex[o]]] = o
+            free[vertex[o]] += 1
+    return view_start, views
+
+
+@compiled()
+def count_blocks(vertex: I32, first: I32, view_start: I64, views: I32) -> I64:
+    """Return the number of blocks (V,) in each block row: the diagonal, and lower ones in use."""
+    num_slabs, num_vertices = view_start.shape[0], view_start.shape[1] - 1
+    count = np.ones(num_vertices, np.int64)
+    last_row = np.full(num_vertices, _ABSENT, np.int64)  # the row in which a column was met last
+    for row in range(num_vertices):
+        last_row[row] = row
+        for slab in range(num_slabs):
+            for own in views[view_start[slab, row] : view_start[slab, row + 1]]:
+                for col in vertex[first[own] : own]:
+                    if last_row[col] != row:
+                        last_row[col] = row
+                        count[row] += 1
+    return count
+
+
+@compiled()
+def block_columns(vertex: I32, first: I32, view_start: I64, views: I32, row_start: I64) -> I64:
+    """Return the column (B,) of every block, ascending within a row, for offsets of the rows."""
+    num_slabs, num_vertices = view_start.shape[0], view_start.shape[1] - 1
+    cols = np.empty(row_start[num_vertices], np.int64)
+    last_row = np.full(num_vertices, _ABSENT, np.int64)
+    for row in range(num_vertices):
+        last_row[row] = row
+        met = row_start[row]
+        cols[met] = row
+        for slab in range(num_slabs):
+            for own in views[view_start[slab, row] : view_start[slab, row + 1]]:
+                for col in vertex[first[own] : own]:
+                    if last_row[col] != row:
+                        last_row[col] = row
+                        met += 1
+                        cols[met] = col
+        cols[row_start[row] : row_start[row + 1]].sort()
+    return cols

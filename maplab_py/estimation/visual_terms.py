@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from types import ModuleType
 
 import numpy as np
@@ -10,15 +11,10 @@ from numpy.typing import NDArray
 
 from maplab_py.estimation.loss import Loss, robust
 from maplab_py.estimation.states import F64, NODES_PER_VERTEX, States
-from maplab_py.estimation.visual_structure import reduced_blocks
-from maplab_py.vimap.table import starts_of_counts
+from maplab_py.estimation.visual_structure import elimination_plan
 
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
-
-_CHUNKS, _CHUNKS_OF_LARGE, _MANY_BLOCKS = 4, 2, 500_000
-"""Landmarks are summed in this many parts, whatever the number of threads (determinism). Each part
-has blocks of its own, which for many blocks (of 288 bytes) would take too much memory."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,6 +30,11 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.vertex)
+
+    @cached_property
+    def scale2(self) -> F64:
+        """Squared loss scale (O,)."""
+        return np.square(self.loss_scale)
 
     @property
     def landmark(self) -> I64:
@@ -57,7 +58,7 @@ class Cameras:
 class VisualSystem:
     """Reduced normal equations of the poses."""
 
-    blocks: F64  # (B, 6, 6) [row pose, column pose]
+    values: F64  # (4 B, 3, 3) at `node_blocks`
     gradient: F64  # (V, 6) of half the cost
     diagonal: F64  # (V, 6) of the unreduced equations
     cost: float  # half the sum of rho
@@ -65,20 +66,15 @@ class VisualSystem:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NodeSystem:
-    """Reduced normal equations by node, ready for the solver."""
+    """Reduced normal equations by node; the blocks are where `VisualTerms.node_system` was told."""
 
-    values: F64  # (B, 3, 3) at `block_nodes`
     gradient: F64  # (nodes, 3)
     diagonal: F64  # (nodes, 3) of the unreduced equations
     cost: float
 
 
 class VisualTerms:
-    """All reprojection errors of a problem.
-
-    `pair_row`, `pair_col` (B,) say which vertices each block of the reduced system joins; the
-    diagonal block of every vertex is among them.
-    """
+    """All reprojection errors of a problem."""
 
     def __init__(
         self,
@@ -110,30 +106,28 @@ class VisualTerms:
         self._prior = np.zeros((count, 4)) if landmark_prior is None else landmark_prior
         self.observations = observations
         self._num_vertices = num_vertices
-        counts = np.diff(observations.start)
-        self._pair_start = starts_of_counts(counts * (counts + 1) // 2)
-        self.pair_row, self.pair_col, self._pair_block, self._diagonal_block = reduced_blocks(
-            observations.start, observations.vertex, self._pair_start, num_vertices
-        )
-        self.num_chunks = _CHUNKS if len(self.pair_row) < _MANY_BLOCKS else _CHUNKS_OF_LARGE
-        self._chunk_start = _balanced_chunks(counts, self.num_chunks)
-        shape = (self.num_chunks, num_vertices, 6)
-        self._blocks = np.empty((self.num_chunks, len(self.pair_row), 6, 6))
+        self.plan = plan = elimination_plan(observations.start, observations.vertex, num_vertices)
+        shape = (plan.chunk_start.shape[1] - 1, num_vertices, 6)
+        self._Y = np.empty((plan.largest_slab, 3, 6))
+        self._square = np.empty((*shape, 6))
         self._gradient, self._diagonal = np.empty(shape), np.empty(shape)
-        self._is_diagonal = self.pair_row == self.pair_col
+
+    @property
+    def num_chunks(self) -> int:
+        """How many sums are kept apart, whatever the number of threads."""
+        return len(self._gradient)
 
     def block_nodes(self, states: States) -> tuple[I64, I64]:  # noqa: ARG002
         """Return node row and column (B,) of every block of the system."""
-        return node_blocks(self.pair_row, self.pair_col)
+        return node_blocks(self.plan.rows, self.plan.cols)
 
-    def node_system(self, states: States, damping: float) -> NodeSystem:
-        """Eliminate the landmarks and return what is left, by node."""
-        system = self.linearize(states.T_G_I, states.p_G, damping)
+    def node_system(self, states: States, damping: float, values: F64) -> NodeSystem:
+        """Eliminate the landmarks; what is left goes, by node, to values (B, 3, 3) and the result."""
+        system = self.linearize(states.T_G_I, states.p_G, damping, values)
         gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))
         pose_part(gradient, states)[:] = system.gradient
         pose_part(diagonal, states)[:] = system.diagonal
-        values = split_blocks(system.blocks, self._is_diagonal)
-        return NodeSystem(values, gradient, diagonal, system.cost)
+        return NodeSystem(gradient, diagonal, system.cost)
 
     def take_step(
         self, states: States, step: F64, moved: States, damping: float
@@ -152,10 +146,14 @@ class VisualTerms:
 
     def cost(self, states: States) -> float:
         """Return half the sum of rho at some states, without forming any equations."""
+        return self.cost_of_errors(self.errors(states)[0], states)
+
+    def cost_of_errors(self, error_px: F64, states: States) -> float:
+        """Return the cost at some states for the reprojection errors (O,) that they have."""
         data = self.observations
         used = data.inverse_sigma > 0.0
-        squared = np.square(self.errors(states)[0][used] * data.inverse_sigma[used])
-        scale2 = data.loss_scale[used] ** 2
+        squared = np.square(error_px[used] * data.inverse_sigma[used])
+        scale2 = data.scale2[used]
         total = float(np.sum(robust(Loss(self._loss), scale2, squared)[0]))
         off = (states.p_G - self._prior[:, :3]) * self._prior[:, 3:]
         return 0.5 * (total + float(np.sum(off * off)))
@@ -174,17 +172,23 @@ class VisualTerms:
         """Exchange weights and losses; the structure must be the same."""
         self.observations = observations
 
-    def linearize(self, T_G_I: F64, p_G: F64, damping: float) -> VisualSystem:
-        """Eliminate the landmarks at the given states. The arrays are reused by the next call."""
-        cost = np.empty(self.num_chunks)
+    def linearize(
+        self, T_G_I: F64, p_G: F64, damping: float, values: F64 | None = None
+    ) -> VisualSystem:
+        """Eliminate the landmarks at the given states, into values (4 B, 3, 3) if given.
+
+        Gradient and diagonal are reused by the next call.
+        """
+        if values is None:
+            values = np.empty((4 * len(self.plan.cols), 3, 3))
+        cost, blocks = np.empty(self.num_chunks), values.reshape(-1, 6, 6)
         self._kernels.eliminate(
             *self._measured(), T_G_I, self._cameras.T_I_C, self._cameras.parameters, p_G,
-            self._prior, self._pair_start, self._pair_block, self._diagonal_block, damping, self._move_points,
-            self._chunk_start, self._blocks, self._gradient, self._diagonal, cost,
+            self._prior, self.plan, damping, self._move_points, self._Y, self._square,
+            self._gradient, self._diagonal, cost, blocks,
         )  # fmt: skip
-        return VisualSystem(
-            self._blocks[0], self._gradient[0], self._diagonal[0], 0.5 * float(cost[0])
-        )
+        self._kernels.cut_blocks(self.plan, blocks, values)
+        return VisualSystem(values, self._gradient[0], self._diagonal[0], 0.5 * float(cost[0]))
 
     def step(
         self, T_G_I: F64, p_G: F64, pose_step: F64, new_T_G_I: F64, damping: float
@@ -193,7 +197,7 @@ class VisualTerms:
         new_p_G, sums = np.empty_like(p_G), np.zeros((self.num_chunks, 2))
         self._kernels.substitute(
             *self._measured(), T_G_I, self._cameras.T_I_C, self._cameras.parameters, p_G,
-            self._prior, np.ascontiguousarray(pose_step), damping, self._move_points, self._chunk_start,
+            self._prior, np.ascontiguousarray(pose_step), damping, self._move_points, self.plan.step_start,
             new_T_G_I, new_p_G, sums,
         )  # fmt: skip
         return new_p_G, 0.5 * float(sums[0, 0]), 0.5 * float(sums[0, 1])
@@ -210,24 +214,15 @@ class VisualTerms:
 
     def _measured(self) -> tuple[object, ...]:
         data = self.observations
-        scale2 = data.loss_scale * data.loss_scale
         return (
             data.start,
             data.vertex,
             data.camera,
             data.uv_px,
             data.inverse_sigma,
-            scale2,
+            data.scale2,
             self._loss,
         )
-
-
-def _balanced_chunks(counts: I64, num_chunks: int) -> I64:
-    """Cut the landmarks into chunks of about equal work."""
-    work = np.concatenate([[0.0], np.cumsum(counts * (counts + 8.0))])
-    chunks = np.searchsorted(work, np.linspace(0.0, work[-1], num_chunks + 1))
-    chunks[0], chunks[-1] = 0, len(counts)
-    return chunks.astype(np.int64)
 
 
 def node_blocks(rows: I64, cols: I64) -> tuple[I64, I64]:
@@ -239,13 +234,6 @@ def node_blocks(rows: I64, cols: I64) -> tuple[I64, I64]:
     node_row = NODES_PER_VERTEX * rows[:, None] + np.array([0, 0, 1, 1])
     node_col = NODES_PER_VERTEX * cols[:, None] + np.array([0, 1, 0, 1])
     return np.maximum(node_row, node_col).reshape(-1), np.minimum(node_row, node_col).reshape(-1)
-
-
-def split_blocks(blocks: F64, is_diagonal: NDArray[np.bool_]) -> F64:
-    """Cut pose blocks (B, 6, 6) into 3 x 3 parts (4 B, 3, 3) in the order of `node_blocks`."""
-    parts = blocks.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4).copy()
-    parts[is_diagonal, 0, 1] = 0.0
-    return parts.reshape(-1, 3, 3)
 
 
 def pose_part(by_node: F64, states: States) -> F64:

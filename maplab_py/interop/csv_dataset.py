@@ -16,8 +16,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.interop.text_table import check_writable, format_rows, write_text
+from maplab_py.interop.text_table import format_rows
 from maplab_py.options import option
+from maplab_py.output_files import check_writable, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.vimap import VIMap, ids

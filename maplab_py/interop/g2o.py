@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.text_table import format_rows, write_text
+from maplab_py.interop.text_table import format_rows
+from maplab_py.output_files import write_text
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

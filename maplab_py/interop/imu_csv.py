@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
-from maplab_py.interop.text_table import format_rows, read_text_table, write_text
+from maplab_py.interop.text_table import format_rows, read_text_table
+from maplab_py.output_files import write_text
 
 _HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"

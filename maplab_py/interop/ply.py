@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError
+from maplab_py.output_files import write_bytes
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -184,7 +185,5 @@ def write_ply(cloud: PlyCloud, path: Path) -> None:
     kinds = {"<f4": "float", "u1": "uchar"}
     lines = [f"property {kinds[kind]} {name}" for name, kind in fields]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *lines]
-    try:
-        path.write_bytes(("\n".join([*head, "end_header"]) + "\n").encode() + table.tobytes())
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from None
+    header = ("\n".join([*head, "end_header"]) + "\n").encode()
+    write_bytes(path, [header, table.tobytes()], overwrite=True)

@@ -7,11 +7,9 @@ Time stamps are parsed from their digits, never through a float: 19-digit nanose
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
-import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -98,53 +96,10 @@ def format_rows(row_format: str, columns: Sequence[NDArray[Any] | list[Any]]) ->
         yield (line * len(lists[0])) % tuple(values)
 
 
-def write_text(path: Path, chunks: Iterable[str], *, overwrite: bool = False) -> None:
-    """Write a text file at once: it is either there completely or not at all.
-
-    Raises:
-        UserError: The file exists and `overwrite` is not set, or it cannot be written.
-    """
-    check_writable(path, overwrite=overwrite)
-    temporary = ""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as stream:
-            stream.writelines(chunks)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-        temporary = ""
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
-
-
-def check_writable(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that exists.
-
-    Raises:
-        UserError: The file exists and `overwrite` is not set, or it is a folder.
-    """
-    if path.is_dir():
-        raise UserError(f"{path} is a folder: name a file")
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists already: give --overwrite to replace it")
-
-
 def seconds_text(times_ns: I64) -> tuple[I64, I64]:
     """Return whole seconds and nanoseconds, for the format `%d.%09d` of times that are >= 0."""
     seconds, rest = np.divmod(times_ns, 1_000_000_000)
     return seconds, rest
-
-
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current
 
 
 def _data_lines(text: str) -> tuple[list[str], list[int], tuple[str, ...]]:

@@ -18,8 +18,8 @@ from maplab_py.interop.text_table import (
     format_rows,
     read_text_table,
     seconds_text,
-    write_text,
 )
+from maplab_py.output_files import write_text
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

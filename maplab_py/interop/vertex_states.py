@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_vectors, slerp
-from maplab_py.interop.text_table import format_rows, write_text
+from maplab_py.interop.text_table import format_rows
 from maplab_py.interop.trajectories import Trajectory, write_tum
+from maplab_py.output_files import write_text
 from maplab_py.vimap import VIMap, ids
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import MissionSensor

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
+from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
 
@@ -72,8 +73,7 @@ def check_plot_file(path: Path, *, overwrite: bool) -> None:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise UserError(f"--plot_file={path}: the name must end in {', '.join(SUFFIXES)}")
-    if path.exists() and not overwrite:
-        raise UserError(f"--plot_file={path} exists; give --overwrite or another name")
+    check_writable(path, overwrite=overwrite)
 
 
 def write_figure(figure: Figure, path: Path) -> None:
@@ -86,8 +86,4 @@ def write_figure(figure: Figure, path: Path) -> None:
     suffix = path.suffix.lower()
     content = io.BytesIO()
     figure.savefig(content, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.getvalue())
-    except OSError as error:
-        raise UserError(f"--plot_file={path}: cannot be written: {error.strerror}") from None
+    write_bytes(path, [content.getvalue()], overwrite=True)

@@ -16,8 +16,8 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import ImuRecording as ImuFile
 from maplab_py.interop.imu_csv import write_imu_csv
-from maplab_py.interop.text_table import write_text
 from maplab_py.interop.trajectories import Trajectory, write_euroc
+from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.simulation.imaging import Imager

@@ -10,15 +10,14 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import hashlib
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError
+from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage import maplab_map_pb2 as pb
@@ -60,6 +59,11 @@ def summary_map_file(path: Path) -> Path | None:
     return inside if inside.is_file() else None
 
 
+def summary_map_bytes(summary: SummaryMap) -> bytes:
+    """Return the content of the file; the same summary gives the same bytes."""
+    return gzip.compress(_message(summary).SerializeToString(), _GZIP_LEVEL, mtime=0)
+
+
 def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = False) -> Path:
     """Write `localization_summary_map` into a folder; it is there completely or not at all.
 
@@ -67,25 +71,8 @@ def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = Fa
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
     path = folder / FILE_NAME
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists: give --overwrite to replace it")
-    data = gzip.compress(_message(summary).SerializeToString(), _GZIP_LEVEL, mtime=0)
-    temporary = ""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{FILE_NAME}.", dir=folder)
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-        temporary = ""
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
+    check_writable(path, overwrite=overwrite)
+    write_bytes(path, [summary_map_bytes(summary)], overwrite=overwrite)
     return path
 
 

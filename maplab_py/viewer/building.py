@@ -11,7 +11,7 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_drawing
 from maplab_py.viewer.extension import plugin_layers
-from maplab_py.viewer.layers import cameras, clouds, landmarks, paths, references
+from maplab_py.viewer.layers import cameras, closures, clouds, landmarks, paths, references
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
@@ -86,11 +86,13 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
         layers += references.ground_truth(drawing, subject.truth)
     if subject.other is not None:
         layers += references.compared(drawing, subject.other, side_by_side=subject.side_by_side)
+    remembered, unreadable = closures.recorded_closures(drawing)
+    layers += remembered
     added, problems = plugin_layers(drawing, {layer.name for layer in layers})
     layers += added
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
     extent = drawing.extent
-    notes = _notes(layers) + problems
+    notes = _notes(layers) + unreadable + problems
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
         notes.insert(0, f"in grey: {subject.other_name}")

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
+from maplab_py.algorithms.loop_closure.listing import describe_closure
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.viewer.scene import Entity
@@ -28,6 +29,8 @@ def facts(vi_map: VIMap, entity: Entity, row: int) -> Facts:
         return landmark_facts(vi_map, row)
     if entity is Entity.LOOP_CLOSURE:
         return loop_closure_facts(vi_map, row)
+    if entity is Entity.CLOSURE:
+        return closure_facts(vi_map, row)
     return ()
 
 
@@ -98,6 +101,26 @@ def loop_closure_facts(vi_map: VIMap, row: int) -> Facts:
         ("correction", f"{np.linalg.norm(wrong[:3]):.3f} m"),
         ("correction of heading", f"{np.degrees(np.linalg.norm(wrong[3:])):.2f} deg"),
         ("inliers", f"{common} landmarks in common"),
+    )
+
+
+def closure_facts(vi_map: VIMap, row: int) -> Facts:
+    """Return what the map remembers of a closure, as lc_report lists it."""
+    line = describe_closure(vi_map, row)
+    return (
+        ("closure", line.id),
+        ("verdict", line.verdict),
+        ("served for", line.use or "nothing"),
+        ("query", f"mission {line.query} at {line.query_s:.2f} s"),
+        ("target", f"mission {line.place} at {line.place_s:.2f} s"),
+        ("matches", str(line.matches)),
+        ("inliers", f"{line.inliers} ({100.0 * line.ratio:.0f} %)"),
+        ("correction when found", f"{line.correction_m:.3f} m, {line.correction_deg:.2f} deg"),
+        ("gap now", f"{line.gap_m:.3f} m, {line.gap_deg:.2f} deg"),
+        ("tilt", f"{line.tilt_deg:.2f} deg"),
+        ("agreeing neighbours", str(line.support)),
+        ("landmarks merged", str(line.merged)),
+        ("weight", f"{line.weight:.3f}"),
     )
 
 

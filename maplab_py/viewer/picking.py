@@ -19,6 +19,7 @@ _BONUS_RAD = {
     Entity.VERTEX: 0.4 * _CONE_RAD,
     Entity.LANDMARK: 0.1 * _CONE_RAD,
     Entity.LOOP_CLOSURE: 0.0,
+    Entity.CLOSURE: 0.0,
 }
 """Vertices are few and large and win against what is beside them, as do points against lines."""
 

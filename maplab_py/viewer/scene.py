@@ -28,7 +28,8 @@ class Entity(Enum):
     NONE = "none"
     VERTEX = "vertex"
     LANDMARK = "landmark"
-    LOOP_CLOSURE = "loop closure"
+    LOOP_CLOSURE = "loop closure"  # an edge of the map
+    CLOSURE = "closure"  # one that the map remembers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -97,6 +97,6 @@ def _check_disjoint(base: VIMap, other: VIMap) -> None:
         if len(clash):
             raise MapError(
                 f"{noun} {to_hex(theirs[clash[0]])} is in both maps ({len(clash)} equal {noun} "
-                "ids): use --assign_new_ids to keep both, or append a submap with "
-                "load_merge_submap"
+                "ids): use --assign_new_ids to keep both, or, if these are pieces of "
+                "one mission, load_merge_submap or load_merge_all_submaps"
             )

@@ -1,8 +1,10 @@
 """Absolute pose of a camera rig from matches of keypoints with points, many queries at once.
 
 Two matches and the direction of gravity give yaw and position (a quadratic), so that few random
-samples suffice even among many wrong matches; every better hypothesis is refined with all six
-degrees of freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
+samples suffice even among many wrong matches; where gravity is not known, three matches give the
+whole pose (P3P, and generalised P3P where a rig's cameras have several centres). Every better
+hypothesis is refined with all six degrees of freedom (MSAC with local optimisation: Torr and
+Zisserman 2000, Chum et al. 2003).
 """
 
 from __future__ import annotations
@@ -16,6 +18,9 @@ from maplab_py.geometry import se3, so3
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+SAMPLE_SIZES = {"gravity": 2, "three_point": 3}
+"""Ways to make hypotheses, and how many matches each takes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,6 +59,7 @@ def solve_poses(
     seed: int = 0,
     max_iterations: int = 200,
     tilt_sigma_rad: float = 0.02,
+    hypotheses: str = "gravity",
 ) -> PoseSolutions:
     """Find the pose of every query. Deterministic in the seed, for any thread count.
 
@@ -62,6 +68,8 @@ def solve_poses(
         seed: Seed of the random samples.
         max_iterations: Most samples per query; fewer are drawn when inliers abound.
         tilt_sigma_rad: Standard deviation of the given roll and pitch.
+        hypotheses: One of SAMPLE_SIZES: "gravity", or "three_point", which makes no use of the
+            given attitude: it only tells the tilt.
     """
     from maplab_py.vision.pose_kernels import search_poses
 
@@ -70,13 +78,14 @@ def solve_poses(
     q_W_I = problems.q_M_I  # W: the frame of the attitude, with its origin at the body
     origin_W = so3.rotate(q_W_I[of_match], problems.origin_I)
     ray_W = so3.rotate(q_W_I[of_match], problems.ray_I)
-    R, t, H = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 6, 6))
+    R, t, H = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.empty((count, 6, 6))
     cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
     is_inlier = np.zeros(matches, dtype=np.bool_)
+    inverse_tilt = 1.0 / tilt_sigma_rad if hypotheses == "gravity" else 0.0
     search_poses(
         problems.start, _mixed_seeds(problems.key, seed), origin_W, ray_W,
         np.ascontiguousarray(problems.point_M), problems.keypoint, 1.0 / problems.tolerance,
-        max_iterations, 1.0 / tilt_sigma_rad, R, t, H, cost, inliers,
+        max_iterations, inverse_tilt, SAMPLE_SIZES[hypotheses], R, t, H, cost, inliers,
         np.empty(count, dtype=np.int64), is_inlier,
     )  # fmt: skip
     is_first = np.ones(matches, dtype=np.bool_)

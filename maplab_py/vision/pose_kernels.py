@@ -1,8 +1,8 @@
-"""Compiled kernels of the absolute pose search: two-point hypotheses, scoring, refinement.
+"""Compiled kernels of the absolute pose search: hypotheses, scoring, refinement.
 
 W is the query's body frame turned so that its z axis points up; M is the gravity-aligned frame of
-the points. Hypotheses are yaw and position of T_M_W; the refinement frees roll and pitch, held by
-a prior.
+the points. Hypotheses are T_M_W: from two matches yaw and position, from three matches all of it.
+The refinement frees roll and pitch, held by a prior.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from maplab_py.vision.jit import compiled, prange
 
 _MIN_DEPTH_M = 0.05
 _CONFIDENCE = 0.999
+_MOST_ROOT_STEPS = 40
+_FIRST, _SECOND = (0, 0, 1), (1, 2, 2)  # points of the pairs 01, 02, 12
 _LOOSE = 3.0
 """Hypotheses are scored with as many times the tolerance: their tilt is only as good as given."""
 
@@ -67,6 +69,185 @@ def _two_point(o1, f1, X1, o2, f2, X2, yaw, position):  # type: ignore[no-untype
         position[count, 2] = X1[2] - (o1[2] + depth1 * f1[2])
         count += 1
     return count
+
+
+@compiled()
+def _pair_equations(o, f, X, scale, cosine, near, far, offset):  # type: ignore[no-untyped-def]
+    """Fill in, for the pairs 01, 02, 12, what says that two points keep their distance.
+
+    With depths d it is d_i^2 + d_j^2 - 2 cosine d_i d_j + 2 near d_i - 2 far d_j + offset = 0,
+    lengths in units of `scale`.
+    """
+    for pair in range(3):
+        i, j = _FIRST[pair], _SECOND[pair]
+        w, D = (o[i] - o[j]) / scale, (X[i] - X[j]) / scale
+        cosine[pair] = f[i] @ f[j]
+        near[pair], far[pair] = w @ f[i], w @ f[j]
+        offset[pair] = w @ w - D @ D
+
+
+@compiled(inline="always")
+def _pair_error(pair, a, b, cosine, near, far, offset):  # type: ignore[no-untyped-def]
+    lever = 2.0 * (near[pair] * a - far[pair] * b)
+    return a * a + b * b - 2.0 * cosine[pair] * a * b + lever + offset[pair]
+
+
+@compiled()
+def _eliminant(d, cosine, near, far, offset):  # type: ignore[no-untyped-def]
+    """Return the product of the third equation over the branches that depth d of point 0 leaves.
+
+    The first two equations give two depths of points 1 and 2 each; the product over the four
+    combinations is a polynomial of degree 8 in d (its roots are the solutions).
+    """
+    product = 1.0 + 0.0j
+    m1, m2 = cosine[0] * d + far[0], cosine[1] * d + far[1]
+    root1 = np.sqrt(m1 * m1 - (d * d + 2.0 * near[0] * d + offset[0]))
+    root2 = np.sqrt(m2 * m2 - (d * d + 2.0 * near[1] * d + offset[1]))
+    for a in (m1 - root1, m1 + root1):
+        for b in (m2 - root2, m2 + root2):
+            product *= _pair_error(2, a, b, cosine, near, far, offset)
+    return product
+
+
+@compiled()
+def _polynomial_roots(coefficient, root):  # type: ignore[no-untyped-def]
+    """Fill in all roots of a polynomial, lowest coefficient first (Aberth, Math. Comp. 1973)."""
+    degree = len(coefficient) - 1
+    bound = 0.0
+    for k in range(degree):
+        share = abs(coefficient[k] / coefficient[degree])
+        bound = max(bound, share ** (1.0 / (degree - k)))
+    for k in range(degree):
+        angle = 2.0 * np.pi * k / degree + 0.4
+        root[k] = bound * (np.cos(angle) + 1j * np.sin(angle))
+    for _ in range(_MOST_ROOT_STEPS):
+        largest = 0.0
+        for k in range(degree):
+            z = root[k]
+            value, slope = coefficient[degree] + 0.0j, 0.0j
+            for c in range(degree - 1, -1, -1):
+                slope = slope * z + value
+                value = value * z + coefficient[c]
+            if value == 0.0 or slope == 0.0:
+                continue
+            push = 0.0j
+            for other in range(degree):
+                if other != k and root[other] != z:
+                    push += 1.0 / (z - root[other])
+            newton = value / slope
+            step = newton / (1.0 - newton * push)
+            root[k] = z - step
+            largest = max(largest, abs(step) / (1.0 + abs(z)))
+        if largest < 1e-11:
+            break
+
+
+@compiled()
+def _polish_depths(d, cosine, near, far, offset):  # type: ignore[no-untyped-def]
+    """Newton on the three equations, in place; return whether they hold afterwards."""
+    e, J = np.empty(3), np.zeros((3, 3))
+    for step in range(8):
+        for pair in range(3):
+            i, j = _FIRST[pair], _SECOND[pair]
+            e[pair] = _pair_error(pair, d[i], d[j], cosine, near, far, offset)
+            J[pair] = 0.0
+            J[pair, i] = 2.0 * (d[i] - cosine[pair] * d[j] + near[pair])
+            J[pair, j] = 2.0 * (d[j] - cosine[pair] * d[i] - far[pair])
+        if np.abs(e).max() < 1e-12:
+            return True
+        if step == 7 or abs(np.linalg.det(J)) < 1e-14:
+            break
+        d -= np.linalg.solve(J, e)
+    return np.abs(e).max() < 1e-8
+
+
+@compiled(inline="always")
+def _triad(p, axes):  # type: ignore[no-untyped-def]
+    """Fill in the orthonormal axes (columns) that three points span; return whether they do."""
+    u, v = p[1] - p[0], p[2] - p[0]
+    w = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    length, area = np.sqrt(u @ u), np.sqrt(w @ w)
+    if length < 1e-9 or area < 1e-4 * length * np.sqrt(v @ v):
+        return False
+    u, w = u / length, w / area
+    axes[:, 0], axes[:, 2] = u, w
+    axes[0, 1] = w[1] * u[2] - w[2] * u[1]
+    axes[1, 1] = w[2] * u[0] - w[0] * u[2]
+    axes[2, 1] = w[0] * u[1] - w[1] * u[0]
+    return True
+
+
+@compiled()
+def three_point(o, f, X, R, t):  # type: ignore[no-untyped-def]
+    """Fill in up to eight poses R (8, 3, 3), t (8, 3) with R (o_i + depth_i f_i) + t = X_i.
+
+    P3P for rays from one centre, generalised P3P for rays from several. Depths follow from the
+    distances between the points: two of them are eliminated (Nister and Stewenius, JMIV 2007), the
+    polynomial of the third is interpolated from its values on the unit circle. With one centre
+    only even powers occur, and half the degree does.
+
+    Returns:
+        How many there are.
+    """
+    axes_X, axes_W, p = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    if not _triad(X, axes_X):
+        return 0
+    reach = np.empty(3)  # depths at which rays are as far apart as points
+    for pair in range(3):
+        i, j = _FIRST[pair], _SECOND[pair]
+        D, g = X[i] - X[j], f[i] - f[j]
+        reach[pair] = np.sqrt(D @ D) / max(np.sqrt(g @ g), 1e-6)
+    scale = np.median(reach)
+    cosine, near, far, offset = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    _pair_equations(o, f, X, scale, cosine, near, far, offset)
+    is_central = max(np.abs(near).max(), np.abs(far).max()) < 1e-12
+    degree = 4 if is_central else 8
+    values = np.empty(degree + 1, dtype=np.complex128)
+    turns = np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))
+    for k in range(degree + 1):
+        d = np.sqrt(turns[k]) if is_central else turns[k]
+        values[k] = _eliminant(d, cosine, near, far, offset)
+    coefficient = np.empty(degree + 1)
+    for c in range(degree + 1):
+        coefficient[c] = np.mean(values * np.conj(turns) ** c).real
+    if abs(coefficient[degree]) <= 1e-13 * np.abs(coefficient).max():
+        return 0
+    root = np.empty(degree, dtype=np.complex128)
+    _polynomial_roots(coefficient, root)
+    depth = np.empty(3)
+    count = 0
+    for k in range(degree):
+        z = np.sqrt(root[k]) if is_central else root[k]
+        if z.real <= 0.0 or abs(z.imag) > 1e-2 * z.real:
+            continue
+        _other_depths(z.real, cosine, near, far, offset, depth)
+        if not _polish_depths(depth, cosine, near, far, offset):
+            continue
+        if depth.min() * scale < _MIN_DEPTH_M:
+            continue
+        for i in range(3):
+            p[i] = o[i] + scale * depth[i] * f[i]
+        if not _triad(p, axes_W):
+            continue
+        R[count] = axes_X @ np.ascontiguousarray(axes_W.T)
+        t[count] = X[0] - R[count] @ p[0]
+        count += 1
+    return count
+
+
+@compiled()
+def _other_depths(d, cosine, near, far, offset, depth):  # type: ignore[no-untyped-def]
+    """Fill in the branch of the other two depths that fulfils the third equation best."""
+    m1, m2 = cosine[0] * d + far[0], cosine[1] * d + far[1]
+    root1 = np.sqrt(max(m1 * m1 - (d * d + 2.0 * near[0] * d + offset[0]), 0.0))
+    root2 = np.sqrt(max(m2 * m2 - (d * d + 2.0 * near[1] * d + offset[1]), 0.0))
+    best = np.inf
+    for a in (m1 - root1, m1 + root1):
+        for b in (m2 - root2, m2 + root2):
+            error = abs(_pair_error(2, a, b, cosine, near, far, offset))
+            if error < best:
+                best = error
+                depth[0], depth[1], depth[2] = d, a, b
 
 
 @compiled()
@@ -226,70 +407,93 @@ def _polish(  # type: ignore[no-untyped-def]
     return cost, inliers
 
 
+@compiled()
+def _draw(state, sample_size, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
+    """Fill in the poses of a random sample of matches; return how many there are."""
+    sample = np.empty(sample_size, dtype=np.int64)
+    for i in range(sample_size):
+        sample[i] = np.int64(_next_random(state) % np.uint64(len(k)))
+        for other in sample[:i]:
+            if k[other] == k[sample[i]]:
+                return 0
+    if sample_size == 3:
+        return three_point(o[sample], f[sample], X[sample], R, t)
+    a, b = sample
+    yaw = np.empty(2)
+    count = _two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, t)
+    for s in range(count):
+        cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
+        R[s] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return count
+
+
+@compiled()
+def _search_pose(  # type: ignore[no-untyped-def]
+    seed, o, f, X, k, w, max_iterations, inverse_tilt, sample_size, best_R, best_t, H, best_used
+):
+    """Search one pose; fill in its rotation, position, information and inliers.
+
+    Returns:
+        Cost, inlying keypoints and samples drawn.
+    """
+    count = len(k)
+    keypoints = 0
+    for i in range(count):
+        if i == 0 or k[i] != k[i - 1]:
+            keypoints += 1
+    state = np.array([seed], dtype=np.uint64)
+    used = np.zeros(count, dtype=np.bool_)
+    best_cost, best_inliers = float(keypoints), 0
+    best_loose = best_cost
+    w_loose = w / _LOOSE
+    R_guess, t_guess = np.empty((8, 3, 3)), np.empty((8, 3))
+    R, t = np.empty((3, 3)), np.empty(3)
+    needed, done = max_iterations, 0
+    while done < needed and keypoints >= 3:
+        done += 1
+        for s in range(_draw(state, sample_size, k, o, f, X, R_guess, t_guess)):
+            R[:], t[:] = R_guess[s], t_guess[s]
+            cost, inliers = _score(R, t, 0, count, o, f, X, k, w_loose, used)
+            if cost >= best_loose or inliers < 3:
+                continue
+            best_loose = cost
+            if not _refine(R, t, 0, count, o, f, X, w_loose, used, inverse_tilt, 3, H):
+                continue
+            cost, inliers = _polish(R, t, 0, count, o, f, X, k, w, used, inverse_tilt, 2)
+            if cost >= best_cost:
+                continue
+            best_cost, best_inliers = cost, inliers
+            best_R[:], best_t[:] = R, t
+            best_used[:] = used
+            miss = 1.0 - (inliers / count) ** sample_size
+            if miss < 1e-9:
+                needed = done
+            else:
+                wanted = np.log(1.0 - _CONFIDENCE) / np.log(miss)
+                needed = min(max_iterations, max(int(wanted) + 1, 10))
+    H[:] = 0.0
+    if best_inliers >= 3:
+        best_cost, best_inliers = _polish(
+            best_R, best_t, 0, count, o, f, X, k, w, best_used, inverse_tilt, 10
+        )
+        g = np.empty(6)
+        _accumulate(best_R, best_t, 0, count, o, f, X, w, best_used, inverse_tilt, H, g)
+    return best_cost, best_inliers, done
+
+
 @compiled(parallel=True)
 def search_poses(  # type: ignore[no-untyped-def]
     start, seeds, origin, ray, point, keypoint, inverse_sigma, max_iterations, inverse_tilt,
-    R_out, t_out, H_out, cost_out, inliers_out, iterations_out, is_inlier,
+    sample_size, R, t, H, cost, inliers, iterations, is_inlier,
 ):  # fmt: skip
-    """Search the pose of every problem; matches of one problem are consecutive, sorted by keypoint."""
-    for problem in prange(len(start) - 1):
-        begin, end = start[problem], start[problem + 1]
-        count = end - begin
-        keypoints = 0
-        for i in range(begin, end):
-            if i == begin or keypoint[i] != keypoint[i - 1]:
-                keypoints += 1
-        state = np.array([seeds[problem]], dtype=np.uint64)
-        o, f, X = origin[begin:end], ray[begin:end], point[begin:end]
-        k, w = keypoint[begin:end], inverse_sigma[begin:end]
-        used = np.zeros(count, dtype=np.bool_)
-        best_used = np.zeros(count, dtype=np.bool_)
-        best_R, best_t = np.eye(3), np.zeros(3)
-        best_cost, best_inliers = float(keypoints), 0
-        best_loose = best_cost
-        w_loose = w / _LOOSE
-        H = np.zeros((6, 6))
-        yaw, position = np.empty(2), np.empty((2, 3))
-        R, t = np.empty((3, 3)), np.empty(3)
-        needed = max_iterations
-        done = 0
-        while done < needed and keypoints >= 3:
-            done += 1
-            a = np.int64(_next_random(state) % np.uint64(count))
-            b = np.int64(_next_random(state) % np.uint64(count))
-            if k[a] == k[b]:
-                continue
-            for s in range(_two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, position)):
-                cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
-                R[:] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-                t[:] = position[s]
-                cost, inliers = _score(R, t, 0, count, o, f, X, k, w_loose, used)
-                if cost >= best_loose or inliers < 3:
-                    continue
-                best_loose = cost
-                if not _refine(R, t, 0, count, o, f, X, w_loose, used, inverse_tilt, 3, H):
-                    continue
-                cost, inliers = _polish(R, t, 0, count, o, f, X, k, w, used, inverse_tilt, 2)
-                if cost >= best_cost:
-                    continue
-                best_cost, best_inliers = cost, inliers
-                best_R[:], best_t[:] = R, t
-                best_used[:] = used
-                share = inliers / count
-                miss = 1.0 - share * share
-                if miss < 1e-9:
-                    needed = done
-                else:
-                    wanted = np.log(1.0 - _CONFIDENCE) / np.log(miss)
-                    needed = min(max_iterations, max(int(wanted) + 1, 10))
-        H[:] = 0.0
-        if best_inliers >= 3:
-            best_cost, best_inliers = _polish(
-                best_R, best_t, 0, count, o, f, X, k, w, best_used, inverse_tilt, 10
-            )
-            g = np.empty(6)
-            _accumulate(best_R, best_t, 0, count, o, f, X, w, best_used, inverse_tilt, H, g)
-        R_out[problem], t_out[problem], H_out[problem] = best_R, best_t, H
-        cost_out[problem], inliers_out[problem] = best_cost, best_inliers
-        iterations_out[problem] = done
-        is_inlier[begin:end] = best_used
+    """Search the pose of every problem; matches of one problem are consecutive, sorted by keypoint.
+
+    Samples are of two matches (and gravity) or of three.
+    """
+    for i in prange(len(start) - 1):
+        begin, end = start[i], start[i + 1]
+        cost[i], inliers[i], iterations[i] = _search_pose(
+            seeds[i], origin[begin:end], ray[begin:end], point[begin:end], keypoint[begin:end],
+            inverse_sigma[begin:end], max_iterations, inverse_tilt, sample_size,
+            R[i], t[i], H[i], is_inlier[begin:end],
+        )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.errors import UserError
+from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.vision.projection import DescriptorProjection
 
 
@@ -19,17 +20,10 @@ def save_projection(
     Raises:
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists: give --overwrite to replace it")
+    check_writable(path, overwrite=overwrite)
     content = io.BytesIO()
     np.savez(content, matrix=projection.matrix)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.part")
-        temporary.write_bytes(content.getvalue())
-        temporary.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_bytes(path, [content.getvalue()], overwrite=overwrite)
 
 
 def load_projection(path: Path) -> DescriptorProjection:

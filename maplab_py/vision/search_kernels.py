@@ -21,10 +21,11 @@ def _popcount(x):  # type: ignore[no-untyped-def]
 
 
 @compiled(inline="always")
-def _different_bits(a, b):  # type: ignore[no-untyped-def]
+def _different_bits(a, i, b, j):  # type: ignore[no-untyped-def]
+    # indices, as taking rows out would count references: that costs more than the comparison
     bits = np.uint64(0)
-    for w in range(len(a)):
-        bits += _popcount(a[w] ^ b[w])
+    for w in range(a.shape[1]):
+        bits += _popcount(a[i, w] ^ b[j, w])
     return bits
 
 
@@ -32,7 +33,7 @@ def _different_bits(a, b):  # type: ignore[no-untyped-def]
 def bits_between(words_a, rows_a, words_b, rows_b, distance):  # type: ignore[no-untyped-def]
     """Fill in the Hamming distances between rows of two tables."""
     for i in prange(len(rows_a)):
-        distance[i] = _different_bits(words_a[rows_a[i]], words_b[rows_b[i]])
+        distance[i] = _different_bits(words_a, rows_a[i], words_b, rows_b[i])
 
 
 @compiled()
@@ -69,7 +70,7 @@ def search_all(  # type: ignore[no-untyped-def]
     for q in prange(len(q_words)):
         labels = np.full(k, -1, dtype=np.int64)
         for d in range(len(d_words)):
-            value = np.float32(_different_bits(q_words[q], d_words[d]))
+            value = np.float32(_different_bits(q_words, q, d_words, d))
             if value < distance[q, k - 1] and _allowed(
                 q_label[q], q_session[q], q_time[q],
                 d_label[d], d_session[d], d_time[d], min_time, others_only,
@@ -104,10 +105,10 @@ def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type
 
 
 @compiled(inline="always")
-def _squared_distance(a, b):  # type: ignore[no-untyped-def]
+def _squared_distance(a, i, b, j):  # type: ignore[no-untyped-def]
     total = np.float32(0.0)
-    for j in range(len(a)):
-        difference = a[j] - b[j]
+    for k in range(a.shape[1]):
+        difference = a[i, k] - b[j, k]
         total += difference * difference
     return total
 
@@ -139,9 +140,9 @@ def search_cells(  # type: ignore[no-untyped-def]
                 reach += 1
             for d in range(start[cell], start[cell + 1]):
                 if rank_by_bits:
-                    value = np.float32(_different_bits(q_words[q], d_words[d]))
+                    value = np.float32(_different_bits(q_words, q, d_words, d))
                 else:
-                    value = _squared_distance(q_points[q], d_points[d])
+                    value = _squared_distance(q_points, q, d_points, d)
                 if value < distance[q, k - 1] and _allowed(
                     q_label[q], q_session[q], q_time[q],
                     d_label[d], d_session[d], d_time[d], min_time, others_only,

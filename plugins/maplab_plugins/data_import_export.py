@@ -26,7 +26,7 @@ class WrittenFiles(Report):
     rows: int
 
 
-@command("csv_export", example="csv_export --csv_export_path=csv", acts_outside=True)
+@command("csv_export", example="csv_export --csv_export_path=csv", writes_files=True)
 def csv_export(
     context: CommandContext,
     *,
@@ -48,7 +48,7 @@ def csv_export(
 @command(
     "csv_export_vertices_only",
     example="csv_export_vertices_only --csv_export_path=csv",
-    acts_outside=True,
+    writes_files=True,
 )
 def csv_export_vertices_only(
     context: CommandContext,
@@ -93,7 +93,7 @@ def _export_csv(
     "export_trajectory_to_csv",
     "ettc",
     example="ettc --pose_export_file=poses.csv",
-    acts_outside=True,
+    writes_files=True,
 )
 def export_trajectory_to_csv(
     context: CommandContext,
@@ -141,7 +141,7 @@ def export_trajectory_to_csv(
     "export_ncamera_calibration",
     "encc",
     example="encc --ncamera_calibration_export_folder=c",
-    acts_outside=True,
+    writes_files=True,
 )
 def export_ncamera_calibration(
     context: CommandContext,
@@ -155,7 +155,7 @@ def export_ncamera_calibration(
         ncamera_calibration_export_folder: Folder to write into; files are named by sensor id.
         overwrite: Replace files that exist.
     """
-    from maplab_py.interop.text_table import check_writable, write_text
+    from maplab_py.output_files import check_writable, write_text
     from maplab_py.sensors import CameraRig
     from maplab_py.sensors.sensors_yaml import sensor_entry
     from maplab_py.sensors.yaml_text import dump_yaml
@@ -175,7 +175,7 @@ def export_ncamera_calibration(
 @command(
     "export_mission_info",
     example="export_mission_info --mission_info_export_path=info.yaml",
-    acts_outside=True,
+    writes_files=True,
 )
 def export_mission_info(
     context: CommandContext,
@@ -189,7 +189,7 @@ def export_mission_info(
         mission_info_export_path: File to write.
         overwrite: Replace the file if it exists.
     """
-    from maplab_py.interop.text_table import write_text
+    from maplab_py.output_files import write_text
     from maplab_py.sensors.yaml_text import dump_yaml
     from maplab_py.vimap import ids
 

@@ -24,7 +24,7 @@ _OPTIONS = LocalizationOptions()
     "localize",
     example="localize --localization_map=office_summary --localization_csv=poses.csv",
     see_also=("generate_summary_map_and_save_to_disk", "landmark_sparsify"),
-    acts_outside=True,
+    writes_files=True,
 )
 def localize(
     context: CommandContext,
@@ -61,7 +61,7 @@ def localize(
     import json
 
     from maplab_py.algorithms.localization.localization import describe, localize_missions
-    from maplab_py.interop.text_table import check_writable, write_text
+    from maplab_py.output_files import check_writable, write_text
 
     if sequence_length < 1:
         raise UserError(f"--sequence_length={sequence_length}: at least 1")

@@ -109,7 +109,7 @@ def delete_loopclosure_edges(context: CommandContext) -> Message:
     "train_projection_matrix",
     example="train_projection_matrix projection.npz",
     see_also=("loopclosure_all_missions",),
-    acts_outside=True,
+    writes_files=True,
 )
 def train_projection_matrix(
     context: CommandContext,

@@ -63,7 +63,7 @@ def landmark_sparsify(
         dry_run: Only report what would go; the map stays as it is.
     """
     from maplab_py.algorithms.sparsification.sparsify import sparsify
-    from maplab_py.interop.text_table import check_writable, write_text
+    from maplab_py.output_files import check_writable, write_text
     from maplab_py.vimap.ids import to_hex_list
 
     if num_landmarks_to_keep <= 0:

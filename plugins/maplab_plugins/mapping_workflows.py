@@ -26,7 +26,7 @@ _SUMMARY = SummaryMapOptions()
     "clsm",
     example="clsm --summary_map_save_path=office_summary --num_landmarks_to_keep=10000",
     see_also=("generate_summary_map_and_save_to_disk", "localize"),
-    acts_outside=True,
+    writes_files=True,
 )
 def create_localization_summary_map(
     context: CommandContext,

@@ -23,7 +23,7 @@ class Plot(Report):
     "plot_trajectory",
     example="plot_trajectory --plot_file=top.png --overwrite",
     see_also=("plot_errors", "plot_coobservability"),
-    acts_outside=True,
+    writes_files=True,
 )
 def plot_trajectory(
     context: CommandContext,
@@ -62,7 +62,7 @@ def plot_trajectory(
     "plot_errors",
     example="plot_errors --ground_truth=V1_01_easy.csv --plot_file=errors.png",
     see_also=("evaluate_trajectory",),
-    acts_outside=True,
+    writes_files=True,
 )
 def plot_errors(
     context: CommandContext,
@@ -95,7 +95,7 @@ def plot_errors(
     return Plot(plot_file, f"errors over time, RMSE {rmse_m:.4f} m")
 
 
-@command("plot_landmarks", example="plot_landmarks --plot_file=landmarks.png", acts_outside=True)
+@command("plot_landmarks", example="plot_landmarks --plot_file=landmarks.png", writes_files=True)
 def plot_landmarks(
     context: CommandContext,
     *,
@@ -122,7 +122,7 @@ def plot_landmarks(
     "plot_coobservability",
     example="plot_coobservability --plot_file=shared.png",
     see_also=("mission_coobservability_stats",),
-    acts_outside=True,
+    writes_files=True,
 )
 def plot_coobservability(
     context: CommandContext,
@@ -147,7 +147,7 @@ def plot_coobservability(
     "plot_vi_states_of_mission",
     example="plot_vi_states_of_mission --map_mission=59f0 --plot_file=states.png",
     see_also=("export_trajectory_to_csv",),
-    acts_outside=True,
+    writes_files=True,
 )
 def plot_vi_states_of_mission(
     context: CommandContext,

@@ -72,7 +72,7 @@ def import_g2o(context: CommandContext, file: Path, *, map_key: str = "") -> Mes
     "export_g2o",
     example="export_g2o graph.g2o",
     see_also=("import_g2o", "relax"),
-    acts_outside=True,
+    writes_files=True,
 )
 def export_g2o(
     context: CommandContext,

@@ -9,7 +9,7 @@ from maplab_py.algorithms.summary.options import (
     SummaryMapOptions,
     SummaryMapReport,
 )
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
 
 _SUMMARY = SummaryMapOptions()
 
@@ -19,7 +19,7 @@ _SUMMARY = SummaryMapOptions()
     "summary_map",
     example="summary_map --summary_map_save_path=office_summary",
     see_also=("create_localization_summary_map", "landmark_sparsify", "localize"),
-    acts_outside=True,
+    writes_files=True,
 )
 def generate_summary_map_and_save_to_disk(
     context: CommandContext,
@@ -35,20 +35,21 @@ def generate_summary_map_and_save_to_disk(
         overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.summary.summary import make_summary_map
-    from maplab_py.storage.summary_map import FILE_NAME, write_summary_map
+    from maplab_py.storage.summary_map import FILE_NAME, summary_map_bytes
 
     if summary_map_save_path is None:
         raise UserError("no place to write to: give --summary_map_save_path=FOLDER")
-    if (summary_map_save_path / FILE_NAME).exists() and not overwrite:
-        raise UserError(f"{summary_map_save_path / FILE_NAME} exists: give --overwrite")
+    file = summary_map_save_path / FILE_NAME
+    check_writable(file, overwrite=overwrite)
     summary = make_summary_map(context.vi_map, options, progress=context.progress)
-    file = write_summary_map(summary, summary_map_save_path, overwrite=overwrite)
+    data = summary_map_bytes(summary)
+    write_bytes(file, [data], overwrite=overwrite)
     return SummaryMapReport(
         landmarks=len(summary.p_G),
         observations=len(summary.descriptors),
         observers=len(summary.p_G_observer),
         descriptor_dimensions=summary.descriptors.shape[1],
-        megabytes=file.stat().st_size * 1e-6,
+        megabytes=len(data) * 1e-6,
         file=file,
     )
 

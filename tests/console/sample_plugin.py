@@ -20,6 +20,7 @@ from maplab_py.plugin import (
     UserError,
     command,
     option,
+    write_text,
 )
 from maplab_py.vimap import BaseFrames, Missions, VIMap
 
@@ -133,6 +134,15 @@ def find_nothing(context: CommandContext) -> Refusal:
 def echo(context: CommandContext, *words: str) -> Message:
     """Print words."""
     return Message(" ".join(words))
+
+
+@command("keep_words", needs_map=False, writes_files=True)
+def keep_words(
+    context: CommandContext, file: Path, *words: str, overwrite: bool = False
+) -> Message:
+    """Write words to a file."""
+    write_text(file, words, overwrite=overwrite)
+    return Message("kept")
 
 
 @command("destroy", needs_map=False)

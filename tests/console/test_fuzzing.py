@@ -28,7 +28,9 @@ FLAGS = sorted(REGISTRY.all_flags())
 HARMLESS = sorted(
     name
     for name in REGISTRY.names
-    if not REGISTRY.find(name).acts_outside and not REGISTRY.find(name).name.startswith("load")
+    if not REGISTRY.find(name).acts_outside
+    and not REGISTRY.find(name).writes_files
+    and not REGISTRY.find(name).name.startswith("load")
 )
 ODD_TEXT = st.text(
     alphabet=st.characters(codec="utf-8", exclude_characters="|!&$", exclude_categories=["Cs"]),

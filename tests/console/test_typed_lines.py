@@ -27,6 +27,7 @@ Capture = pytest.CaptureFixture[str]
 @pytest.fixture
 def runner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runner:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.chdir(tmp_path)
     terminal = ConsoleTerminal()
     return Runner(Session(make_registry(), terminal), terminal)
 
@@ -143,6 +144,21 @@ def test_a_dry_run_leaves_the_map(runner: Runner, capsys: Capture) -> None:
     assert runner.run_text("destroy --dry_run") == Status.OK
     assert runner.run_text("transcript x --dry_run") == Status.USER_ERROR
     assert not Path("x").exists()
+
+
+def test_a_dry_run_tells_of_files_and_writes_none(runner: Runner, capsys: Capture) -> None:
+    assert runner.run_text("keep_words w.txt ab cd --dry_run") == Status.OK
+    out, err = capsys.readouterr()
+    assert out == "kept\n"
+    assert "would write w.txt (4 bytes)" in err
+    assert not Path("w.txt").exists()
+    assert runner.run_text("keep_words w.txt ab") == Status.OK
+    assert Path("w.txt").read_text() == "ab"
+    assert runner.run_text("keep_words w.txt x --dry_run") == Status.USER_ERROR
+    assert "w.txt exists already" in capsys.readouterr().err
+    assert runner.run_text("keep_words w.txt x --dry_run --overwrite & ; join") == Status.OK
+    assert "would replace w.txt (1 bytes)" in capsys.readouterr().err
+    assert Path("w.txt").read_text() == "ab"
 
 
 def test_errors_are_objects_with_json(capsys: Capture) -> None:

@@ -122,7 +122,7 @@ def test_loop_closures_only(session: Session) -> None:
     edges = session.vi_map.loop_closure_edges.take(np.zeros(2, dtype=bool))
     without = session.vi_map.replace(loop_closure_edges=edges)
     session.maps.update(session.maps.selected.with_value(without, "removing"))
-    with pytest.raises(UserError, match="has no loop closure edges"):
+    with pytest.raises(UserError, match="has no loop closures"):
         session.run("visualize_loop_closures")
 
 

@@ -139,7 +139,9 @@ def try_out(runner: Runner, name: str, line: str, capsys: Capture) -> None:
     capsys.readouterr()
     assert runner.session.maps.state is state
     inside = [path for path in WRITES.paths if _is_below(path, Path.cwd())]
-    assert inside == [], f"{name} writes files: mark it with acts_outside=True"
+    assert inside == [], (
+        f"{name} writes files: write through maplab_py.output_files, or mark it with acts_outside=True"
+    )
 
 
 def undo_and_redo(runner: Runner, before: MapsState) -> None:

@@ -21,6 +21,8 @@ window.requestAnimationFrame = (f) => setTimeout(() => draw(f), 1500);
 """
 """Draws seldom: ten pages that render in software would take all of a small machine."""
 
+_TWO_FRAMES = "() => new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))"
+
 
 @contextmanager
 def chromium() -> Iterator[Any]:
@@ -61,7 +63,7 @@ class Page:
         self.page.goto(url)
         self.page.wait_for_selector("canvas", state="attached")
 
-    def wait_until(self, condition: Any, seconds: float = 30.0) -> bool:
+    def wait_until(self, condition: Any, seconds: float = 60.0) -> bool:
         """Wait until a condition of ours holds, while the page lives on."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -77,6 +79,19 @@ class Page:
 
     def settle(self, milliseconds: int = 900) -> None:
         self.page.wait_for_timeout(milliseconds)
+
+    def still_picture(self, seconds: float = 60.0) -> np.ndarray:
+        """Return the picture (H, W, 3) once it has stopped changing, however slow the machine is."""
+        end = time.monotonic() + seconds
+        same, last = 0, self.picture()
+        while same < 2:
+            assert time.monotonic() < end, "the page does not come to rest"
+            self.page.evaluate(_TWO_FRAMES)
+            self.settle(250)
+            now = self.picture()
+            same = same + 1 if np.array_equal(now, last) else 0
+            last = now
+        return last
 
     def picture(self) -> np.ndarray:
         """Return what is to be seen of the scene (H, W, 3), without panel and messages."""

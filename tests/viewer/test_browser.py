@@ -66,6 +66,7 @@ def shared_page(browser: Any, running: Viewer) -> Iterator[Page]:
 @pytest.fixture
 def page(shared_page: Page, viewer: Viewer) -> Page:
     shared_page.settle(1200)
+    shared_page.still_picture()
     return shared_page
 
 
@@ -79,7 +80,7 @@ def test_the_page_shows_the_map_and_asks_nobody_else(page: Page, viewer: Viewer)
 
 
 def test_checkboxes_toggle_layers(page: Page, viewer: Viewer) -> None:
-    before = page.picture()
+    before = page.still_picture()
     page.checkbox("Landmarks 300").click()
     assert page.wait_until(lambda: "landmarks" not in viewer.visible_layers)
     pale = colours.mixed(colours.MISSIONS[0], colours.REFERENCE, 0.45)
@@ -135,8 +136,7 @@ def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> Non
     slider.focus()
     page.page.keyboard.press("Home")
     assert page.wait_until(lambda: viewer.player is not None and viewer.player.step == 0)
-    page.settle()
-    beginning = colour_count(page.picture(), colours.MISSIONS[0])
+    beginning = colour_count(page.still_picture(), colours.MISSIONS[0])
     for _ in range(12):
         page.page.keyboard.press("ArrowRight")
     assert page.wait_until(lambda: viewer.player is not None and viewer.player.step >= 10)

@@ -45,17 +45,29 @@ def descriptor_set(descriptors: NDArray[np.uint8], label, *, session=0, time_ns=
 
 
 def pose_problems(
-    count: int, matches: int, *, outliers: float, noise_rad: float, tilt_rad: float, seed: int
+    count: int,
+    matches: int,
+    *,
+    outliers: float,
+    noise_rad: float,
+    tilt_rad: float,
+    seed: int,
+    cameras: int = 2,
+    flatness: float = 1.0,
 ) -> tuple[PoseProblems, NDArray[np.float64], NDArray[np.bool_]]:
-    """Return problems of a rig with two cameras, the true poses, and which matches are wrong."""
+    """Return problems of a rig with one or two cameras, the true poses, and which matches are wrong.
+
+    Points lie in a box; with a flatness of 0 they lie in its middle plane, x = 0.
+    """
     rng = np.random.default_rng(seed)
     turn = yaw.quaternion(rng.uniform(-np.pi, np.pi, count))
     q = so3.multiply(turn, so3.exp(rng.normal(scale=0.4, size=(count, 3))))
     T = se3.make(q, rng.normal(scale=3.0, size=(count, 3)))
     problem = np.repeat(np.arange(count), matches)
     total = count * matches
-    point = rng.uniform(-6.0, 6.0, size=(total, 3))
-    origin = np.where(rng.random((total, 1)) < 0.5, [0.1, 0.0, 0.05], [-0.1, 0.02, 0.0])
+    point = rng.uniform(-6.0, 6.0, size=(total, 3)) * [flatness, 1.0, 1.0]
+    is_first = rng.random((total, 1)) < 0.5
+    origin = np.where(is_first | (cameras == 1), [0.1, 0.0, 0.05], [-0.1, 0.02, 0.0])
     ray = se3.transform(se3.inverse(T)[problem], point) - origin
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     ray += rng.normal(scale=noise_rad, size=ray.shape)

@@ -1,7 +1,7 @@
-"""Anchor missions: align all pairs, keep the best tree, fit the base frames to all closures.
+"""Anchor missions: align all pairs, drop contradictions, grow the best tree, fit the base frames.
 
-The result does not depend on the order of missions: all pairs are aligned first, and the tree that
-starts from the known missions takes the pairs with most inliers first.
+The result depends neither on the order of missions nor on which are known: all pairs are aligned
+and compared first, the tree takes those with most inliers first, the fit takes all that fit it.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.anchoring.alignment import Sightings, agreeing, fit_missions
+from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
 from maplab_py.algorithms.anchoring.options import (
     AnchoringOptions,
     AnchoringReport,
     MissionAlignment,
 )
+from maplab_py.algorithms.anchoring.pairs import USED, Pair, align_pairs, consistent, fits
 from maplab_py.algorithms.loop_closure.closing import describe, with_quality
 from maplab_py.algorithms.loop_closure.closures import VERDICTS
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
@@ -33,17 +34,6 @@ I64 = NDArray[np.int64]
 
 _DEFAULT = AnchoringOptions()
 _LOOPS = LoopClosureOptions()
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Pair:
-    """An accepted alignment of two missions."""
-
-    a: int
-    b: int
-    T_B_A: F64  # yaw and position (4,)
-    weight: float
-    sightings: Sightings
 
 
 def anchor_missions(
@@ -84,14 +74,16 @@ def anchor_missions(
         loop_options,
         missions=np.arange(len(known)),
         only_other_missions=True,
-        known_base_frames=False,
+        trust_base_frames=False,
         progress=progress,
     )
-    pairs, alignments = _aligned_pairs(judged, detection, options, names)
-    T_G_M, reached = _spread(yaw.from_pose(vi_map.T_G_M), known, pairs)
-    used = [p.sightings for p in pairs if reached[p.a] and reached[p.b]]
+    pairs = align_pairs(_sightings(judged, detection), _looks_alike(judged, detection), options)
+    pairs = consistent(pairs, options, names)
+    T_G_M, reached, pairs = _spread(yaw.from_pose(vi_map.T_G_M), known, pairs, options)
+    used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
     if used:
         T_G_M = fit_missions(_joined(used), T_G_M, known | ~reached)
+    alignments = [_described(pair, names) for pair in pairs]
     anchored = reached & wanted
     report = AnchoringReport(
         already_known=tuple(names[i] for i in np.flatnonzero(known)),
@@ -126,52 +118,18 @@ def _nothing_to_do(
     )
 
 
-def _aligned_pairs(
-    vi_map: VIMap, detection: Detection, options: AnchoringOptions, names: list[str]
-) -> tuple[list[_Pair], list[MissionAlignment]]:
-    """Align every pair of missions that closures join."""
-    all_ = _sightings(vi_map, detection)
-    unclear = _ambiguous_counts(vi_map, detection)
-    pairs: list[_Pair] = []
-    alignments: list[MissionAlignment] = []
-    for a, b in np.unique(np.stack([all_.mission_A, all_.mission_B], axis=1), axis=0).tolist():
-        between = all_.take((all_.mission_A == a) & (all_.mission_B == b))
-        T_B_A, agree = agreeing(between, options)
-        good = between.take(agree)
-        single = np.array([[0.0, 0.0, 0.0, 0.0], T_B_A])
-        local = dataclasses.replace(
-            good, mission_A=np.ones_like(good.mission_A), mission_B=np.zeros_like(good.mission_B)
-        )
-        T_B_A = fit_missions(local, single, np.array([True, False]))[1]
-        gap = yaw.transform(T_B_A, good.T_A_I[:, 4:]) - good.T_B_I[:, 4:]
-        count, agreed = len(agree), int(np.count_nonzero(agree))
-        verdict = "used"
-        if unclear[a, b] > options.max_ambiguous_ratio * agreed:
-            verdict = (
-                f"{unclear[a, b]} closures with places that look like other places, {agreed} "
-                f"without; more than --anchor_transform_max_ambiguous_ratio="
-                f"{options.max_ambiguous_ratio:g}"
-            )
-        elif agreed < options.min_inlier_count:
-            verdict = f"{agreed} closures agree, {options.min_inlier_count} are wanted"
-        elif agreed < options.min_inlier_ratio * count:
-            verdict = f"only {agreed} of {count} closures agree"
-        else:
-            pairs.append(_Pair(a, b, T_B_A, float(good.weight.sum()), good))
-        alignments.append(
-            MissionAlignment(
-                missions=f"{names[a]} - {names[b]}",
-                closures=count,
-                agreeing=agreed,
-                rms_m=float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))),
-                verdict=verdict,
-            )
-        )
-    return pairs, alignments
+def _described(pair: Pair, names: list[str]) -> MissionAlignment:
+    return MissionAlignment(
+        missions=f"{names[pair.a]} - {names[pair.b]}",
+        closures=pair.closures,
+        agreeing=len(pair.sightings.weight),
+        rms_m=pair.rms_m,
+        verdict=pair.verdict,
+    )
 
 
-def _ambiguous_counts(vi_map: VIMap, detection: Detection) -> I64:
-    """Count closures (M, M) between missions that were refused since places look alike."""
+def _looks_alike(vi_map: VIMap, detection: Detection) -> I64:
+    """Count closures (M, M; upper triangle) that were refused since places look alike."""
     c = detection.closures
     rows = np.flatnonzero(c.verdict == VERDICTS.index(Verdict.AMBIGUOUS))
     ends = np.stack([c.query_vertex[rows], c.place_vertex[rows]])
@@ -201,20 +159,39 @@ def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
 
 
 def _spread(
-    T_G_M: F64, known: NDArray[np.bool_], pairs: list[_Pair]
-) -> tuple[F64, NDArray[np.bool_]]:
-    """Grow a maximum spanning tree from the known missions (Prim); return places and who is reached."""
+    T_G_M: F64, known: NDArray[np.bool_], pairs: list[Pair], options: AnchoringOptions
+) -> tuple[F64, NDArray[np.bool_], list[Pair]]:
+    """Grow a maximum spanning tree from the known missions (Prim).
+
+    Returns:
+        Where the missions are, which are reached, and the pairs: those that contradict the tree
+        over a longer cycle have that as their verdict.
+    """
     T_G_M, reached = T_G_M.copy(), known.copy()
-    ranked = sorted(pairs, key=lambda p: -p.weight)
+    ranked = sorted((p for p in pairs if p.verdict == USED), key=lambda p: -p.weight)
     while True:
         bridge = next((p for p in ranked if reached[p.a] != reached[p.b]), None)
         if bridge is None:
-            return T_G_M, reached
+            break
         if reached[bridge.b]:
             T_G_M[bridge.a] = yaw.compose(T_G_M[bridge.b], bridge.T_B_A)
         else:
             T_G_M[bridge.b] = yaw.compose(T_G_M[bridge.a], yaw.inverse(bridge.T_B_A))
         reached[bridge.a] = reached[bridge.b] = True
+    checked = [_against_tree(p, T_G_M, reached, options) for p in pairs]
+    return T_G_M, reached, checked
+
+
+def _against_tree(
+    pair: Pair, T_G_M: F64, reached: NDArray[np.bool_], options: AnchoringOptions
+) -> Pair:
+    """Refuse a pair that does not fit where the tree put its missions."""
+    if pair.verdict != USED or not (reached[pair.a] and reached[pair.b]):
+        return pair
+    T_B_A = yaw.compose(yaw.inverse(T_G_M[pair.b]), T_G_M[pair.a])
+    if fits(pair, T_B_A, options):
+        return pair
+    return dataclasses.replace(pair, verdict="contradicts stronger alignments")
 
 
 def _joined(parts: list[Sightings]) -> Sightings:
@@ -230,7 +207,7 @@ def _why_not(  # type: ignore[no-untyped-def]
     mission, names, alignments, vi_map, detection, loop_options
 ) -> str:
     mine = [a for a in alignments if names[mission] in a.missions]
-    tried = [f"{a.missions}: {a.verdict}" for a in mine if a.verdict != "used"]
+    tried = [f"{a.missions}: {a.verdict}" for a in mine if a.verdict != USED]
     if tried:
         return "; ".join(tried)
     if mine:

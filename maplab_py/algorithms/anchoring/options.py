@@ -27,11 +27,6 @@ class AnchoringOptions:
     ransac_max_position_error_m: float = option(
         1.0, help="Largest difference in position of closures that agree", unit="m"
     )
-    max_ambiguous_ratio: float = option(
-        0.25,
-        help="Closures with places that look like others, as part of those that agree; with more "
-        "the missions may have been in different places that look alike, and stay unaligned",
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,6 +23,16 @@ I64 = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Sights:
+    """From where L landmarks were seen."""
+
+    direction: F64  # (L, 3) unit, in G, toward the middle of the observers
+    spread_rad: F64  # (L,) largest angle of an observer from there
+    nearest_m: F64  # (L,) distances of the observers
+    farthest_m: F64  # (L,)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class LocalizationMap:
     """L landmarks seen by K observers in N observations."""
 
@@ -42,6 +52,31 @@ class LocalizationMap:
     def observers_of(self) -> tuple[I64, I64]:
         """Offsets (L + 1) and observers, by landmark."""
         return _grouped(self.descriptors.label, self.observer, len(self.p_G))
+
+    @cached_property
+    def rows_of(self) -> tuple[I64, I64]:
+        """Offsets (L + 1) and observation rows, by landmark."""
+        label = self.descriptors.label
+        counts = np.bincount(label, minlength=len(self.p_G))
+        return starts_of_counts(counts), np.argsort(label, kind="stable")
+
+    @cached_property
+    def sights(self) -> Sights:
+        """From where each landmark was seen."""
+        start, rows = self.rows_of
+        first, count = start[:-1], np.diff(start)
+        toward = self.p_G_observer[self.observer[rows]] - np.repeat(self.p_G, count, axis=0)
+        distance = np.linalg.norm(toward, axis=1)
+        toward /= np.maximum(distance, 1e-9)[:, None]
+        mean = np.add.reduceat(toward, first, axis=0)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+        cosine = np.einsum("ni,ni->n", toward, np.repeat(mean, count, axis=0))
+        return Sights(
+            direction=mean,
+            spread_rad=np.arccos(np.clip(np.minimum.reduceat(cosine, first), -1.0, 1.0)),
+            nearest_m=np.minimum.reduceat(distance, first),
+            farthest_m=np.maximum.reduceat(distance, first),
+        )
 
     @cached_property
     def landmarks_of(self) -> tuple[I64, I64]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.absolute_pose import PoseProblems, solve_poses
@@ -23,6 +24,11 @@ I64 = NDArray[np.int64]
 
 _CERTAIN = 2
 """As many times the wanted inliers leave no doubt: no further place is tried."""
+_MIN_HYPOTHESIS = 3
+"""Inliers that make a pose worth trying on all landmarks in view."""
+_GUIDED_ROUNDS = 2
+_GUIDED_RADIUS, _GUIDED_DISTANCE = 6.0, 1.3
+"""Landmarks in view are looked for in as many times the inliers' error and match distance."""
 
 
 class Outcome(Enum):
@@ -89,26 +95,29 @@ class Localizer:
     def localize(self, query: Query) -> Localization:
         """Find the pose of a query in G."""
         begin = time.perf_counter()
-        keypoint, landmark = self._match(query)
+        descriptors = self._described(query)
+        keypoint, landmark = self._match(descriptors)
         places = self._places(keypoint, landmark)
         matched = time.perf_counter()
-        answer = self._solve(query, keypoint, landmark, places)
+        answer = self._solve(query, descriptors, keypoint, landmark, places)
         return dataclasses.replace(
             answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
         )
 
-    def _match(self, query: Query) -> tuple[I64, I64]:
-        """Return keypoints and landmarks of all matches, sorted by keypoint."""
+    def _described(self, query: Query) -> DescriptorSet:
         count = len(query.descriptors)
         raw = np.ascontiguousarray(query.descriptors)
         words = self._map.descriptors.words.shape[1]
-        descriptors = DescriptorSet(
+        return DescriptorSet(
             projected=self._map.projection.project(raw),
             words=pack_words(raw) if words else np.zeros((count, 0), dtype=np.uint64),
             label=np.full(count, -1, dtype=np.int64),
             session=np.full(count, -1, dtype=np.int32),
             time_ns=np.zeros(count, dtype=np.int64),
         )
+
+    def _match(self, descriptors: DescriptorSet) -> tuple[I64, I64]:
+        """Return keypoints and landmarks of all matches, sorted by keypoint."""
         found = self._index.nearest(descriptors, self._options.num_neighbors, MatchRule())
         keypoint, rank = np.nonzero((found.row >= 0) & (found.distance <= self._max_distance))
         return keypoint, self._map.descriptors.label[found.row[keypoint, rank]]
@@ -139,25 +148,54 @@ class Localizer:
             votes = np.where(near, 0, votes)
         return found
 
-    def _solve(self, query: Query, keypoint: I64, landmark: I64, places: list[I64]) -> Localization:
-        """Search the pose place by place; the most inliers win, and many inliers end the search."""
+    def _solve(
+        self,
+        query: Query,
+        descriptors: DescriptorSet,
+        keypoint: I64,
+        landmark: I64,
+        places: list[I64],
+    ) -> Localization:
+        """Search the pose place by place; the most inliers win, and many inliers end the search.
+
+        A pose that few matches agree with is tried on all landmarks that it has in view.
+        """
+        o = self._options
         best = _failed(Outcome.FEW_MATCHES, len(query.descriptors))
+        enough = _CERTAIN * o.min_inlier_count
         for number, rows in enumerate(places):
-            found = self._solve_place(query, number, keypoint[rows], landmark[rows])
+            key = query.key * o.places + number
+            found = self._search(query, key, keypoint[rows], landmark[rows])
+            for _ in range(_GUIDED_ROUNDS):
+                if not _MIN_HYPOTHESIS <= found.inliers < enough:
+                    break
+                near = guided_matches(
+                    self._map,
+                    found.T_G_I,
+                    projected=descriptors.projected,
+                    words=descriptors.words,
+                    origin_I=query.origin_I,
+                    ray_I=query.ray_I,
+                    radius_rad=_GUIDED_RADIUS * o.ransac_pixel_sigma * query.rad_per_px,
+                    max_distance=_GUIDED_DISTANCE * self._max_distance,
+                )
+                guided = self._search(query, key, *near)
+                if guided.inliers <= found.inliers:
+                    break
+                found = guided
             if best.outcome is Outcome.FEW_MATCHES or found.inliers > best.inliers:
                 best = found
-            enough = _CERTAIN * self._options.min_inlier_count
             if best.outcome is Outcome.LOCALIZED and best.inliers >= enough:
                 break
         return best
 
-    def _solve_place(self, query: Query, number: int, keypoint: I64, landmark: I64) -> Localization:
-        """Search the pose from the matches in one place, sorted by keypoint."""
+    def _search(self, query: Query, key: int, keypoint: I64, landmark: I64) -> Localization:
+        """Search the pose from some matches, sorted by keypoint."""
         o = self._options
         solutions = solve_poses(
             PoseProblems(
                 start=np.array([0, len(keypoint)]),
-                key=np.array([query.key * o.places + number]),
+                key=np.array([key]),
                 q_M_I=query.q_M_I[None],
                 origin_I=query.origin_I[keypoint],
                 ray_I=query.ray_I[keypoint],

@@ -26,15 +26,15 @@ class LocalizationOptions:
     max_projected_distance: float = option(
         40.0, help="Largest squared distance of projected descriptors of a match; summary maps."
     )
-    places: int = option(3, help="Places of the map that are tried for each query.")
+    places: int = option(6, help="Places of the map that are tried for each query.")
     min_shared_landmarks: int = option(
         5, help="Observers of the map that share so many landmarks belong to one place."
     )
-    min_matches: int = option(8, help="Matches with one place that are worth verifying.")
+    min_matches: int = option(5, help="Matches with one place that are worth verifying.")
     ransac_pixel_sigma: float = option(
         2.0, help="Largest reprojection error of an inlier.", unit="px"
     )
-    num_ransac_iters: int = option(200, help="Most samples of two matches per place.")
+    num_ransac_iters: int = option(500, help="Most samples of two matches per place.")
     min_inlier_count: int = option(8, help="Landmarks that must agree with the pose.")
     min_inlier_ratio: float = option(
         0.03, help="Part of the keypoints matched in the place that must agree."

@@ -159,13 +159,11 @@ def _detect(
     vi_map: VIMap, options: LoopClosureOptions, missions: I64 | None, progress: Progress
 ) -> Detection:
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
-    known = vi_map.baseframes.is_known[vi_map.missions.baseframe[rows]]
     return detect(
         vi_map,
         options,
         missions=rows,
         only_other_missions=options.only_against_other_missions,
-        known_base_frames=bool(known.all()),
         progress=progress,
     )
 

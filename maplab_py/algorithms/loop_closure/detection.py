@@ -53,7 +53,7 @@ def detect(
     *,
     missions: I64,
     only_other_missions: bool = False,
-    known_base_frames: bool = True,
+    trust_base_frames: bool = True,
     progress: Progress = SILENT,
 ) -> Detection:
     """Look for the places of some missions in the same missions.
@@ -63,7 +63,7 @@ def detect(
         options: Thresholds.
         missions: Mission rows.
         only_other_missions: Leave out places of the query's own mission.
-        known_base_frames: Base frames are to be trusted: corrections between missions are limited too.
+        trust_base_frames: Known base frames count: corrections between missions are limited too.
         progress: Progress.
 
     Raises:
@@ -101,8 +101,9 @@ def detect(
         tolerance_px=options.ransac_pixel_sigma,
         seed=options.seed,
         max_iterations=options.num_ransac_iters,
+        hypotheses=options.pose_hypotheses,
     )
-    closures = _closures(vi_map, features, candidates, search, options, known_base_frames)
+    closures = _closures(vi_map, features, candidates, search, options, trust_base_frames)
     if only_other_missions:
         mission = vi_map.vertices.mission
         other = mission[closures.query_vertex] != mission[closures.place_vertex]
@@ -170,12 +171,13 @@ def _closures(
     candidates: Candidates,
     search: PoseSearch,
     options: LoopClosureOptions,
-    known_base_frames: bool,
+    trust_base_frames: bool,
 ) -> Closures:
     """Make the table of closures, with the verdicts of the gates."""
     s, query = search.solutions, candidates.query_vertex
     place = _most_seen(vi_map, search, candidates.place_vertex)
-    judgement = judge(vi_map, query, place, s, options, known_base_frames=known_base_frames)
+    is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe] & trust_base_frames
+    judgement = judge(vi_map, query, place, s, options, is_known=is_known)
     inlier = np.flatnonzero(s.is_inlier)
     problem = np.repeat(np.arange(len(query)), np.diff(search.start))[inlier]
     return Closures(

@@ -14,6 +14,11 @@ from maplab_py.algorithms.loop_closure.consensus import (
     check_consensus,
     path_lengths,
 )
+from maplab_py.algorithms.loop_closure.mission_pairs import (
+    PairedClosures,
+    PairRule,
+    without_alignment,
+)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.recording import banned
 from maplab_py.algorithms.loop_closure.report import Verdict
@@ -26,8 +31,9 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _DRIFT_OFFSET_M = 0.5
-_ANCHORED_DRIFT_RATIO = 0.02
-"""Of the way of a mission whose base frame is known: what anchoring has left."""
+_USUAL_DRIFT_RATIO = 0.02
+"""Of the way; among places that look alike, a closure has to keep within it. Between missions of
+known base frames the way counts from where they began: what anchoring has left."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,12 +62,22 @@ def judge(
     solutions: PoseSolutions,
     options: LoopClosureOptions,
     *,
-    known_base_frames: bool,
+    is_known: Mask,
 ) -> Judgement:
-    """Judge closures: geometry, plausibility against drift, look-alikes, consensus of neighbours."""
+    """Judge closures: geometry, plausibility against drift, look-alikes, consensus of neighbours.
+
+    Args:
+        vi_map: The map.
+        query: Query vertices (N,).
+        place: Vertices of the places (N,).
+        solutions: Poses found.
+        options: Thresholds.
+        is_known: Missions (M,) whose base frames are to be trusted.
+    """
     s = solutions
     mission = vi_map.vertices.mission[place].astype(np.int64)
     same = vi_map.vertices.mission[query] == mission
+    related = is_known[vi_map.vertices.mission[query]] & is_known[mission]
     change = se3.local(vi_map.T_G_I[query], se3.compose(vi_map.T_G_M[mission], s.T_M_I))
     judgement = Judgement(
         verdict=np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8),
@@ -80,7 +96,7 @@ def judge(
     way = path_lengths(vi_map)
     drift = _DRIFT_OFFSET_M + options.max_drift_ratio * np.abs(way[query] - way[place])
     is_far_own = same & (judgement.correction_m > drift)
-    limited = same | known_base_frames
+    limited = same | related
     judgement.refuse(is_far_own | _beyond(options, judgement, limited), Verdict.IMPLAUSIBLE)
     rule = AmbiguityRule(_DRIFT_OFFSET_M, options.max_drift_ratio)
     unclear = np.isin(
@@ -89,11 +105,13 @@ def judge(
             query, way[place], mission, s.T_M_I, s.inlier_count, is_far_own, geometric, rule
         ),
     )
-    # known base frames tell which of the places it is
-    anchored = _DRIFT_OFFSET_M + _ANCHORED_DRIFT_RATIO * (way[query] + way[place])
-    settled = same | (known_base_frames & (judgement.correction_m <= anchored))
+    # odometry and known base frames tell which of the places it is
+    since = np.where(same, np.abs(way[query] - way[place]), way[query] + way[place])
+    usual = _DRIFT_OFFSET_M + _USUAL_DRIFT_RATIO * since
+    settled = limited & (judgement.correction_m <= usual)
     judgement.refuse(unclear & ~settled, Verdict.AMBIGUOUS)
     _check_neighbours(vi_map, query, place, s, options, judgement)
+    _check_pairs(vi_map, query, place, s, options, judgement, ~limited)
     return judgement
 
 
@@ -131,3 +149,26 @@ def _check_neighbours(
     judgement.support[left] = support
     judgement.verdict[left[contradicted]] = VERDICTS.index(Verdict.CONTRADICTED)
     judgement.verdict[left[~supported & ~contradicted]] = VERDICTS.index(Verdict.NO_SUPPORT)
+
+
+def _check_pairs(
+    vi_map: VIMap,
+    query: I64,
+    place: I64,
+    solutions: PoseSolutions,
+    options: LoopClosureOptions,
+    judgement: Judgement,
+    unrelated: Mask,
+) -> None:
+    """Refuse closures between missions of unknown relation that do not tell a clear alignment."""
+    v, way = vi_map.vertices, path_lengths(vi_map)
+    closures = PairedClosures.of(
+        (v.mission[query].astype(np.int64), v.mission[place].astype(np.int64)),
+        (v.T_M_I[query], solutions.T_M_I),
+        (way[query], way[place]),
+        solutions.inlier_count.astype(np.float64),
+    )
+    looks_alike = judgement.verdict == VERDICTS.index(Verdict.AMBIGUOUS)
+    rule = PairRule(_DRIFT_OFFSET_M, options.max_drift_ratio, options.max_ambiguous_ratio)
+    refused = without_alignment(closures, judgement.passing & unrelated, looks_alike, rule)
+    judgement.refuse(refused, Verdict.AMBIGUOUS)

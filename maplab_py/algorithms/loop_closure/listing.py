@@ -17,7 +17,7 @@ from maplab_py.algorithms.loop_closure.record import USES, LoopRecord, read_reco
 from maplab_py.algorithms.loop_closure.report import Verdict
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.text_table import write_text
+from maplab_py.output_files import write_text
 from maplab_py.report import to_json
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdArray, IdIndex, to_hex, to_hex_list
@@ -73,6 +73,13 @@ def list_closures(
         closures=tuple(lines[row] for row in shown),
         notes=() if len(c) else ("no closures are recorded: lc, relax and aam record them",),
     )
+
+
+def describe_closure(vi_map: VIMap, row: int) -> ClosureLine:
+    """Return one recorded closure (a row of what `read_record` returns)."""
+    record = read_record(vi_map)
+    chosen = record.closures.take(np.array([row]))
+    return _lines(vi_map, dataclasses.replace(record, closures=chosen))[0]
 
 
 def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0.0) -> IdArray:

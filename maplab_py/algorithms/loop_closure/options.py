@@ -45,7 +45,13 @@ class LoopClosureOptions:
     ransac_pixel_sigma: float = option(
         2.0, help="Largest reprojection error of an inlier", unit="px"
     )
-    num_ransac_iters: int = option(300, help="Most samples of two matches per query vertex")
+    num_ransac_iters: int = option(300, help="Most samples of matches per query vertex")
+    pose_hypotheses: str = option(
+        "gravity",
+        help="What a sample makes a pose of: gravity (two matches, and gravity as the query has "
+        "it) or three_point (three matches: P3P, generalised for rigs of several cameras)",
+        choices=("gravity", "three_point"),
+    )
     min_inlier_count: int = option(12, help="Keypoints that must agree with the pose")
     min_inlier_ratio: float = option(
         0.1, help="Part of the query's keypoints matched in the place that must agree"
@@ -68,6 +74,11 @@ class LoopClosureOptions:
     )
     min_support: int = option(
         2, help="Other query vertices nearby whose closures must agree in yaw and position"
+    )
+    max_ambiguous_ratio: float = option(
+        0.25,
+        help="Between missions of unknown relation: closures that tell another alignment, or whose "
+        "query fits several places, as part of those that agree; with more, none of them counts",
     )
     min_merge_observations: int = option(
         2, help="Verified observations that must agree before two landmarks are merged"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.candidates import Candidates, Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures, points_in_mission
+from maplab_py.algorithms.loop_closure.recording import closure_ids
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
@@ -37,6 +38,7 @@ def search_poses(
     tolerance_px: float,
     seed: int,
     max_iterations: int,
+    hypotheses: str,
 ) -> PoseSearch:
     """Find each candidate's pose T_M_I, M being the frame of the place's mission."""
     problem = np.repeat(np.arange(len(candidates.query_vertex)), np.diff(candidates.start))
@@ -49,7 +51,9 @@ def search_poses(
     mission = vi_map.vertices.mission[candidates.place_vertex].astype(np.int64)
     problems = PoseProblems(
         start=starts_of_counts(np.bincount(problem, minlength=len(mission))),
-        key=candidates.query_vertex * len(vi_map.vertices) + candidates.place_vertex,
+        key=closure_ids(vi_map, candidates.query_vertex, candidates.place_vertex)[:, 0].view(
+            np.int64
+        ),
         q_M_I=vi_map.vertices.T_M_I[candidates.query_vertex, :4],
         origin_I=features.origin_I[feature],
         ray_I=features.ray_I[feature],
@@ -57,5 +61,7 @@ def search_poses(
         keypoint=feature,
         tolerance=tolerance_px * features.rad_per_px[feature],
     )
-    solutions = solve_poses(problems, seed=seed, max_iterations=max_iterations)
+    solutions = solve_poses(
+        problems, seed=seed, max_iterations=max_iterations, hypotheses=hypotheses
+    )
     return PoseSearch(solutions, problems.start, feature, landmark, bits)

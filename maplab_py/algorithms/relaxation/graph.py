@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.losses import LOSSES
+from maplab_py.algorithms.relaxation.kernels import connected_parts
 from maplab_py.algorithms.relaxation.optimizer import PoseGraphOptimizer
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.pose_graph import (
@@ -85,7 +85,7 @@ def optimize_graph(
     none = TiltPriors.of_vertices(np.zeros(0, dtype=np.int64), graph.T_G_V, 1.0)
     weight = np.ones(len(edges))
     if len(loops) == 0:
-        optimizer = PoseGraphOptimizer(is_free, trajectory, loops, none, LOSSES["none"])
+        optimizer = PoseGraphOptimizer(is_free, trajectory, loops, none, "none")
         T, iterations = optimizer.run(graph.T_G_V, 1.0, options.num_iterations, progress)
         before, after = optimizer.cost(graph.T_G_V, 1.0), optimizer.cost(T, 1.0)
         return OptimizedGraph(T, weight, before, after, iterations)
@@ -110,14 +110,9 @@ def _edges(graph: PoseGraph) -> RelativePoses:
 
 def _anchors(graph: PoseGraph) -> I64:
     """Return the poses that stay."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(graph.id)
-    links = coo_array((np.ones(len(graph.first)), (graph.first, graph.second)), (count, count))
-    label = connected_components(links, directed=False)[1]
-    open_ = np.flatnonzero(~np.isin(label, label[graph.fixed]))
-    return np.union1d(graph.fixed, open_[np.unique(label[open_], return_index=True)[1]])
+    part = connected_parts(len(graph.id), graph.first, graph.second)
+    open_ = np.flatnonzero(~np.isin(part, part[graph.fixed]))
+    return np.union1d(graph.fixed, part[open_])
 
 
 def map_of_graph(graph: PoseGraph) -> VIMap:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.losses import Loss
+from maplab_py.algorithms.relaxation import kernels
+from maplab_py.algorithms.relaxation.losses import LOSSES
 from maplab_py.algorithms.relaxation.pose_graph import RelativePoses, TiltPriors
 from maplab_py.errors import EstimationError
+from maplab_py.estimation import relative_pose_kernels as edge_kernels
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
+from maplab_py.estimation.linear.ordering import exact_minimum_degree
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.relative_pose_kernels import normal_blocks
-from maplab_py.geometry import se3, so3
 from maplab_py.progress import Progress
 
 F64 = NDArray[np.float64]
@@ -21,18 +24,26 @@ I64 = NDArray[np.int64]
 
 _FIRST_DAMPING = 1e-8
 _LARGEST_DAMPING = 1e8
-_SUFFICIENT_DECREASE = 1e-7  # relative; less is convergence
+_REMAINING = 1e-8  # relative decrease of the cost that is not worth another iteration
+_SLOW = 0.02  # of the last decrease: second derivatives pay
+_NEAR = 0.05  # relative decrease of the cost; farther off they lead astray
+_UNDAMPED = (1e-12, 1e-9, 1e-6)  # enough for parts that no closure holds any more
+_EYE = np.eye(6)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Linearization:
     cost: float
-    gradient: F64  # (N * 6,) of half the cost, by free pose
-    blocks: F64  # (B, 6, 6) of the normal equations, one per entry of the structure
+    gradient: F64  # (N, 6) of half the cost, by free pose
+    diagonal: F64  # (N, 6) of the Gauss-Newton matrix
 
 
 class PoseGraphOptimizer:
-    """Minimises sum |trajectory|^2 + sum rho(|closure|^2) + sum |tilt|^2 over free poses."""
+    """Minimises sum |trajectory|^2 + sum rho(|closure|^2) + sum |tilt|^2 over free poses.
+
+    Gauss-Newton, until that is slow: then second derivatives are added, where residuals are
+    logarithms. Those of split residuals are left out.
+    """
 
     def __init__(
         self,
@@ -40,64 +51,111 @@ class PoseGraphOptimizer:
         trajectory: RelativePoses,
         loops: RelativePoses,
         tilt: TiltPriors,
-        loss: Loss,
+        loss: str,
     ) -> None:
         """Prepare the structure of the normal equations."""
         self._edges = RelativePoses.concatenate(trajectory, loops)
         self._num_trajectory = len(trajectory)
+        self._trust = np.ones(len(self._edges))
         self._tilt = tilt
-        self._loss = loss
+        self._loss = LOSSES[loss]
         self._free = np.flatnonzero(is_free)
+        size = len(self._free)
         variable = np.full(len(is_free), -1, dtype=np.int64)
-        variable[self._free] = np.arange(len(self._free))
-        self._a = variable[self._edges.from_vertex]
-        self._b = variable[self._edges.to_vertex]
-        self._t = variable[tilt.vertex]
-        # each contribution is a block of its own: the solver adds those of equal place; the last
-        # ones are the damping of the diagonal
-        a, b, nodes = self._a, self._b, np.arange(len(self._free))
-        places = [(a, a), (b, b), (np.maximum(a, b), np.minimum(a, b)), (self._t, self._t)]
-        wanted = [col >= 0 for _, col in places]
-        rows = [row[kept] for (row, _), kept in zip(places, wanted, strict=True)]
-        cols = [col[kept] for (_, col), kept in zip(places, wanted, strict=True)]
+        variable[self._free] = np.arange(size)
+        self._a = a = variable[self._edges.from_vertex]
+        self._b = b = variable[self._edges.to_vertex]
+        self._tilted = variable[tilt.vertex]
+        # each contribution is a block of its own, and the solver adds those of equal place; the
+        # last ones are those of single poses: tilt and damping
+        places = [(a, a), (b, b), (np.maximum(a, b), np.minimum(a, b))]
+        kept = [np.flatnonzero(col >= 0) for _, col in places]
         self._slot = np.full((len(a), 3), -1, dtype=np.int64)
         first = 0
-        for part in range(3):
-            count = int(np.count_nonzero(wanted[part]))
-            self._slot[wanted[part], part] = first + np.arange(count)
-            first += count
-        turned = wanted[2] & (a > b)
+        for part, edges in enumerate(kept):
+            self._slot[edges, part] = first + np.arange(len(edges))
+            first += len(edges)
+        turned = np.flatnonzero((self._slot[:, 2] >= 0) & (a > b))
         self._slot[turned, 2] = -2 - self._slot[turned, 2]
-        self._num_edge_blocks = first
-        self._tilt_kept = np.flatnonzero(wanted[3])
-        size = len(self._free)
-        self._blocks = np.zeros((first + len(self._tilt_kept) + size, 6, 6))
+        rows = [row[edges] for (row, _), edges in zip(places, kept, strict=True)]
+        cols = [col[edges] for (_, col), edges in zip(places, kept, strict=True)]
+        nodes = np.arange(size)
+        self._blocks = np.zeros((first + size, 6, 6))
+        self._own = self._blocks[first:]
         self._solver = BlockCholesky(
-            np.concatenate([*rows, nodes]), np.concatenate([*cols, nodes]), size, 6
+            np.concatenate([*rows, nodes]),
+            np.concatenate([*cols, nodes]),
+            size,
+            6,
+            ordering=exact_minimum_degree,
         )
+
+    def plain(self) -> PoseGraphOptimizer:
+        """Return the same graph without a loss, which shares memory with this one."""
+        other = copy.copy(self)
+        other._loss = LOSSES["none"]
+        other._trust = self._trust.copy()
+        return other
+
+    def trust(self, loops: NDArray[np.bool_]) -> None:
+        """Leave out the closures (L,) that are False."""
+        self._trust[self._num_trajectory :] = loops
 
     def cost(self, T_G_I: F64, price: float) -> float:
         """Return the sum that is minimised, for poses (V, 7)."""
-        u = self._edges.squared_errors(T_G_I)
-        robust = self._loss(u[self._num_trajectory :], price)[0]
-        tilt = np.sum(self._tilt.errors(T_G_I) ** 2)
-        return float(np.sum(u[: self._num_trajectory]) + np.sum(robust) + tilt)
+        graph = (*self._edges.arguments(T_G_I), self._trust, self._num_trajectory)
+        tilt = self._tilt
+        return float(
+            edge_kernels.robust_cost(*graph, self._loss.code, price)
+            + kernels.tilt_cost(T_G_I, tilt.vertex, tilt.q_G_I, tilt.sigma_rad)
+        )
+
+    def closure_uncertainty(self, T_G_I: F64) -> F64:
+        """Return how uncertain closures' errors are by the poses alone: W J Sigma J^T W^T (L, 6, 6).
+
+        With the identity added it is the covariance of the errors of closures that are left out;
+        taken from the identity it is that of those which count.
+
+        Raises:
+            EstimationError: The poses are not determined.
+        """
+        linear = self._linearize(T_G_I, 1.0, bend=False)
+        for damping in _UNDAMPED:
+            self._own += (damping * linear.diagonal)[:, :, None] * _EYE
+            with contextlib.suppress(NotPositiveDefinite):
+                self._solver.factor(self._blocks)
+                break
+        else:
+            raise EstimationError("relaxation: the closures do not determine the poses")
+        edges = self._edges.take(np.arange(self._num_trajectory, len(self._edges)))
+        _, J_a, J_b = edges.linearized(T_G_I)
+        slot = self._slot[self._num_trajectory :]
+        inverse = np.concatenate([self._solver.inverse_blocks(), np.zeros((1, 6, 6))])
+        aa, bb, ba = (inverse[slot[:, part]] for part in range(3))  # the last one, where none is
+        turned = slot[:, 2] < -1
+        ba[turned] = np.swapaxes(inverse[-2 - slot[turned, 2]], 1, 2)
+        cross = J_b @ ba @ np.swapaxes(J_a, 1, 2)
+        own = J_a @ aa @ np.swapaxes(J_a, 1, 2) + J_b @ bb @ np.swapaxes(J_b, 1, 2)
+        return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
 
     def run(
         self, T_G_I: F64, price: float, max_iterations: int, progress: Progress
     ) -> tuple[F64, int]:
         """Iterate from poses (V, 7); return the new ones and the number of iterations.
 
+        It ends when the decreases, which shrink by some factor from step to step, add up to no more
+        than 1e-7 of the cost from here on.
+
         Raises:
             EstimationError: The poses are not determined, or not finite.
         """
-        damping = _FIRST_DAMPING
+        damping, bend, decrease = _FIRST_DAMPING, False, 0.0
         for iteration in range(max_iterations):
             progress.check()
-            linear = self._linearize(T_G_I, price)
+            linear = self._linearize(T_G_I, price, bend)
             if not np.isfinite(linear.cost):
                 raise EstimationError("relaxation: the cost of the pose graph is not finite")
-            accepted = None
+            accepted, cost = None, linear.cost
             while accepted is None and damping < _LARGEST_DAMPING:
                 candidate = self._step(T_G_I, linear, damping)
                 cost = np.inf if candidate is None else self.cost(candidate, price)
@@ -112,57 +170,37 @@ class PoseGraphOptimizer:
                 return T_G_I, iteration
             T_G_I = accepted
             progress.line(f"  relax {iteration + 1:3d}  cost {cost:12.6g}  price {price:10.4g}")
-            if linear.cost - cost <= _SUFFICIENT_DECREASE * linear.cost:
+            before, decrease = decrease, linear.cost - cost
+            ratio = min(decrease / before, 0.999) if before > 0.0 else 0.5
+            if decrease * ratio / (1.0 - ratio) <= _REMAINING * cost:
                 return T_G_I, iteration + 1
+            bend = bend or (
+                self._loss.code == edge_kernels.QUADRATIC
+                and decrease < _NEAR * cost
+                and ratio > _SLOW
+            )
         return T_G_I, max_iterations
 
-    def _linearize(self, T_G_I: F64, price: float) -> _Linearization:
-        error, J_a, J_b = self._edges.linearized(T_G_I)
-        u = np.einsum("ei,ei->e", error, error)
-        rho, weight = u.copy(), np.ones(len(u))
-        closures = slice(self._num_trajectory, None)
-        rho[closures], weight[closures] = self._loss(u[closures], price)
-        blocks = self._blocks
+    def _linearize(self, T_G_I: F64, price: float, bend: bool) -> _Linearization:
         gradient, diagonal = np.zeros((2, len(self._free), 6))
-        normal_blocks(
-            error, J_a, J_b, weight, self._slot, self._a, self._b, blocks, gradient, diagonal
-        )
-        tilt_error, J_t = self._tilt.linearized(T_G_I)
-        tilt_error_kept, J_t = tilt_error[self._tilt_kept], J_t[self._tilt_kept]
-        tilt_blocks, tilt_node = np.swapaxes(J_t, 1, 2) @ J_t, self._t[self._tilt_kept]
-        np.add.at(gradient, tilt_node, np.einsum("eij,ei->ej", J_t, tilt_error_kept))
-        np.add.at(diagonal, tilt_node, np.einsum("eii->ei", tilt_blocks))
-        tilt_end = self._num_edge_blocks + len(tilt_node)
-        blocks[self._num_edge_blocks : tilt_end] = tilt_blocks
-        blocks[tilt_end:] = diagonal[:, :, None] * np.eye(6)
-        return _Linearization(
-            cost=float(np.sum(rho) + np.sum(tilt_error**2)),
-            gradient=gradient.reshape(-1),
-            blocks=blocks,
-        )
+        self._own[:] = 0.0
+        system = (self._slot, self._a, self._b, self._blocks, gradient, diagonal)
+        graph = (*self._edges.arguments(T_G_I), self._trust, self._num_trajectory)
+        cost = edge_kernels.normal_equations(*graph, self._loss.code, price, bend, *system)
+        tilt = (self._tilt.vertex, self._tilt.q_G_I, self._tilt.sigma_rad, self._tilted)
+        cost += kernels.add_tilt(T_G_I, *tilt, self._own, gradient, diagonal)
+        return _Linearization(float(cost), gradient, diagonal)
 
     def _step(self, T_G_I: F64, linear: _Linearization, damping: float) -> F64 | None:
-        """Return the poses after one damped Gauss-Newton step; None when it has no solution."""
-        undamped = linear.blocks[-len(self._free) :].copy()
-        linear.blocks[-len(self._free) :] *= damping
+        """Return the poses after one damped step; None when it has no solution."""
+        undamped = self._own.copy()
+        self._own += (damping * linear.diagonal)[:, :, None] * _EYE
         try:
-            self._solver.factor(linear.blocks)
+            self._solver.factor(self._blocks)
         except NotPositiveDefinite:
             return None
         finally:
-            linear.blocks[-len(self._free) :] = undamped
-        step = self._solver.solve(-linear.gradient).reshape(-1, 6)
-        moved = T_G_I.copy()
-        moved[self._free] = _moved(T_G_I[self._free], step)
-        return moved if bool(np.isfinite(moved).all()) else None
-
-
-def _moved(T_G_I: F64, step: F64) -> F64:
-    """Move poses (N, 7) along screws whose velocities [dp, dtheta] (N, 6) are the steps.
-
-    Equal to adding dp and turning by dtheta to first order. Where half a trajectory turns about a
-    far corner, screws keep its shape and sums stretch it: that saves most of the iterations.
-    """
-    twist = step.copy()
-    twist[:, :3] = so3.rotate(so3.inverse(T_G_I[:, :4]), step[:, :3])
-    return se3.compose(T_G_I, se3.exp(twist))
+            self._own[:] = undamped
+        step = self._solver.solve(-linear.gradient.reshape(-1)).reshape(-1, 6)
+        moved: F64 = kernels.moved(T_G_I, self._free, step)
+        return moved if bool(np.isfinite(step).all()) else None

@@ -22,16 +22,18 @@ class RelaxationOptions:
     flag_prefix: ClassVar[str] = "relax_"
 
     robustness: str = option(
-        "dcs",
-        help="How false loop closures are kept from doing harm: 'switchable' estimates a switch "
-        "variable for each one, 'dcs' (dynamic covariance scaling) lets them go in closed form but "
-        "trusts good ones fully, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
-        choices=("switchable", "dcs", "cauchy", "none"),
+        "gnc",
+        help="How false loop closures are kept from doing harm: 'gnc' (graduated non-convexity) "
+        "finds those that agree with one another, trusts them fully and the others not at all; "
+        "'switchable' estimates a switch variable for each one, 'dcs' (dynamic covariance scaling) "
+        "lets them go in closed form, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
+        choices=("gnc", "switchable", "dcs", "cauchy", "none"),
     )
     switch_prior: float = option(
         20.0,
         help="Cost of switching a loop closure off: closures whose squared normalised error (six "
-        "degrees of freedom) is above it lose their weight.",
+        "degrees of freedom) is above it lose their weight. With 'gnc' it is multiplied by the "
+        "variance factor that the closures show, so wrong covariances do less harm.",
     )
     position_drift: float = option(
         0.03, help="Position random walk of the trajectories.", unit="m/sqrt(m)"
@@ -57,6 +59,16 @@ class RelaxationOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class SwitchedOff:
+    """A closure that the relaxed map contradicts."""
+
+    closure: str  # id
+    is_edge: bool  # of the map; False = found by this search
+    error_m: float  # between what it says and what the relaxed map says
+    error_deg: float
+
+
+@dataclasses.dataclass(frozen=True)
 class RelaxationReport(Report):
     """What a relaxation did."""
 
@@ -64,14 +76,17 @@ class RelaxationReport(Report):
     num_switched_off: int  # of those, given less than half their weight in the end
     num_ignored: int  # not used at all; `notes` says why
     num_vertices: int  # that could move
+    num_base_frames: int  # that moved
     num_clusters: int  # groups of missions held together by closures
     iterations: int
     cost_before: float
     cost_after: float
     mean_correction_m: float
     max_correction_m: float
+    mean_correction_deg: float
     max_correction_deg: float
     seconds: float
+    worst: tuple[SwitchedOff, ...] = ()  # ten at most
     notes: tuple[str, ...] = ()
 
     @property

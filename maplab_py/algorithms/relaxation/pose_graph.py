@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.relaxation.kernels import connected_parts, tilt_errors
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.estimation import relative_pose_kernels as kernels
 from maplab_py.geometry import se3, so3
@@ -70,7 +71,7 @@ class RelativePoses:
     def errors(self, T_G_I: F64) -> F64:
         """Return the whitened residuals W e (E, 6) for vertex poses (V, 7)."""
         error = np.empty((len(self), 6))
-        kernels.relative_pose_errors(*self._arguments(T_G_I), error)
+        kernels.relative_pose_errors(*self.arguments(T_G_I), error)
         return error
 
     def squared_errors(self, T_G_I: F64) -> F64:
@@ -78,16 +79,14 @@ class RelativePoses:
         return np.asarray(np.sum(self.errors(T_G_I) ** 2, axis=1))
 
     def linearized(self, T_G_I: F64) -> tuple[F64, F64, F64]:
-        """Return W e (E, 6) and its derivatives (E, 6, 6) by [dp, dtheta] of A and of B.
-
-        Perturbations as everywhere: p <- p + dp, R <- R exp(dtheta).
-        """
+        """Return W e (E, 6) and its derivatives (E, 6, 6) by twists of A and of B: T <- T exp(x)."""
         error = np.empty((len(self), 6))
         J_a, J_b = np.empty((2, len(self), 6, 6))
-        kernels.relative_pose_jacobians(*self._arguments(T_G_I), error, J_a, J_b)
+        kernels.relative_pose_jacobians(*self.arguments(T_G_I), error, J_a, J_b)
         return error, J_a, J_b
 
-    def _arguments(self, T_G_I: F64) -> tuple[F64, I64, I64, F64, F64, NDArray[np.bool_]]:
+    def arguments(self, T_G_I: F64) -> tuple[F64, I64, I64, F64, F64, NDArray[np.bool_]]:
+        """Return what the compiled loops take of poses (V, 7) and edges."""
         return (
             np.ascontiguousarray(T_G_I),
             self.from_vertex,
@@ -113,25 +112,13 @@ class TiltPriors:
     @classmethod
     def of_vertices(cls, vertex: I64, T_G_I: F64, sigma_deg: float) -> TiltPriors:
         """Take the present attitude of vertices as measured."""
-        return cls(vertex, T_G_I[vertex, :4], float(np.deg2rad(sigma_deg)))
+        return cls(vertex, np.ascontiguousarray(T_G_I[vertex, :4]), float(np.deg2rad(sigma_deg)))
 
     def errors(self, T_G_I: F64) -> F64:
         """Return the whitened residuals (N, 2) for vertex poses (V, 7)."""
-        return self._weighted(self._angle(T_G_I)[:, :, None])[:, :, 0]
-
-    def linearized(self, T_G_I: F64) -> tuple[F64, F64]:
-        """Return the residuals (N, 2) and their derivatives (N, 2, 6) by [dp, dtheta]."""
-        angle = self._angle(T_G_I)
-        J = np.zeros((len(self.vertex), 2, 6))
-        J[:, :, 3:] = self._weighted(so3.right_jacobian_inverse(angle))
-        return self._weighted(angle[:, :, None])[:, :, 0], J
-
-    def _angle(self, T_G_I: F64) -> F64:
-        return so3.log(so3.multiply(so3.inverse(self.q_G_I), T_G_I[self.vertex, :4]))
-
-    def _weighted(self, columns: F64) -> F64:
-        """Turn columns (N, 3, k) into G and keep their horizontal rows, divided by sigma."""
-        return np.asarray((so3.to_matrix(self.q_G_I) @ columns)[:, :2] / self.sigma_rad)
+        error, J = np.empty((len(self.vertex), 2)), np.empty((len(self.vertex), 2, 3))
+        tilt_errors(np.ascontiguousarray(T_G_I), self.vertex, self.q_G_I, error, J)
+        return error / self.sigma_rad
 
 
 def trajectory_edges(vi_map: VIMap, options: RelaxationOptions) -> RelativePoses:
@@ -253,11 +240,7 @@ def usable_loop_closures(
 
 
 def clusters(num_vertices: int, edges: list[RelativePoses]) -> I64:
-    """Return a label (V,) per vertex: vertices joined by edges have the same one."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
+    """Return a label (V,) per vertex, the first vertex that edges join it to."""
     a = np.concatenate([e.from_vertex for e in edges])
     b = np.concatenate([e.to_vertex for e in edges])
-    graph = coo_array((np.ones(len(a)), (a, b)), shape=(num_vertices, num_vertices))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    return np.asarray(connected_parts(num_vertices, a, b), dtype=np.int64)

@@ -1,18 +1,20 @@
 """Relaxation: loop closures pull the trajectories together, everything else moves along.
 
-The variables are vertex poses in G. Between neighbours of a mission the map's present relative pose
-is a measurement with the covariance of odometry drift; loop closures are measurements between far
-vertices, some of them false. Landmarks stay where they are in their vertex' body frame, so they move
-rigidly with it; velocities turn with it; biases and base frames stay.
+The variables are vertex poses and base frames. Between neighbours of a mission the map's present
+relative pose is a measurement with the covariance of odometry drift; loop closures are measurements
+between far vertices, some of them false. A base frame turns about the vertical and moves; what a
+mission's base frame does, its vertices could do as well, so the first vertex of each mission keeps
+position and heading in M. The optimum is the same for poses in G: it is found for those, and then
+divided between base frames and vertices. Landmarks stay where they are in their vertex' body frame,
+so they move rigidly with it; velocities turn with it; biases stay.
 
-False closures are held off by robust weighting (switchable constraints: Suenderhauf and Protzel,
-IROS 2012; dynamic covariance scaling: Agarwal et al., ICRA 2013). Far from the answer a true closure
-looks as false as a false one, so the optimisation begins with so high a switching cost that all of
-them count, and lowers it step by step (graduated non-convexity: Yang et al., RA-L 2020).
+False closures are found by graduated non-convexity and a verdict on each (see `robust`, `verdict`),
+or held off by robust weighting (switchable constraints: Suenderhauf and Protzel, IROS 2012; dynamic
+covariance scaling: Agarwal et al., ICRA 2013).
 
 Use: `find_loop_closures` of `algorithms.loop_closure` gives the edges for `loop_closures`; those are
 constraints of this call only and are not added to the map. The map's own loop-closure edges always
-count, and stay in the map.
+count and stay in the map, their switch variables telling what became of them.
 """
 
 from __future__ import annotations
@@ -23,9 +25,12 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
+from maplab_py.algorithms.relaxation.options import (
+    RelaxationOptions,
+    RelaxationReport,
+    SwitchedOff,
+)
 from maplab_py.algorithms.relaxation.pose_graph import (
-    RelativePoses,
     TiltPriors,
     clusters,
     has_odometry_backbone,
@@ -37,6 +42,7 @@ from maplab_py.algorithms.relaxation.robust import Solution, optimize_robustly
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import IdIndex, to_hex
 from maplab_py.vimap.tables import LoopClosureEdges
 
 F64 = NDArray[np.float64]
@@ -82,9 +88,9 @@ def relax_graph(
 ) -> Relaxed:
     """Relax the pose graph of a map.
 
-    In each cluster of missions joined by closures the first vertex stays where it is. Missions
-    without a usable closure do not move. Closures to missions of unknown base frame are ignored
-    (closures within such a mission are not).
+    In each cluster of missions joined by closures the first vertex stays where it is, and the base
+    frame of its mission. Missions without a usable closure do not move. Closures to missions of
+    unknown base frame are ignored (closures within such a mission are not).
 
     Args:
         vi_map: The map.
@@ -94,8 +100,9 @@ def relax_graph(
         progress: Where iterations are shown, and where cancellation comes from.
 
     Returns:
-        The map with new poses and velocities, and the report. Without any usable closure the map is
-        returned as it was and the report tells so as a failure.
+        The map with new poses, base frames, velocities and switch variables, and the report.
+        Without any usable closure the map is returned as it was and the report tells so as a
+        failure.
 
     Raises:
         EstimationError: The pose graph has no usable solution.
@@ -121,14 +128,61 @@ def relax_graph(
     level = np.flatnonzero(is_free & ~odometry)
     tilt = TiltPriors.of_vertices(level, vi_map.T_G_I, options.tilt_sigma_deg)
     solution = optimize_robustly(vi_map.T_G_I, is_free, graph, loops, tilt, options, progress)
-    moved = move_vertices(vi_map, np.flatnonzero(is_free), solution.T_G_I)
-    report = _report(vi_map, moved, is_active, len(anchors), loops, solution, num_ignored, notes)
-    report = dataclasses.replace(report, seconds=time.perf_counter() - begin)
+    free = np.flatnonzero(is_free)
+    placed, num_base_frames = _move_base_frames(vi_map, free, anchors, solution.T_G_I)
+    moved = move_vertices(placed, free, solution.T_G_I)
+    moved = _with_switches(moved, closures, solution.weight)
+    report = dataclasses.replace(
+        _report(vi_map, moved, is_active, closures, solution),
+        num_ignored=num_ignored,
+        num_vertices=len(free),
+        num_base_frames=num_base_frames,
+        num_clusters=len(anchors),
+        notes=tuple(notes),
+        seconds=time.perf_counter() - begin,
+    )
     return Relaxed(moved, report, closures, solution.weight)
 
 
+def _move_base_frames(vi_map: VIMap, rows: I64, anchors: I64, T_G_I: F64) -> tuple[VIMap, int]:
+    """Turn and shift base frames so that the first vertex of each moving mission keeps its place.
+
+    Those of missions that hold an anchor stay, unknown ones, and those that missions share.
+    """
+    missions, start = vi_map.missions, vi_map.vertex_start
+    is_moving = np.zeros(len(missions), dtype=np.bool_)
+    is_moving[vi_map.vertices.mission[rows]] = True
+    is_moving[vi_map.vertices.mission[anchors]] = False
+    users = np.bincount(missions.baseframe, minlength=len(vi_map.baseframes))
+    is_own = vi_map.baseframes.is_known & (users == 1)
+    mission = np.flatnonzero(is_moving & is_own[missions.baseframe])
+    if len(mission) == 0:
+        return vi_map, 0
+    frame, first = missions.baseframe[mission], start[mission]
+    T_G_M = vi_map.baseframes.T_G_M.copy()
+    T_M_I = vi_map.vertices.T_M_I[first]
+    q_G_M = so3.multiply(T_G_I[first, :4], so3.inverse(T_M_I[:, :4]))
+    turn = so3.multiply(q_G_M, so3.inverse(T_G_M[frame, :4]))
+    about_up = np.zeros((len(mission), 3))
+    about_up[:, 2] = 2.0 * np.arctan2(turn[:, 2], turn[:, 3])
+    q = so3.multiply(so3.exp(about_up), T_G_M[frame, :4])
+    T_G_M[frame] = se3.make(q, T_G_I[first, 4:] - so3.rotate(q, T_M_I[:, 4:]))
+    return vi_map.replace(baseframes=vi_map.baseframes.replace(T_G_M=T_G_M)), len(mission)
+
+
+def _with_switches(vi_map: VIMap, closures: LoopClosureEdges, weight: F64) -> VIMap:
+    """Write the weights (E,) of closures into the switch variables of the map's own edges."""
+    edges = vi_map.loop_closure_edges
+    if len(edges) == 0:
+        return vi_map
+    row = IdIndex(edges.id).rows(closures.id)
+    switch = edges.switch_variable.copy()
+    switch[row[row >= 0]] = np.sqrt(weight[row >= 0])
+    return vi_map.replace(loop_closure_edges=edges.replace(switch_variable=switch))
+
+
 def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
-    """Give some vertices (rows) the poses T_G_I[rows] of (V, 7); base frames stay.
+    """Give some vertices (rows) the poses T_G_I[rows] of (V, 7), by what they are in M.
 
     Velocities turn with their vertices; landmarks follow without a change.
     """
@@ -152,45 +206,63 @@ def _report(
     before: VIMap,
     after: VIMap,
     is_active: NDArray[np.bool_],
-    num_clusters: int,
-    loops: RelativePoses,
+    closures: LoopClosureEdges,
     solution: Solution,
-    num_ignored: int,
-    notes: list[str],
 ) -> RelaxationReport:
     old, new = before.T_G_I[is_active], after.T_G_I[is_active]
     moved_m = np.linalg.norm(new[:, 4:] - old[:, 4:], axis=1)
     turn = so3.log(so3.multiply(so3.inverse(old[:, :4]), new[:, :4]))
-    return RelaxationReport(
-        num_loop_closures=len(loops),
+    turned_deg = np.rad2deg(np.linalg.norm(turn, axis=1))
+    return dataclasses.replace(
+        _NOTHING_DONE,
+        num_loop_closures=len(closures),
         num_switched_off=int(np.count_nonzero(solution.weight < 0.5)),
-        num_ignored=num_ignored,
-        num_vertices=int(np.count_nonzero(is_active)) - num_clusters,
-        num_clusters=num_clusters,
         iterations=solution.iterations,
         cost_before=solution.cost_before,
         cost_after=solution.cost_after,
         mean_correction_m=float(moved_m.mean()),
         max_correction_m=float(moved_m.max()),
-        max_correction_deg=float(np.rad2deg(np.linalg.norm(turn, axis=1).max())),
-        seconds=0.0,
-        notes=tuple(notes),
+        mean_correction_deg=float(turned_deg.mean()),
+        max_correction_deg=float(turned_deg.max()),
+        worst=_worst(after, closures, solution.weight),
+    )
+
+
+def _worst(vi_map: VIMap, closures: LoopClosureEdges, weight: F64) -> tuple[SwitchedOff, ...]:
+    """Describe the closures that were switched off, those farthest from the map first."""
+    off = closures.take(np.flatnonzero(weight < 0.5))
+    T_G_I = vi_map.T_G_I
+    T_A_B = se3.relative(T_G_I[off.from_vertex], T_G_I[off.to_vertex])
+    error = se3.local(off.T_A_B, T_A_B)
+    error_m = np.linalg.norm(error[:, :3], axis=1)
+    error_deg = np.rad2deg(np.linalg.norm(error[:, 3:], axis=1))
+    is_edge = IdIndex(vi_map.loop_closure_edges.id).rows(off.id) >= 0
+    return tuple(
+        SwitchedOff(
+            to_hex(off.id[row]), bool(is_edge[row]), float(error_m[row]), float(error_deg[row])
+        )
+        for row in np.argsort(-error_m, kind="stable")[:_NUM_WORST].tolist()
     )
 
 
 def _nothing_done(num_ignored: int, notes: list[str]) -> RelaxationReport:
-    return RelaxationReport(
-        num_loop_closures=0,
-        num_switched_off=0,
-        num_ignored=num_ignored,
-        num_vertices=0,
-        num_clusters=0,
-        iterations=0,
-        cost_before=0.0,
-        cost_after=0.0,
-        mean_correction_m=0.0,
-        max_correction_m=0.0,
-        max_correction_deg=0.0,
-        seconds=0.0,
-        notes=tuple(notes),
-    )
+    return dataclasses.replace(_NOTHING_DONE, num_ignored=num_ignored, notes=tuple(notes))
+
+
+_NUM_WORST = 10
+_NOTHING_DONE = RelaxationReport(
+    num_loop_closures=0,
+    num_switched_off=0,
+    num_ignored=0,
+    num_vertices=0,
+    num_base_frames=0,
+    num_clusters=0,
+    iterations=0,
+    cost_before=0.0,
+    cost_after=0.0,
+    mean_correction_m=0.0,
+    max_correction_m=0.0,
+    mean_correction_deg=0.0,
+    max_correction_deg=0.0,
+    seconds=0.0,
+)

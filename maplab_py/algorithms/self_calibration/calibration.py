@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
+from maplab_py.algorithms.self_calibration.consistency import Consistency, keep_consistent
+from maplab_py.algorithms.self_calibration.curvature import with_curvature
 from maplab_py.algorithms.self_calibration.information import (
     Spectrum,
     name_direction,
@@ -23,7 +25,7 @@ from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sen
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.inertial_terms import InertialTerm
-from maplab_py.estimation.solver import SolverOptions, SolverSummary, optimize_states
+from maplab_py.estimation.solver import AfterStep, SolverOptions, SolverSummary, optimize_states
 from maplab_py.estimation.states import States
 from maplab_py.estimation.trust_region import Schedule
 from maplab_py.progress import SILENT, Progress
@@ -35,8 +37,11 @@ F64 = NDArray[np.float64]
 
 _ROUGH = 8
 """Iterations before landmarks are triangulated anew and outliers judged again."""
-_UNDETERMINED = 0.1
-"""Directions that keep more of the prior's variance, a third of its deviation, are refused."""
+_NEARLY = 1e-4
+"""Outliers are told from the rest when an iteration lowers the robust cost by less than this."""
+_UNDETERMINED = 0.3**2
+"""Directions that keep more of the prior's variance are refused: of a device that is one prior
+deviation off, a share s of it stays, which is sqrt(s) of the announced deviation."""
 _UNKNOWN = 0.5
 """Parameters that keep more of it stay where they were: the data say less than the prior."""
 
@@ -82,13 +87,15 @@ def calibrate(
         MapError: Calibrations are missing.
     """
     began = time.perf_counter()
+    if options.imu_curvature:
+        vi_map = with_curvature(vi_map)
     rough = pose(vi_map, options, missions=missions, progress=progress)
     before = rough.posed.states.blocks
     posed = time.perf_counter()
     roughly = dataclasses.replace(options, num_iterations=_ROUGH, function_tolerance=1e-3)
     states, first = solve(rough, roughly, progress)
     problem = pose(_begun_anew(rough, states, options), options, prior_at=before, progress=progress)
-    states, summary = solve(problem, options, progress)
+    states, summary, consistency = _settled(problem, options, progress)
     covariance = posterior_covariance(problem, states)
     found = spectrum(covariance, problem.parameters)
     directions = found.unobservable(_UNDETERMINED)
@@ -104,10 +111,32 @@ def calibrate(
         problem,
         states,
     )
-    report = _report(calibration, first, summary, names, segments)
+    report = _report(calibration, first, summary, names, segments, consistency)
     return calibration, dataclasses.replace(
         report, seconds_pose=posed - began, seconds_solve=time.perf_counter() - posed
     )
+
+
+def _settled(
+    problem: SegmentProblem, options: SelfCalibrationOptions, progress: Progress
+) -> tuple[States, SolverSummary, Consistency]:
+    """Minimise robustly, leave out what does not fit, and minimise plainly."""
+    if options.loss == "none" or options.inconsistent_probability <= 0.0:
+        states, summary = solve(problem, options, progress)
+        return states, summary, Consistency(0, 0, 1.0)
+    nearly = dataclasses.replace(
+        options, function_tolerance=max(options.function_tolerance, _NEARLY)
+    )
+    states, robust = solve(problem, nearly, progress)
+    posed = problem.posed
+    consistency = keep_consistent(posed, states, options.inconsistent_probability)
+
+    def refresh(_: int, now: States) -> bool:
+        return posed.problem.visual is not None and posed.problem.visual.refresh(now)
+
+    states, plain = _minimised(problem, states, options, progress, refresh)
+    summary = dataclasses.replace(plain, iterations=robust.iterations + plain.iterations)
+    return states, summary, consistency
 
 
 def _begun_anew(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> VIMap:
@@ -137,17 +166,23 @@ def solve(
 ) -> tuple[States, SolverSummary]:
     """Minimise; outliers are rejected on the way."""
     posed = problem.posed
-    return optimize_states(
-        posed.problem,
-        posed.states,
-        SolverOptions(
-            num_iterations=options.num_iterations,
-            function_tolerance=options.function_tolerance,
-            schedule=Schedule.CERES,
-        ),
-        progress,
-        posed.rejection.after_step if posed.rejection is not None else None,
+    after_step = posed.rejection.after_step if posed.rejection is not None else None
+    return _minimised(problem, posed.states, options, progress, after_step)
+
+
+def _minimised(
+    problem: SegmentProblem,
+    states: States,
+    options: SelfCalibrationOptions,
+    progress: Progress,
+    after_step: AfterStep | None,
+) -> tuple[States, SolverSummary]:
+    solver = SolverOptions(
+        num_iterations=options.num_iterations,
+        function_tolerance=options.function_tolerance,
+        schedule=Schedule.CERES,
     )
+    return optimize_states(problem.posed.problem, states, solver, progress, after_step)
 
 
 def _report(
@@ -156,6 +191,7 @@ def _report(
     summary: SolverSummary,
     unobservable: tuple[str, ...],
     segments: int,
+    consistency: Consistency,
 ) -> SelfCalibrationReport:
     problem, states = calibration.problem, calibration.states
     posed = problem.posed
@@ -169,6 +205,8 @@ def _report(
         keyframes=len(posed.selection.vertices),
         landmarks=0 if rejection is None else int(np.count_nonzero(rejection.used_landmarks())),
         observations=0 if rejection is None else int(np.count_nonzero(rejection.is_used)),
+        inconsistent_landmarks=consistency.inconsistent,
+        keypoint_noise_factor=consistency.noise_factor,
         cost_before=sum(first.initial_costs.values()),
         cost_after=sum(summary.final_costs.values()),
         chi_square_per_freedom=chi_square_per_freedom(problem, states),

@@ -62,8 +62,18 @@ class SelfCalibrationOptions:
     )
     loss: str = option(
         "cauchy",
-        help="Robust loss of reprojection errors while calibrating.",
+        help="Robust loss of reprojection errors until outliers are known.",
         choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"),
+    )
+    inconsistent_probability: float = option(
+        0.01,
+        help="Landmarks whose residuals are less probable than this are left out; the others then "
+        "count in full. 0 = keep the robust loss to the end.",
+    )
+    imu_curvature: bool = option(
+        True,
+        help="Correct inertial samples for what straight lines between them leave out; otherwise "
+        "the signal runs straight from sample to sample.",
     )
     gate_reprojection_error_px: float = option(
         40.0, help="Observations off by more at the beginning do not take part.", unit="px"

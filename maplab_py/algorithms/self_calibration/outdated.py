@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.calibration import chi_square_per_freedom, solve
+from maplab_py.algorithms.self_calibration.curvature import with_curvature
 from maplab_py.algorithms.self_calibration.database import SegmentDatabase, with_calibration
 from maplab_py.algorithms.self_calibration.information import posterior_covariance
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
@@ -61,7 +62,7 @@ def fits(
         progress.step(number, len(database), "test segments")
         own = database.map_of(record)
         own = own.replace(sensors=with_calibration(own.sensors, sensors))
-        problem = pose(own, options)
+        problem = pose(with_curvature(own) if options.imu_curvature else own, options)
         states, _ = solve(problem, options, progress=SILENT)
         change = problem.parameters.difference(states.blocks, problem.posed.states.blocks)
         covariance = posterior_covariance(problem, states)

@@ -32,6 +32,8 @@ class SelfCalibrationReport(Report):
     keyframes: int
     landmarks: int
     observations: int
+    inconsistent_landmarks: int  # left out: their tracks are not of one point
+    keypoint_noise_factor: float  # noise of the keypoints over what the map says
     cost_before: float
     cost_after: float
     chi_square_per_freedom: float  # about 1 when the sigmas of the measurements are right

@@ -27,12 +27,12 @@ class SparsificationOptions:
         30, help="Landmarks that every keyframe should still see."
     )
     weighted: bool = option(
-        True,
+        False,
         help="Count a landmark by the chance of matching it again, which rises with the number of "
         "vertices that saw it; otherwise, as in the thesis, all count alike.",
     )
     slack_levels: int = option(
-        3,
+        2,
         help="A keyframe that lacks more is lacking worse: the price doubles with every part of so "
         "many of the wanted number; 1 = one price for all, as in the thesis.",
     )

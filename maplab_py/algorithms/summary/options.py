@@ -25,12 +25,25 @@ class SummaryMapOptions:
     max_observations_per_landmark: int = option(
         0, help="Observations that are kept of a landmark, spread over all of them; 0 = all."
     )
-    covariances: bool = option(True, help="Write a covariance for every landmark.")
+    position_step_m: float = option(
+        1.0 / 1024.0,
+        help="Positions are rounded to multiples of this; 0 = not rounded.",
+        unit="m",
+    )
+    covariances: bool = option(
+        False, help="Write a covariance for every landmark, 24 bytes that hardly pack."
+    )
+    landmark_ids: bool = option(
+        False,
+        help="Write the ids of the landmarks, 16 bytes that do not pack; those of the observing "
+        "vertices are written in any case.",
+    )
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.descriptor_step < 0.0:
-            raise FlagError("--summary_map_descriptor_step must not be negative")
+        for name in ("descriptor_step", "position_step_m"):
+            if getattr(self, name) < 0.0:
+                raise FlagError(f"--summary_map_{name} must not be negative")
         if self.max_observations_per_landmark < 0:
             raise FlagError("--summary_map_max_observations_per_landmark must not be negative")
 

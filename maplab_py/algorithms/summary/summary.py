@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
 from maplab_py.vision.projection import DescriptorProjection
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -54,25 +57,39 @@ def make_summary_map(
         rows = _spread(rows, features, options.max_observations_per_landmark)
     landmarks, landmark = np.unique(features.descriptors.label[rows], return_inverse=True)
     vertices, observer = np.unique(features.vertex[rows], return_inverse=True)
-    projected = features.descriptors.projected[rows]
-    if options.descriptor_step:
-        step = np.float32(options.descriptor_step)
-        projected = np.round(projected / step) * step
     covariance = None
     if options.covariances:
         covariance = landmark_covariances(judged, features)[landmarks].astype(np.float32)
-    return SummaryMap(
+    summary = SummaryMap(
         p_G=judged.p_G[landmarks].astype(np.float32),
         p_G_observer=judged.T_G_I[vertices, 4:].astype(np.float32),
-        descriptors=np.ascontiguousarray(projected, dtype=np.float32),
+        descriptors=np.ascontiguousarray(features.descriptors.projected[rows], dtype=np.float32),
         landmark=landmark.reshape(-1).astype(np.uint32),
         observer=observer.reshape(-1).astype(np.uint32),
-        landmark_id=judged.landmarks.id[landmarks],
+        landmark_id=judged.landmarks.id[landmarks] if options.landmark_ids else None,
         observer_id=judged.vertices.id[vertices],
         landmark_covariance=covariance,
         projection=projection.matrix,
         sensors=judged.sensors,
     )
+    return rounded(summary, options)
+
+
+def rounded(summary: SummaryMap, options: SummaryMapOptions) -> SummaryMap:
+    """Round positions and descriptors as the options say; the zero bits that it leaves pack away."""
+    return dataclasses.replace(
+        summary,
+        p_G=_to_multiples(summary.p_G, options.position_step_m),
+        p_G_observer=_to_multiples(summary.p_G_observer, options.position_step_m),
+        descriptors=_to_multiples(summary.descriptors, options.descriptor_step),
+    )
+
+
+def _to_multiples(values: F32, step: float) -> F32:
+    """Round to multiples of a step; 0 = leave as it is."""
+    if not step:
+        return values
+    return np.asarray(np.round(values / np.float32(step)) * np.float32(step), dtype=np.float32)
 
 
 def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:

@@ -106,9 +106,9 @@ def _labels_of_rigs(labels: I64, problem: Problem) -> set[int]:
         return set()
     data = problem.visual.observations
     used = data.inverse_sigma > 0.0
-    views = np.unique(np.stack([data.vertex[used], data.camera[used]], axis=1), axis=0)
-    vertices, cameras = np.unique(views[:, 0], return_counts=True)
-    return set(np.unique(labels[vertices[cameras > 1]]).tolist())
+    seen = np.zeros((len(labels), int(data.camera.max(initial=0)) + 1), dtype=np.bool_)
+    seen[data.vertex[used], data.camera[used]] = True
+    return set(np.unique(labels[seen.sum(axis=1) > 1]).tolist())
 
 
 def _vertices_of(term: FactorTerm, num_vertices: int) -> I64 | None:

@@ -28,12 +28,15 @@ def make_report(posed: PosedProblem, after: States, summary: SolverSummary) -> V
         posed.vi_map, posed.selection, posed.problem, posed.rejection,
     )  # fmt: skip
     before = posed.states
-    terms = _terms(problem, before, after)
+    errors_px = (
+        [] if problem.visual is None else [problem.visual.errors(s)[0] for s in (before, after)]
+    )
+    terms = _terms(problem, before, after, errors_px)
     errors, missions = (np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
     gated = rejected = landmarks = 0
     if problem.visual is not None and rejection is not None:
         used = rejection.is_used
-        errors = np.stack([problem.visual.errors(s)[0][used] for s in (before, after)], axis=1)
+        errors = np.stack([error_px[used] for error_px in errors_px], axis=1)
         observing = vi_map.keypoint_vertex[selection.keypoints[used]]
         missions = vi_map.vertices.mission[observing].astype(np.int64)
         gated, rejected = rejection.gated, rejection.rejected
@@ -60,7 +63,7 @@ def make_report(posed: PosedProblem, after: States, summary: SolverSummary) -> V
         gauge=posed.gauge,
         singular_at=[_name_of(posed, after, node) for node in summary.singular_at],
         calibration=calibration_rows(posed, after),
-        chi_square_per_freedom=_chi_square_per_freedom(posed, after),
+        chi_square_per_freedom=_chi_square_per_freedom(posed, after, errors_px),
         seconds_build=0.0,
         seconds_solve=0.0,
         seconds_total=0.0,
@@ -75,11 +78,14 @@ def _name_of(posed: PosedProblem, states: States, node: int) -> str:
     return f"{NODE_NAMES[node % NODES_PER_VERTEX]} of {to_hex(posed.vi_map.vertices.id[vertex])}"
 
 
-def _terms(problem: Problem, before: States, after: States) -> list[TermReport]:
+def _terms(
+    problem: Problem, before: States, after: States, errors_px: list[F64]
+) -> list[TermReport]:
     terms = []
     if problem.visual is not None:
         used = int(np.count_nonzero(problem.visual.observations.inverse_sigma))
-        costs = [problem.visual.cost(s) for s in (before, after)]
+        both = zip(errors_px, (before, after), strict=True)
+        costs = [problem.visual.cost_of_errors(error_px, s) for error_px, s in both]
         terms.append(TermReport("reprojection", used, *costs))
     for term in problem.factors:
         costs = [factor_terms.cost(term, states) for states in (before, after)]
@@ -103,13 +109,12 @@ def _by_mission(vi_map: VIMap, errors: F64, missions: I64) -> list[MissionReproj
     return rows
 
 
-def _chi_square_per_freedom(posed: PosedProblem, states: States) -> float:
+def _chi_square_per_freedom(posed: PosedProblem, states: States, errors_px: list[F64]) -> float:
     """Return the squared whitened residuals, no robust loss, per degree of freedom."""
     problem, total, count = posed.problem, 0.0, 0
     if problem.visual is not None:
         data = problem.visual.observations
-        error_px = problem.visual.errors(states)[0]
-        total += float(np.sum(np.square(error_px * data.inverse_sigma)))
+        total += float(np.sum(np.square(errors_px[-1] * data.inverse_sigma)))
         count += 2 * int(np.count_nonzero(data.inverse_sigma))
     for term in problem.factors:
         residual = term.evaluate(states)[0]

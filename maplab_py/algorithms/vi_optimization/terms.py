@@ -14,7 +14,6 @@ from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.factor_terms import FactorTerm
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.estimation.imu_calibration_terms import CalibratingInertialTerm, imu_blocks
 from maplab_py.estimation.inertial_terms import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.loss import Loss
@@ -137,8 +136,8 @@ def _with_inertial(
     first, second = selection.rows(table.from_vertex[edges]), selection.rows(table.to_vertex[edges])
     mission = vi_map.vertices.mission[table.from_vertex[edges]]
     g_G = so3.rotate(vi_map.T_G_M[mission, :4], _gravity_M(data, options))
-    walk = integrate(data, np.zeros(3), np.zeros(3))
-    bias_walk = BiasWalkTerm(first, second, walk.gyro_walk_variance, walk.accel_walk_variance)
+    walk = data.walk_variance_density[data.imu_of_edge] * data.duration_s[:, None]
+    bias_walk = BiasWalkTerm(first, second, walk[:, 0], walk[:, 1])
     if options.fix_imu_intrinsics:
         kernel = residual_kernel("inertial", inertial, progress)
         plain = InertialTerm(kernel, data, first, second, g_G)

@@ -1,4 +1,4 @@
-"""Compile the optimiser's kernels by running each once on a tiny problem."""
+"""Compile the kernels of optimiser and place recognition by running each once on tiny problems."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from maplab_py.geometry import se3
 from maplab_py.progress import Progress
 from maplab_py.sensors import Distortion, Imu, Projection
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.vision.warmup import compile_poses, compile_search
 
 _FACTORS = {  # name: its source, inputs, residual size, Jacobian columns
     "inertial": (sources.inertial, 100, 9, 24),
@@ -41,6 +42,7 @@ _FACTORS = {  # name: its source, inputs, residual size, Jacobian columns
 
 _LINEAR, _INTEGRATION = "block Cholesky", "preintegration"
 _REPROJECTION, _CALIBRATION = "reprojection", "camera calibration"
+_RECOGNITION = {"descriptor search": compile_search, "absolute pose": compile_poses}
 
 
 def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
@@ -49,7 +51,7 @@ def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
     Several processes compile at a time; what they make is shared through the cache folder.
     """
     began = time.perf_counter()
-    jobs = [*_FACTORS, _LINEAR, _INTEGRATION]
+    jobs = [*_FACTORS, _LINEAR, _INTEGRATION, *_RECOGNITION]
     for projection, distortion in itertools.product(Projection, Distortion):
         model = f"{projection.name} {distortion.name}"
         jobs += [f"{_REPROJECTION} {model}", f"{_CALIBRATION} {model}"]
@@ -79,6 +81,8 @@ def _compile(job: str) -> None:
             np.ones((1, inputs)), np.eye(size)[None], np.empty((1, size)),
             np.empty((1, size, columns)),
         )  # fmt: skip
+    elif job in _RECOGNITION:
+        _RECOGNITION[job]()
     elif job == _LINEAR:
         _run_linear()
     elif job == _INTEGRATION:
@@ -120,7 +124,7 @@ def _run_visual(
         visual.refresh(states)
     else:
         visual = VisualTerms(visual_kernels(models), observations, cameras, 2)
-    visual.node_system(states, 1e-4)
+    visual.node_system(states, 1e-4, np.empty((len(visual.block_nodes(states)[0]), 3, 3)))
     visual.take_step(states, np.zeros((states.num_nodes, 3)), states, 1e-4)
     visual.errors(states)
 

@@ -78,6 +78,18 @@ class InertialData:
     def __len__(self) -> int:
         return len(self.sample_start) - 1
 
+    def of_edges(self, rows: I64) -> InertialData:
+        """Return the samples of some edges (rows, ascending)."""
+        samples = ragged_rows(self.sample_start, rows)
+        return InertialData(
+            sample_start=starts_of_counts(np.diff(self.sample_start)[rows]),
+            timestamp_ns=self.timestamp_ns[samples],
+            accel_gyro=self.accel_gyro[samples],
+            imus=self.imus,
+            imu_of_edge=self.imu_of_edge[rows],
+            edge_id=None if self.edge_id is None else self.edge_id[rows],
+        )
+
     @cached_property
     def duration_s(self) -> F64:
         """Time (E,) from the first to the last sample of every edge [s]."""

@@ -28,6 +28,7 @@ from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.geometry import so3
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,6 +47,16 @@ class Preintegrated:
     gyro_walk_variance: F64  # (E,) variance of each component of the change of the bias
     accel_walk_variance: F64  # (E,)
     jacobian_intrinsics: F64 | None = None  # (E, 9, 15): T_g and T_a (diagonal, 01, 02, 12), R_A_I
+
+    def updated(self, rows: I64, new: Preintegrated) -> Preintegrated:
+        """Return the same with some edges (rows) replaced."""
+        columns: dict[str, F64] = {}
+        for field in dataclasses.fields(self):
+            old_column, new_column = getattr(self, field.name), getattr(new, field.name)
+            if old_column is not None:
+                columns[field.name] = old_column.copy()
+                columns[field.name][rows] = new_column
+        return Preintegrated(**columns)
 
 
 def integrate(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.estimation.linear import multifrontal
+from maplab_py.estimation.linear.ordering import minimum_degree
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
 from maplab_py.estimation.linear.symbolic import analyse
@@ -21,7 +24,12 @@ class BlockCholesky:
     """
 
     def __init__(
-        self, block_rows: ArrayLike, block_cols: ArrayLike, num_nodes: int, node_size: int
+        self,
+        block_rows: ArrayLike,
+        block_cols: ArrayLike,
+        num_nodes: int,
+        node_size: int,
+        ordering: Callable[[BlockPattern], NDArray[np.int64]] = minimum_degree,
     ) -> None:
         """Analyse the structure of the lower blocks at (block_rows, block_cols), each (B,).
 
@@ -29,7 +37,7 @@ class BlockCholesky:
             ValueError: A block lies above the diagonal or outside the matrix.
         """
         self._pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
-        self._symbolic = symbolic = analyse(self._pattern)
+        self._symbolic = symbolic = analyse(self._pattern, ordering)
         self._factor = np.empty(symbolic.statistics.nonzeros)
         self._front = np.empty(symbolic.front_size)
         self._stack = np.empty(symbolic.stack_size)

@@ -14,9 +14,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.estimation.linear.jit import compiled
 from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct
 
 I64 = NDArray[np.int64]
+
+_SMALL = 2000
+"""Nodes up to which neighbourhoods as rows of bits cost less than SuperLU's detour."""
 
 
 def minimum_degree(pattern: BlockPattern) -> I64:
@@ -28,6 +32,69 @@ def minimum_degree(pattern: BlockPattern) -> I64:
     position = np.empty(num_groups, dtype=np.int64)
     position[group_order] = np.arange(num_groups)
     return np.argsort(position[group], kind="stable")
+
+
+def exact_minimum_degree(pattern: BlockPattern) -> I64:
+    """Return the order (num_nodes,) of exact minimum degree; of many nodes, `minimum_degree`'s.
+
+    For graphs that are solved in a few iterations: a tenth of the time where nodes are few.
+    """
+    if pattern.num_nodes > _SMALL:
+        return minimum_degree(pattern)
+    return np.asarray(_eliminate(pattern.rows, pattern.cols, pattern.num_nodes), dtype=np.int64)
+
+
+@compiled()
+def _eliminate(rows, cols, num_nodes):  # type: ignore[no-untyped-def]
+    """Eliminate the node of fewest neighbours again and again, the first of equal ones.
+
+    The neighbours of each node are bits of a row.
+    """
+    words = (num_nodes + 63) // 64
+    bits = np.zeros((num_nodes, words), np.uint64)
+    one = np.uint64(1)
+    for block in range(len(rows)):
+        row, col = rows[block], cols[block]
+        if row != col:
+            bits[row, col >> 6] |= one << np.uint64(col & 63)
+            bits[col, row >> 6] |= one << np.uint64(row & 63)
+    degree = np.empty(num_nodes, np.int64)
+    for node in range(num_nodes):
+        degree[node] = _count(bits[node])
+    order = np.empty(num_nodes, np.int64)
+    for place in range(num_nodes):
+        best = np.argmin(degree)
+        order[place] = best
+        degree[best] = num_nodes + 1
+        for word in range(words):
+            left = bits[best, word]
+            while left != 0:
+                lowest = left & (~left + one)
+                node = word * 64 + _count_word(lowest - one)
+                left ^= lowest
+                for k in range(words):
+                    bits[node, k] |= bits[best, k]
+                bits[node, node >> 6] &= ~(one << np.uint64(node & 63))
+                bits[node, best >> 6] &= ~(one << np.uint64(best & 63))
+                degree[node] = _count(bits[node])
+    return order
+
+
+@compiled(inline="always")
+def _count_word(x):  # type: ignore[no-untyped-def]
+    """Return how many bits of a word are set."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled(inline="always")
+def _count(row):  # type: ignore[no-untyped-def]
+    total = 0
+    for word in row:
+        total += _count_word(word)
+    return total
 
 
 def indistinguishable_nodes(rows: I64, cols: I64, num_nodes: int) -> tuple[I64, int]:

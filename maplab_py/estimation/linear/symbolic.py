@@ -18,6 +18,7 @@ With nodes numbered in elimination order:
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -65,9 +66,11 @@ class SymbolicFactor:
     statistics: FactorStatistics
 
 
-def analyse(pattern: BlockPattern) -> SymbolicFactor:
+def analyse(
+    pattern: BlockPattern, ordering: Callable[[BlockPattern], I64] = minimum_degree
+) -> SymbolicFactor:
     """Order the nodes and find the factor's structure."""
-    order = minimum_degree(pattern)
+    order = ordering(pattern)
     parent = elimination_tree(*_upper_columns(pattern, _inverse(order)))
     order = order[postorder(parent)]
     position = _inverse(order)

@@ -48,7 +48,7 @@ def add_camera(out, c, k, s, V, border, square, camera_gradient, camera_diagonal
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def subtract_cameras(
-    first, last, pose_of, cameras, count, Y, V, f, g, border, square, camera_gradient
+    first, last, base, pose_of, cameras, count, Y, V, f, g, border, square, camera_gradient
 ):
     """Turn V into Z = L^-1 V and subtract Z'Y, Z'Z and Z'z."""
     z0 = g[0] * f[0]
@@ -63,7 +63,7 @@ def subtract_cameras(
             V[s, 0, w], V[s, 1, w], V[s, 2, w] = y0, y1, y2
             camera_gradient[c, w] -= y0 * z0 + y1 * z1 + y2 * z2
         for o in range(first, last):
-            n, k = o - first, pose_of[o]
+            n, k = o - base, pose_of[o]
             for w in range(CAMERA_COLUMNS):
                 y0, y1, y2 = V[s, 0, w], V[s, 1, w], V[s, 2, w]
                 for e in range(6):
@@ -88,14 +88,14 @@ def slot_of(camera, cameras, count):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def add_calibrating_observations(
-    first, last, landmark, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind, poses,
-    extrinsics, parameters, points, prior, uv_motion, time_offset, diagonal_block, S, grad, diag, border,
+    first, last, base, landmark, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind, poses,
+    extrinsics, parameters, points, prior, uv_motion, time_offset, pose_square, grad, diag, border,
     square, camera_gradient, camera_diagonal, Y, V, cameras, out, h, g,
 ):  # fmt: skip
     """Evaluate a landmark's observations; return the sum of rho and the number of its cameras."""
     total, count = begin_landmark(points, prior, landmark, h, g), 0
     for o in range(first, last):
-        n = o - first
+        n = o - base
         if inverse_sigma[o] == 0.0:
             Y[n] = 0.0
             continue
@@ -104,7 +104,7 @@ def add_calibrating_observations(
         add_time_offset(out, uv_motion, time_offset, o, c)
         total += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
         add_landmark_sums(out, h, g)
-        add_pose(out, n, diagonal_block[k], k, Y, S, grad, diag)
+        add_pose(out, n, k, Y, pose_square, grad, diag)
         s = slot_of(c, cameras, count)
         if s == count:
             cameras[s] = c
@@ -117,50 +117,52 @@ def add_calibrating_observations(
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def eliminate_calibrating(
     start, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind, poses, extrinsics, parameters,
-    points, prior, uv_motion, time_offset, pair_start, pair_block, diagonal_block, damping, move_points,
-    chunk_start, blocks, gradient, diagonal, border, square, camera_gradient, camera_diagonal, cost,
+    points, prior, uv_motion, time_offset, plan, damping, move_points, Y, pose_square, gradient,
+    diagonal, border, square, camera_gradient, camera_diagonal, cost, blocks,
 ):  # fmt: skip
     """Form the reduced normal equations of poses and cameras.
 
     Out, beside those of `eliminate`: border (chunks, C, P, W, 6), square (chunks, C, C, W, W),
     camera_gradient and camera_diagonal (chunks, C, W), W = CAMERA_COLUMNS. Chunk 0 holds the sums.
     """
-    longest = 0
-    for landmark in range(len(start) - 1):
-        longest = max(longest, start[landmark + 1] - start[landmark])
-    chunks = blocks.shape[0]
-    for chunk in prange(chunks):
-        S, grad, diag = blocks[chunk], gradient[chunk], diagonal[chunk]
-        B, C = border[chunk], square[chunk]
-        cgrad, cdiag = camera_gradient[chunk], camera_diagonal[chunk]
-        S[:] = 0.0
-        grad[:] = 0.0
-        diag[:] = 0.0
-        B[:] = 0.0
-        C[:] = 0.0
-        cgrad[:] = 0.0
-        cdiag[:] = 0.0
-        total = 0.0
-        Y, V = np.empty((longest, 3, 6)), np.empty((len(extrinsics), 3, CAMERA_COLUMNS))
-        cameras = np.empty(len(extrinsics), dtype=np.int64)
-        out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
-        for landmark in range(chunk_start[chunk], chunk_start[chunk + 1]):
-            first, last = start[landmark], start[landmark + 1]
-            rho, count = add_calibrating_observations(
-                first, last, landmark, pose_of, camera_of, uv, inverse_sigma, scale2, loss_kind,
-                poses, extrinsics, parameters, points, prior, uv_motion, time_offset, diagonal_block, S,
-                grad, diag, B, C, cgrad, cdiag, Y, V, cameras, out, h, g,
-            )  # fmt: skip
-            total += rho
-            if move_points:
-                factor_3x3(h, damping, f)
-                subtract_landmark(
-                    first, last, pose_of, pair_block, pair_start[landmark], S, grad, Y, f, g
-                )
-                subtract_cameras(first, last, pose_of, cameras, count, Y, V, f, g, B, C, cgrad)
-        cost[chunk] = total
-    reduce_chunks(blocks, gradient, diagonal, cost)
-    for chunk in range(1, chunks):
+    pose_square[:] = 0.0
+    gradient[:] = 0.0
+    diagonal[:] = 0.0
+    cost[:] = 0.0
+    blocks[:] = 0.0
+    border[:] = 0.0
+    square[:] = 0.0
+    camera_gradient[:] = 0.0
+    camera_diagonal[:] = 0.0
+    for slab in range(len(plan.slab_start) - 1):
+        base = start[plan.slab_start[slab]]
+        for chunk in prange(len(cost)):
+            B, C = border[chunk], square[chunk]
+            grad, cgrad, cdiag = gradient[chunk], camera_gradient[chunk], camera_diagonal[chunk]
+            V = np.empty((len(extrinsics), 3, CAMERA_COLUMNS))
+            cameras = np.empty(len(extrinsics), dtype=np.int64)
+            out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
+            total = 0.0
+            for landmark in range(plan.chunk_start[slab, chunk], plan.chunk_start[slab, chunk + 1]):
+                first, last = start[landmark], start[landmark + 1]
+                rho, count = add_calibrating_observations(
+                    first, last, base, landmark, pose_of, camera_of, uv, inverse_sigma, scale2,
+                    loss_kind, poses, extrinsics, parameters, points, prior, uv_motion, time_offset,
+                    pose_square[chunk], grad, diagonal[chunk], B, C, cgrad, cdiag, Y, V, cameras,
+                    out, h, g,
+                )  # fmt: skip
+                total += rho
+                if move_points:
+                    factor_3x3(h, damping, f)
+                    eliminate_landmark(first, last, base, pose_of, grad, Y, f, g)
+                    subtract_cameras(
+                        first, last, base, pose_of, cameras, count, Y, V, f, g, B, C, cgrad
+                    )
+            cost[chunk] += total
+        if move_points:
+            subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, blocks)
+    add_chunks(plan, pose_square, gradient, diagonal, cost, blocks)
+    for chunk in range(1, len(cost)):
         border[0] += border[chunk]
         square[0] += square[chunk]
         camera_gradient[0] += camera_gradient[chunk]

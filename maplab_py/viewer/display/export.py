@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from maplab_py.errors import UserError
+from maplab_py.output_files import write_text
 from maplab_py.viewer.display import text
 from maplab_py.viewer.display.camera import aim_initially
 from maplab_py.viewer.scene import Scene
@@ -43,8 +43,5 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
     )
     end = page.rindex("</body>")
     page = f"{page[:end]}{overlay}{page[end:]}"
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"--file={path}: cannot be written ({error.strerror})") from None
+    write_text(path, [page], overwrite=True)
     return len(page.encode())

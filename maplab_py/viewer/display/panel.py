@@ -90,6 +90,7 @@ class Panel:
         self._mission_widgets: list[Any] = []
         self._signature: tuple[Any, ...] = ()
         self._steps = 0
+        self._is_sliding = False
         self.header = self._gui.add_html("", order=0)
         self._layers = self._gui.add_folder("Layers", order=1)
         self._missions = self._gui.add_folder("Missions", order=2)
@@ -125,8 +126,16 @@ class Panel:
             self.playing: Any = self._gui.add_checkbox("play", False)
             self.time = self._gui.add_html(text.hint("the whole map"))
         self._steps = steps
-        self._bind(self.slider, lambda event: self._actions.set_step(int(event.target.value)))
+        self._bind(self.slider, self._slide)
         self._bind(self.playing, lambda event: self._actions.set_playing(event.target.value))
+
+    def _slide(self, event: Any) -> None:
+        """Follow the slider, which the user may hold: it must not be pushed back meanwhile."""
+        self._is_sliding = True
+        try:
+            self._actions.set_step(int(event.target.value))
+        finally:
+            self._is_sliding = False
 
     def _add_view(self) -> None:
         with self._gui.add_folder("View", order=6, expand_by_default=False):
@@ -230,10 +239,10 @@ class Panel:
             self.image.visible = image is not None
 
     def show_step(self, step: int, steps: int, note: str) -> None:
-        """Move the slider, which may have another number of steps now."""
+        """Move the slider, which may have another number of steps now, unless it moved us."""
         if steps != self._steps:
             self.slider.max = steps
             self._steps = steps
-        if int(self.slider.value) != step:
+        if not self._is_sliding and int(self.slider.value) != step:
             self.slider.value = step
         self.time.content = text.hint(note)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import EstimationError, UserError
+from maplab_py.output_files import write_bytes
 from maplab_py.viewer.display.camera import aim
 from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
 from maplab_py.viewer.scene import Extent
@@ -156,7 +157,4 @@ def save_picture(picture: U8, path: Path) -> None:
         ok = False
     if not ok:
         raise UserError(f"--file={path}: a name ending in .png or .jpg is wanted")
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise UserError(f"--file={path}: cannot be written ({error.strerror})") from None
+    write_bytes(path, [data.tobytes()], overwrite=True)

@@ -10,6 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.loop_closure.record import read_record
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import add_part
@@ -21,6 +22,7 @@ from maplab_py.viewer.layers.cameras import (
     mission_cameras,
     observer_rays,
 )
+from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap.table import ragged_rows
@@ -89,11 +91,17 @@ class Selection:
         elif found.entity is Entity.LOOP_CLOSURE:
             edges = drawing.vi_map.loop_closure_edges
             ends = np.array([edges.from_vertex[found.row], edges.to_vertex[found.row]])
-            p = drawing.p_vertices[ends]
-            self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, row, 6.0))
-            self._add_frusta(drawing, ends.astype(np.int64), 0.05, 2.0)
+            self._mark_closure(drawing, ends.astype(np.int64))
+        elif found.entity is Entity.CLOSURE:
+            record = read_record(drawing.vi_map).closures.take(row)
+            self._mark_closure(drawing, np.concatenate(closure_ends(drawing, record)))
         if self.distance_m is not None and self._anchor is not None:
             self._mark_distance(found, self._anchor, self.distance_m, size)
+
+    def _mark_closure(self, drawing: Drawing, ends: NDArray[np.int64]) -> None:
+        p = drawing.p_vertices[ends]
+        self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, ends[:1], 6.0))
+        self._add_frusta(drawing, ends, 0.05, 2.0)
 
     def _mark_vertex(self, drawing: Drawing, row: int) -> None:
         vi_map = drawing.vi_map

@@ -75,6 +75,8 @@ def join(context: CommandContext, job: int = 0) -> JoinReport | Message:
     for each in chosen:  # all at once, so that Ctrl-C while waiting loses none
         each.apply(context.maps)
         each.was_told = True
+        for note in each.notes:
+            context.terminal.note(f"[{each.number}] {note}")
     reports = {f"[{j.number}] {j.call.command.name}": j.report for j in chosen if j.report}
     conflicts = tuple(
         f"'{c.key}' has changed meanwhile; the result of job {j.number} is map '{c.kept_as}'"

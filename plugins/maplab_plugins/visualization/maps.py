@@ -129,17 +129,22 @@ def visualize_loop_closures(
     options: VisualizationOptions = _OPTIONS,
     viewer: ViewerOptions = _VIEWER,
 ) -> ViewReport:
-    """Show the loop closure edges on the trajectories, coloured by their switch values."""
-    from maplab_py.viewer.building import Subject
+    """Show loop closures on the trajectories: edges by switch value, remembered ones by weight.
 
-    if not len(context.vi_map.loop_closure_edges):
+    A click on one tells what lc_report does: query, target, inliers, correction, verdict.
+    """
+    from maplab_py.algorithms.loop_closure.record import read_record
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.layers.closures import ACCEPTED
+
+    vi_map = context.vi_map
+    if not len(vi_map.loop_closure_edges) and not len(read_record(vi_map).closures):
         raise UserError(
-            f"map '{context.map_key}' has no loop closure edges: loopclosure_all_missions merges "
-            "landmarks and leaves edges only with --lc_insert_lc_edge_instead_of_merging"
+            f"map '{context.map_key}' has no loop closures: loopclosure_all_missions finds them"
         )
     subject = Subject(
-        context.vi_map, context.map_key, options,
-        only_layers=("trajectories", "vertices", "loop_closures"),
+        vi_map, context.map_key, options,
+        only_layers=("trajectories", "vertices", "loop_closures", ACCEPTED),
     )  # fmt: skip
     return show(context, subject, viewer)
 

@@ -61,7 +61,7 @@ def save_view(
 
 
 @command(
-    "export_view", example="export_view --file=map.html", see_also=("save_view",), acts_outside=True
+    "export_view", example="export_view --file=map.html", see_also=("save_view",), writes_files=True
 )
 def export_view(context: CommandContext, *, file: Path, overwrite: bool = False) -> ExportedView:
     """Write what the viewer shows to one HTML file that opens without a network.

@@ -11,6 +11,7 @@ import pytest
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.localization.database import database_of_map, database_of_summary
+from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.localization import (
     Reference,
     align_robustly,
@@ -30,6 +31,7 @@ from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionO
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
+from maplab_py.vision.descriptors import pack_words
 
 OPTIONS = LocalizationOptions()
 
@@ -143,6 +145,80 @@ def test_an_image_of_another_place_is_refused():
         report = describe(database(kind), found)
         assert "none of" in report.failure
         assert sum(report.refused.values()) == len(found.vertex)
+
+
+@pytest.mark.parametrize("kind", ["full", "summary"])
+def test_true_looks_in_wrong_places_are_refused(kind):
+    """Exchanged between keypoints, the descriptors match the map but nothing agrees with a pose."""
+    rng = np.random.default_rng(3)
+    _, query, _, _ = sessions()
+    localizer = Localizer(database(kind), OPTIONS)
+    source = query_vertices(query, np.array([0]), database(kind).projection)
+    for one in queries(source):
+        exchanged = one.descriptors[rng.permutation(len(one.descriptors))]
+        answer = localizer.localize(dataclasses.replace(one, descriptors=exchanged))
+        assert answer.outcome is not Outcome.LOCALIZED
+        assert answer.inliers < OPTIONS.min_inlier_count - 1
+
+
+def near(kind, one, T_G_I):
+    d = database(kind)
+    return guided_matches(
+        d,
+        T_G_I,
+        projected=d.projection.project(one.descriptors),
+        words=pack_words(one.descriptors),
+        origin_I=one.origin_I,
+        ray_I=one.ray_I,
+        radius_rad=12.0 * one.rad_per_px,
+        max_distance=0.34 * 384 if kind == "full" else 52.0,
+    )
+
+
+@pytest.mark.parametrize("kind", ["full", "summary"])
+def test_a_pose_suggests_matches_near_the_images_of_landmarks(kind):
+    _, query, _, truth = sessions()
+    source = query_vertices(query, np.array([0]), database(kind).projection)
+    for row, one in enumerate(queries(source)):
+        keypoint, landmark = near(kind, one, truth[row])
+        assert len(keypoint) > 20
+        assert np.all(np.diff(keypoint) >= 0)
+        assert len(set(zip(keypoint.tolist(), landmark.tolist(), strict=True))) == len(keypoint)
+        point_I = se3.transform(se3.inverse(truth[row]), database(kind).p_G[landmark])
+        toward = point_I - one.origin_I[keypoint]
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        angle_px = np.linalg.norm(np.cross(toward, one.ray_I[keypoint]), axis=1)
+        angle_px /= one.rad_per_px[keypoint]
+        assert angle_px.max() < 12.0 * 1.01
+        # wrong ones would spread over the disc, a quarter of them within half of its radius
+        assert np.mean(angle_px < 6.0) > 0.75
+
+
+def test_a_wrong_pose_suggests_next_to_nothing():
+    _, query, _, truth = sessions()
+    source = query_vertices(query, np.array([0]), database("summary").projection)
+    turned = se3.make(so3.exp([0.0, 0.0, 1.5]), np.zeros(3))
+    for row, one in enumerate(queries(source)):
+        wrong = se3.compose(truth[row], turned)
+        right = near("summary", one, truth[row])[0]
+        assert len(near("summary", one, wrong)[0]) < 0.1 * len(right)
+    far = se3.make(so3.identity(), [1e3, 0.0, 0.0])
+    assert len(near("summary", one, far)[0]) == 0
+
+
+def test_a_landmark_is_looked_for_from_where_it_was_seen():
+    d = database("summary")
+    s = d.sights
+    assert np.all(s.nearest_m <= s.farthest_m)
+    np.testing.assert_allclose(np.linalg.norm(s.direction, axis=1), 1.0)
+    for label in (0, 17, len(d.p_G) - 1):
+        observers = d.p_G_observer[d.observer[d.descriptors.label == label]]
+        offset = observers - d.p_G[label]
+        distance = np.linalg.norm(offset, axis=1)
+        assert s.nearest_m[label] == pytest.approx(distance.min())
+        assert s.farthest_m[label] == pytest.approx(distance.max())
+        angle = np.arccos(np.clip(offset @ s.direction[label] / distance, -1.0, 1.0))
+        assert s.spread_rad[label] == pytest.approx(angle.max(), abs=1e-6)
 
 
 def test_gravity_must_agree():

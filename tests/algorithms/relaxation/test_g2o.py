@@ -25,11 +25,15 @@ from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
 
 PLAIN = RelaxationOptions(robustness="none", num_iterations=100)
-# final values of GTSAM 4.2's Levenberg-Marquardt from the file's poses, twice its error
+# final values of GTSAM's Levenberg-Marquardt from the file's poses, twice its error; tolerances 0:
+# with its own ones it stops 1.5e-5 (robot_a) and 3e-3 (robot_b, which takes it 386 iterations) higher
 GTSAM = {
     "parking-garage": (16727.20389624001, 1.268384799264538),
     "smallGrid3D": (167788.66687106618, 1035.8506647225781),
     "ordered": (0.11741482573824683, 0.11597183377501555),
+    "unordered": (0.11741482573824684, 0.11597183377501555),
+    "robot_a": (664.2471243143091, 46.4731341025),
+    "robot_b": (2177.121240801859, 34.1805144367),
 }
 
 
@@ -39,7 +43,7 @@ def test_objective_and_optimum_are_those_of_gtsam(name):
     before, after = GTSAM[name]
     assert result.cost_before == pytest.approx(before, rel=1e-9)
     assert result.cost_after == pytest.approx(after, rel=1e-6)
-    assert result.iterations < 12
+    assert result.iterations < 15
     np.testing.assert_array_equal(result.weight, 1.0)
 
 
@@ -93,29 +97,63 @@ def test_export_writes_what_was_imported():
     np.testing.assert_allclose(graph.T_G_V, back.T_G_V)
 
 
+def _disturbed(graph, seed):
+    """Return the graph with three of ten loop edges false, the graph without them, and which they are."""
+    rng = np.random.default_rng(seed)
+    loops = np.flatnonzero(~is_odometry(graph))
+    is_false = np.zeros(len(graph.first), dtype=np.bool_)
+    is_false[rng.permutation(loops)[: round(0.3 * len(loops))]] = True
+    count = np.count_nonzero(is_false)
+    error = se3.make(
+        so3.exp(rng.normal(scale=0.5, size=(count, 3))), rng.normal(scale=8.0, size=(count, 3))
+    )
+    T_A_B = graph.T_A_B.copy()
+    T_A_B[is_false] = se3.compose(T_A_B[is_false], error)
+    kept = {
+        name: getattr(graph, name)[~is_false]
+        for name in ("first", "second", "T_A_B", "information")
+    }
+    without = dataclasses.replace(graph, **kept)
+    return dataclasses.replace(graph, T_A_B=T_A_B), without, is_false
+
+
+def _rms(T, reference):
+    return np.sqrt(np.mean(np.sum((T[:, 4:] - reference[:, 4:]) ** 2, axis=1)))
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        *(("smallGrid3D", seed) for seed in (0, 13, 17, 19)),
+        pytest.param("parking-garage", 0, marks=pytest.mark.slow),
+    ],
+)
+def test_false_edges_are_switched_off_and_true_ones_kept(name, seed):
+    graph = read_g2o(shared_data(f"g2o/{name}.g2o"))
+    wrong, without, is_false = _disturbed(graph, seed)
+    robust, bent = optimize_graph(wrong, RelaxationOptions()), optimize_graph(wrong, PLAIN)
+    assert robust.weight[is_false].max() < 0.1
+    assert robust.weight[~is_false].min() > 0.9
+    best = optimize_graph(graph, PLAIN).T_G_V
+    clean_error = _rms(optimize_graph(without, PLAIN).T_G_V, best)
+    assert _rms(robust.T_G_V, best) <= 1.1 * clean_error
+    assert _rms(bent.T_G_V, best) > 3.0 * clean_error
+
+
+@pytest.mark.parametrize("name", ["robot_a", "robot_b", "ordered", "smallGrid3D"])
+def test_nothing_is_switched_off_where_all_agree(name):
+    graph = read_g2o(shared_data(f"g2o/{name}.g2o"))
+    robust, plain = optimize_graph(graph, RelaxationOptions()), optimize_graph(graph, PLAIN)
+    np.testing.assert_array_equal(robust.weight, 1.0)
+    assert robust.cost_after == pytest.approx(plain.cost_after, rel=1e-6)
+
+
 @pytest.mark.parametrize("robustness", ["switchable", "dcs", "cauchy"])
-def test_false_edges_of_a_noisy_grid_are_switched_off(robustness):
+def test_losses_hold_false_edges_off(robustness):
     graph = read_g2o(shared_data("g2o/smallGrid3D.g2o"))
     clean = optimize_graph(graph, PLAIN).T_G_V
-    rng = np.random.default_rng(3)
-    loops = np.flatnonzero(~is_odometry(graph))
-    false = rng.permutation(loops)[: round(0.3 * len(loops))]
-    T_A_B = graph.T_A_B.copy()
-    error = so3.exp(rng.normal(scale=0.5, size=(len(false), 3)))
-    T_A_B[false] = se3.compose(
-        T_A_B[false], se3.make(error, rng.normal(scale=8.0, size=(len(false), 3)))
-    )
-    wrong = dataclasses.replace(graph, T_A_B=T_A_B)
+    wrong, _, is_false = _disturbed(graph, 3)
     robust = optimize_graph(wrong, RelaxationOptions(robustness=robustness))
-    bent = optimize_graph(wrong, PLAIN)
-    true = np.setdiff1d(loops, false)
-    assert robust.weight[false].max() < 0.1
-    assert np.median(robust.weight[true]) > 0.5
-    if robustness == "dcs":
-        assert robust.weight[true].min() > 0.9
-
-    def rms(T):
-        return np.sqrt(np.mean(np.sum((T[:, 4:] - clean[:, 4:]) ** 2, axis=1)))
-
-    assert rms(robust.T_G_V) < 0.25  # the edges' own noise is 0.1 m and 0.2 rad
-    assert rms(bent.T_G_V) > 3.0
+    assert robust.weight[is_false].max() < 0.1
+    assert np.median(robust.weight[~is_false]) > 0.5
+    assert _rms(robust.T_G_V, clean) < 0.25  # the edges' own noise is 0.1 m and 0.2 rad

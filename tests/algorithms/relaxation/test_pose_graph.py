@@ -84,13 +84,13 @@ def test_tilt_prior_feels_tilt_only():
 
 
 def _numeric(function, T, vertex):
-    """Return the derivatives of function(T) by [dp, dtheta] of one vertex, (..., 6)."""
+    """Return the derivatives of function(T) by the twist of one vertex, (..., 6)."""
     columns = []
     for axis in range(6):
         sides = []
         for sign in (1.0, -1.0):
             moved = T.copy()
-            moved[vertex] = se3.retract(T[vertex], sign * 1e-6 * np.eye(6)[axis])
+            moved[vertex] = se3.compose(T[vertex], se3.exp(sign * 1e-6 * np.eye(6)[axis]))
             sides.append(function(moved))
         columns.append((sides[0] - sides[1]) / 2e-6)
     return np.stack(columns, axis=-1)
@@ -116,11 +116,6 @@ def test_derivatives_match_finite_differences(is_log):
         numeric_b = _numeric(lambda T, r=row: edges.errors(T)[r], T, edges.to_vertex[row])
         np.testing.assert_allclose(J_a[row], numeric_a, atol=1e-6 * scale)
         np.testing.assert_allclose(J_b[row], numeric_b, atol=1e-6 * scale)
-    prior = TiltPriors.of_vertices(np.array([5]), T, 0.5)
-    T[5] = se3.retract(T[5], [0, 0, 0, 0.1, -0.2, 0.4])
-    _, J = prior.linearized(T)
-    numeric = _numeric(prior.errors, T, 5)
-    np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(J).max())
 
 
 @pytest.mark.parametrize("name", list(LOSSES))

@@ -13,7 +13,7 @@ def corridor(
     keep: int,
     *,
     wanted: int = 30,
-    levels: int = 3,
+    levels: int = 2,
     patchiness: float = 0.5,
     weighted: bool = False,
     seed: int = 0,

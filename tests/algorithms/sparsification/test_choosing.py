@@ -29,7 +29,7 @@ def best_of_all(problem):
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize(("levels", "weighted"), [(1, False), (3, False), (3, True)])
+@pytest.mark.parametrize(("levels", "weighted"), [(1, False), (2, False), (3, False), (3, True)])
 def test_the_exact_choice_is_the_best_of_all(seed, levels, weighted):
     problem = corridor(12, 8, 4, wanted=3, levels=levels, weighted=weighted, seed=seed)
     best = best_of_all(problem)
@@ -97,7 +97,7 @@ def test_a_restricted_problem_counts_what_the_others_cover():
 
 def test_prices_double_from_part_to_part():
     assert prices(3).tolist() == [4.0, 2.0, 1.0]
-    problem = corridor(50, 10, 5, wanted=6)
+    problem = corridor(50, 10, 5, wanted=6, levels=3)
     worth = problem.value(np.array([0.0, 1.0, 2.0, 3.0, 6.0, 9.0]), np.full(6, 6.0))
     assert worth.tolist() == [0.0, 4.0, 8.0, 10.0, 14.0, 14.0]
 

@@ -24,7 +24,8 @@ def vi_map() -> VIMap:
 
 
 def test_a_summary_holds_the_good_landmarks_as_seen_from_g(vi_map):
-    summary = make_summary_map(vi_map, SummaryMapOptions(descriptor_step=0.0))
+    options = SummaryMapOptions(descriptor_step=0.0, position_step_m=0.0, landmark_ids=True)
+    summary = make_summary_map(vi_map, options)
     findable = findable_landmarks(vi_map)
     rows = IdIndex(vi_map.landmarks.id).rows(summary.landmark_id)
     np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(findable))
@@ -50,8 +51,27 @@ def test_rounded_descriptors_are_near_the_exact_ones(vi_map):
     assert np.all(rounded.descriptors * 32.0 == np.round(rounded.descriptors * 32.0))
 
 
+def test_rounded_positions_are_near_the_exact_ones(vi_map):
+    exact = make_summary_map(vi_map, SummaryMapOptions(position_step_m=0.0))
+    rounded = make_summary_map(vi_map, SummaryMapOptions())
+    for name in ("p_G", "p_G_observer"):
+        difference = np.abs(getattr(exact, name) - getattr(rounded, name))
+        assert 0.0 < difference.max() <= 0.5 / 1024.0 + 1e-5
+
+
+def test_covariances_are_written_when_asked_for(vi_map):
+    summary = make_summary_map(vi_map, SummaryMapOptions(covariances=True))
+    assert summary.landmark_covariance is not None
+    assert np.linalg.eigvalsh(summary.landmark_covariance.astype(np.float64)).min() > 0.0
+
+
+def test_ids_of_landmarks_are_written_when_asked_for(vi_map):
+    assert make_summary_map(vi_map, SummaryMapOptions()).landmark_id is None
+    assert make_summary_map(vi_map, SummaryMapOptions()).observer_id is not None
+
+
 def test_observations_can_be_limited(vi_map):
-    options = SummaryMapOptions(max_observations_per_landmark=3, covariances=False)
+    options = SummaryMapOptions(max_observations_per_landmark=3)
     few = make_summary_map(vi_map, options)
     whole = make_summary_map(vi_map, dataclasses.replace(options, max_observations_per_landmark=0))
     assert few.landmark_covariance is None

@@ -1,0 +1,174 @@
+"""The table, the findings and the figure of docs/map_maintenance.md, from what was measured."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+FRACTIONS = (0.0, 0.5, 0.75, 0.9, 0.95, 0.98)
+METHODS = ("ilp", "most_observed", "random")
+COLOURS = {"ilp": "#0b6fb8", "most_observed": "#c8501e", "random": "#888888"}
+NAMES = {"ilp": "integer programme", "most_observed": "most observed", "random": "random"}
+_WANTED_SHARE = 0.85
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One map variant."""
+
+    keyframed: bool
+    pruned: float
+    method: str
+    landmarks: int
+    observations: int
+    maplab_megabytes: float | None  # maplab's fields only, as exact as it writes them
+    megabytes: float  # our file
+    queries: int
+    recall: float
+    wrong: int
+    median_error_m: float
+
+
+def table(points: list[Point]) -> list[str]:
+    """Return the lines of the table: keyframed maps in brackets, a dash where nothing was measured."""
+    lines = [
+        "| pruned | landmarks | MB as maplab writes it | MB as we write it | recall: integer "
+        "programme | most observed | random |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for pruned in FRACTIONS:
+        pair = [_find(points, keyframed, pruned, METHODS[0]) for keyframed in (False, True)]
+        cells = [f"{100 * pruned:.0f} %"]
+        cells.append(_cell([str(p.landmarks) if p else None for p in pair]))
+        cells.append(_cell([f"{p.maplab_megabytes:.3f}" if p else None for p in pair]))
+        cells.append(_cell([f"{p.megabytes:.3f}" if p else None for p in pair]))
+        for method in METHODS:
+            found = [_find(points, keyframed, pruned, method) for keyframed in (False, True)]
+            cells.append(_cell([f"{100 * p.recall:.1f} %" if p else None for p in found]))
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _cell(values: list[str | None]) -> str:
+    return f"{values[0] or '-'} ({values[1] or '-'})"
+
+
+def _find(points: list[Point], keyframed: bool, pruned: float, method: str) -> Point | None:
+    """Return a variant; without pruning all methods are the same."""
+    wanted = (keyframed, pruned, method if pruned else METHODS[0])
+    found = [p for p in points if (p.keyframed, p.pruned, p.method) == wanted]
+    return found[0] if found else None
+
+
+def plot(points: list[Point]) -> str:
+    """Return the figure as SVG: recall over the pruned part; dashed = keyframed."""
+    left, top, width, height = 60.0, 20.0, 560.0, 300.0
+
+    def at(pruned: float, recall: float) -> str:
+        # the axis is the logarithm of what is kept, so that 98 % is not squeezed into a corner
+        x = left + width * np.log(1.0 - pruned) / np.log(1.0 - FRACTIONS[-1])
+        return f"{x:.1f},{top + height * (1.0 - recall):.1f}"
+
+    size = 'width="660" height="400" viewBox="0 0 660 400"'
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="12">',
+        '<rect width="100%" height="100%" fill="white"/>',
+    ]
+    for step in range(0, 101, 20):
+        y = top + height * (1.0 - step / 100.0)
+        lines.append(f'<path d="M{left} {y} h{width}" stroke="#dddddd"/>')
+        lines.append(f'<text x="{left - 8}" y="{y + 4}" text-anchor="end">{step} %</text>')
+    for pruned in FRACTIONS:
+        x = at(pruned, 0.0).split(",")[0]
+        y = top + height + 18
+        lines.append(f'<text x="{x}" y="{y}" text-anchor="middle">{100 * pruned:.0f} %</text>')
+    middle = left + width / 2
+    lines.append(f'<text x="{middle}" y="358" text-anchor="middle">landmarks pruned</text>')
+    for number, method in enumerate(METHODS):
+        for keyframed in (False, True):
+            found = [_find(points, keyframed, pruned, method) for pruned in FRACTIONS]
+            path = " ".join(at(p.pruned, p.recall) for p in found if p is not None)
+            dash = ' stroke-dasharray="6 4"' if keyframed else ""
+            style = f'stroke="{COLOURS[method]}" stroke-width="2" fill="none"{dash}'
+            lines.append(f'<polyline points="{path}" {style}/>')
+        x = left + 190 * number
+        lines.append(f'<path d="M{x} 380 h24" stroke="{COLOURS[method]}" stroke-width="2"/>')
+        lines.append(f'<text x="{x + 30}" y="384">{NAMES[method]}</text>')
+    lines.append(f'<text x="{left + width}" y="384" text-anchor="end">dashed: keyframed</text>')
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def findings(points: list[Point]) -> list[str]:
+    """Return what the measurements say, in sentences."""
+    whole, thin = (_find(points, keyframed, 0.0, METHODS[0]) for keyframed in (False, True))
+    lines = []
+    if whole and thin:
+        lines.append(
+            f"- Keyframing alone makes maplab's file {_ratio(whole, thin, maplab=True):.1f} times "
+            f"smaller and ours {_ratio(whole, thin):.1f} times, and costs "
+            f"{_points(whole, thin)} points of recall."
+        )
+        lines += _smallest(points, whole)
+    for keyframed, name in ((False, "the map with all keyframes"), (True, "the keyframed map")):
+        before, after = (_find(points, keyframed, share, METHODS[0]) for share in (0.0, 0.9))
+        if before and after:
+            lines.append(
+                f"- Pruning 90 % of {name} costs {_points(before, after)} points of recall."
+            )
+        lines += _against(points, keyframed, name)
+    queries = max(point.queries for point in points)
+    wrong = sum(point.wrong for point in points)
+    answers = sum(point.queries for point in points)
+    lines.append(
+        f"- Of {answers} answers in all variants together, {wrong} were wrong by more than 0.5 m. "
+        f"One of {queries} queries more or less changes recall by {100 / queries:.1f} points."
+    )
+    return lines
+
+
+def _smallest(points: list[Point], whole: Point) -> list[str]:
+    """Name the smallest map that keeps the wanted part of the recall."""
+    enough = [
+        p for p in points if p.method == METHODS[0] and p.recall >= _WANTED_SHARE * whole.recall
+    ]
+    best = min(enough, key=lambda p: p.megabytes)
+    how = "keyframed and " if best.keyframed else ""
+    return [
+        f"- The smallest map that keeps {100 * _WANTED_SHARE:.0f} % of the recall is {how}pruned by "
+        f"{100 * best.pruned:.0f} %: maplab's file is {_ratio(whole, best, maplab=True):.0f} times "
+        f"smaller, ours {_ratio(whole, best):.0f} times, and it keeps "
+        f"{100 * best.recall / whole.recall:.0f} % of the recall (the thesis: 13 times, 85 %)."
+    ]
+
+
+def _against(points: list[Point], keyframed: bool, name: str) -> list[str]:
+    """Compare the programme with the simple choices."""
+    lines = []
+    for method in METHODS[1:]:
+        pairs = [
+            (_find(points, keyframed, share, METHODS[0]), _find(points, keyframed, share, method))
+            for share in FRACTIONS[1:]
+        ]
+        ahead = [
+            f"{100 * (ours.recall - theirs.recall):+.1f} at {100 * ours.pruned:.0f} %"
+            for ours, theirs in pairs
+            if ours and theirs
+        ]
+        if ahead:
+            lines.append(
+                f"- In {name} the programme's choice against {NAMES[method]}, in points: "
+                + ", ".join(ahead)
+                + "."
+            )
+    return lines
+
+
+def _ratio(whole: Point, small: Point, *, maplab: bool = False) -> float:
+    if maplab and whole.maplab_megabytes and small.maplab_megabytes:
+        return whole.maplab_megabytes / small.maplab_megabytes
+    return whole.megabytes / small.megabytes
+
+
+def _points(before: Point, after: Point) -> str:
+    return f"{100 * (before.recall - after.recall):.1f}"

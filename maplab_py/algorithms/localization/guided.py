@@ -1,0 +1,99 @@
+"""Matches that a rough pose suggests: landmarks it has in view, with keypoints near their images.
+
+Searching the whole map for the nearest descriptor finds a keypoint's landmark only when nothing
+else in the map looks more like it. Where a pose says which landmarks are near which keypoint, the
+descriptor only has to be similar, and a true pose finds most of what is there while a wrong one
+finds next to nothing (active search: Sattler et al., TPAMI 2017).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.geometry import se3
+from maplab_py.vimap.table import ragged_rows
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_RANGE_FACTOR = 2.0
+_TURN_RAD = np.deg2rad(40.0)
+"""A landmark is looked for from up to so much farther, nearer and more aside than it was seen."""
+
+
+def guided_matches(
+    database: LocalizationMap,
+    T_G_I: F64,
+    *,
+    projected: NDArray[np.float32],
+    words: NDArray[np.uint64],
+    origin_I: F64,
+    ray_I: F64,
+    radius_rad: F64,
+    max_distance: float,
+) -> tuple[I64, I64]:
+    """Return keypoints and landmarks of matches near a pose, sorted by keypoint.
+
+    Args:
+        database: The map.
+        T_G_I: Rough pose (7,) of the query.
+        projected: Projected descriptors (N, dimensions) of its keypoints.
+        words: Packed descriptors (N, W); empty rows for summary maps.
+        origin_I: Camera centres (N, 3) of the keypoints in the body frame [m].
+        ray_I: Unit rays (N, 3) of the keypoints in the body frame.
+        radius_rad: Angle (N,) around each ray in which landmarks are looked for.
+        max_distance: Largest distance of descriptors: bits, or squared in the projected space.
+    """
+    landmarks = np.flatnonzero(_in_range(database, T_G_I[4:]))
+    p_I = se3.transform(se3.inverse(T_G_I), database.p_G[landmarks])
+    keypoint, near = _near_rays(origin_I, ray_I, radius_rad, p_I)
+    landmark = landmarks[near]
+    if len(keypoint) == 0:
+        return keypoint, landmark
+    start, rows = database.rows_of
+    count = np.diff(start)[landmark]
+    row = rows[ragged_rows(start, landmark)]
+    owner = np.repeat(keypoint, count)
+    if database.has_bits:
+        from maplab_py.vision.search_kernels import bits_between
+
+        distance = np.empty(len(row))
+        bits_between(words, owner, database.descriptors.words, row, distance)
+    else:
+        offset = projected[owner] - database.descriptors.projected[row]
+        distance = np.einsum("nd,nd->n", offset, offset).astype(np.float64)
+    nearest = np.minimum.reduceat(distance, np.cumsum(count) - count)
+    similar = nearest <= max_distance
+    return keypoint[similar], landmark[similar]
+
+
+def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
+    """Tell which landmarks (L,) may be visible from a place, judging by where they were seen."""
+    s = database.sights
+    toward = p_G_I - database.p_G
+    distance = np.linalg.norm(toward, axis=1)
+    cosine = np.einsum("li,li->l", toward, s.direction) / np.maximum(distance, 1e-9)
+    inside = (distance < _RANGE_FACTOR * s.farthest_m) & (distance * _RANGE_FACTOR > s.nearest_m)
+    return np.asarray(inside & (cosine > np.cos(np.minimum(s.spread_rad + _TURN_RAD, np.pi))))
+
+
+def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I64, I64]:
+    """Return the pairs of rays and points within the radius, sorted by ray."""
+    keypoints, points = [], []
+    centres, camera = np.unique(origin_I, axis=0, return_inverse=True)
+    camera = camera.reshape(-1)
+    for number, centre in enumerate(centres):
+        mine = np.flatnonzero(camera == number)
+        toward = p_I - centre
+        distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
+        x, y, z = (toward / distance[:, None]).T
+        # written out: a product with an inner length of 3 is not worth the threads of BLAS
+        cosine = ray_I[mine, :1] * x + ray_I[mine, 1:2] * y + ray_I[mine, 2:] * z
+        ray, point = np.nonzero(cosine > np.cos(radius_rad[mine])[:, None])
+        keypoints.append(mine[ray])
+        points.append(point)
+    keypoint, point = np.concatenate(keypoints), np.concatenate(points)
+    order = np.argsort(keypoint, kind="stable")
+    return keypoint[order], point[order]

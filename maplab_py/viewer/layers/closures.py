@@ -1,0 +1,55 @@
+"""The loop closures that the map remembers, accepted and refused, whatever has become of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.algorithms.loop_closure.closures import VERDICTS
+from maplab_py.algorithms.loop_closure.record import ClosureRecord, read_record
+from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.errors import MapError
+from maplab_py.viewer import colours
+from maplab_py.viewer.drawing import Drawing, make_segments
+from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, LegendEntry
+
+ACCEPTED, REFUSED = "accepted_closures", "refused_closures"
+_REFUSED_COLOUR = colours.from_hex("#a9adb6")[0]
+
+
+def recorded_closures(drawing: Drawing) -> tuple[list[Layer], list[str]]:
+    """Return a layer of accepted closures, one of refused ones, and what could not be read.
+
+    The accepted ones are coloured by what relaxation has left of their weight.
+    """
+    try:
+        record = read_record(drawing.vi_map).closures
+    except MapError as error:
+        return [], [str(error)]
+    if not len(record):
+        return [], []
+    is_accepted = record.verdict == VERDICTS.index(Verdict.ACCEPTED)
+    legend = LegendEntry("weight", tuple(colours.hex_codes(colours.TRUST)), "0", "1")
+    colour = colours.ramp(record.weight, colours.TRUST)
+    colour[~is_accepted] = _REFUSED_COLOUR
+    ends = [drawing.p_vertices[rows] for rows in closure_ends(drawing, record)]
+
+    def layer(name: str, title: str, chosen: np.ndarray, *legends: LegendEntry) -> Layer:
+        rows = np.flatnonzero(chosen)
+        part = make_segments(ends[0][rows], ends[1][rows], colour[rows], rows, 1.5)
+        return Layer(
+            name, title, {WHOLE_MAP: part}, len(rows), Entity.CLOSURE,
+            legend=legends, is_visible=False,
+        )  # fmt: skip
+
+    return [
+        layer(ACCEPTED, "Accepted closures", is_accepted, legend),
+        layer(REFUSED, "Refused closures", ~is_accepted),
+    ], []
+
+
+def closure_ends(
+    drawing: Drawing, record: ClosureRecord
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], ...]:
+    """Return the rows (N,) of the query's and of the place's vertex of each closure."""
+    rows = drawing.vi_map.vertex_index.rows
+    return rows(record.query).astype(np.int64), rows(record.place).astype(np.int64)
