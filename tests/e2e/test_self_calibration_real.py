@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_the_batch_returns_from_a_disturbed_calibration() -> None:
     session.run("load", map_folder=shared_data("maplab_maps/tango_handheld"))
     entry = session.maps.selected
     session.maps.update(entry.with_value(disturbed(entry.vi_map), "disturb"))
-    report = session.run(
+    report: Any = session.run(
         "self_calibrate",
         batch=True,
         sc_states="intrinsics,extrinsics_rotation,extrinsics_translation",
@@ -60,7 +61,7 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
     for command in ("elq", "optvi", "lc", "optvi"):
         session.run(command)
     truth = shared_data("euroc_imu/V101.gt.csv")
-    before = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
+    before: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
     entry = session.maps.selected
     _, rig_id = device_of(entry.vi_map)
     rig = entry.vi_map.sensors.camera_rig(rig_id)
@@ -76,7 +77,7 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
     }
     start = dataclasses.replace(entry.vi_map.sensors, sensors=sensors)
     session.maps.update(entry.with_value(entry.vi_map.replace(sensors=start), "disturb"))
-    report = session.run(
+    report: Any = session.run(
         "self_calibrate",
         batch=True,
         sc_states="intrinsics,extrinsics_rotation,extrinsics_translation",
@@ -87,5 +88,5 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
     # these images would move the camera by 4 cm: decision 97
     assert found["camera position z"].verdict.startswith("kept: the data would move the camera")
     session.run("optvi")
-    after = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
+    after: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
     assert after.ape_m.rmse <= before.ape_m.rmse

@@ -27,12 +27,12 @@ def report_of(result: FilteredCalibration) -> SelfCalibrationReport:
         landmarks=result.tracks,
         observations=result.observations,
         inconsistent_landmarks=result.tracks_rejected,
-        keypoint_noise_factor=1.0,
+        keypoint_noise_factor=1.0,  # the filter believes what the map says
         cost_before=float("nan"),
         cost_after=float("nan"),
         chi_square_per_freedom=result.mean_square,
         iterations=0,
-        termination="filtered once",
+        termination=f"filtered once; {result.tracks_rejected} tracks rejected",
         seconds_pose=0.0,
         seconds_solve=result.seconds,
     )
