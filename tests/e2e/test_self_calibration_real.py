@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_the_batch_returns_from_a_disturbed_calibration() -> None:
     session.run("load", map_folder=shared_data("maplab_maps/tango_handheld"))
     entry = session.maps.selected
     session.maps.update(entry.with_value(disturbed(entry.vi_map), "disturb"))
-    report = session.run(
+    report: Any = session.run(
         "self_calibrate",
         batch=True,
         sc_states="intrinsics,extrinsics_rotation,extrinsics_translation",
@@ -52,3 +53,40 @@ def test_the_batch_returns_from_a_disturbed_calibration() -> None:
     assert found["camera distortion w"] == pytest.approx(0.9316, abs=1e-3)
     assert report.unobservable == ()
     assert report.chi_square_per_freedom == pytest.approx(1.0, abs=0.1)
+
+
+def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
+    session = Session(load_registry())
+    session.run("load_merge_all_submaps", maps_folder=shared_data("maplab_maps/euroc_v1_01"))
+    for command in ("elq", "optvi", "lc", "optvi"):
+        session.run(command)
+    truth = shared_data("euroc_imu/V101.gt.csv")
+    before: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
+    entry = session.maps.selected
+    _, rig_id = device_of(entry.vi_map)
+    rig = entry.vi_map.sensors.camera_rig(rig_id)
+    camera = rig.cameras[0]
+    wrong = dataclasses.replace(
+        camera,
+        intrinsics=camera.intrinsics * [1.01, 1.01, 1.0, 1.0] + [0.0, 0.0, 4.0, -4.0],
+        distortion_parameters=camera.distortion_parameters * 1.1,
+    )
+    sensors = {
+        **entry.vi_map.sensors.sensors,
+        rig_id: dataclasses.replace(rig, cameras=(wrong,)),
+    }
+    start = dataclasses.replace(entry.vi_map.sensors, sensors=sensors)
+    session.maps.update(entry.with_value(entry.vi_map.replace(sensors=start), "disturb"))
+    report: Any = session.run(
+        "self_calibrate",
+        batch=True,
+        sc_states="intrinsics,extrinsics_rotation,extrinsics_translation",
+    )
+    found = {one.parameter: one for one in report.parameters}
+    assert found["camera focal length u"].after == pytest.approx(459.7, abs=1.0)
+    assert found["camera focal length v"].after == pytest.approx(458.5, abs=1.0)
+    # these images would move the camera by 4 cm: decision 97
+    assert found["camera position z"].verdict.startswith("kept: the data would move the camera")
+    session.run("optvi")
+    after: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")
+    assert after.ape_m.rmse <= before.ape_m.rmse

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.self_calibration.database import device_of
 from maplab_py.console.registry import load_registry
 from maplab_py.console.session import Session
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.storage.native import save_map
+from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import device, scene_map, uncalibrated
 
 FLAGS = {
@@ -51,6 +53,17 @@ def test_batch_uses_everything(session: Session) -> None:
     report = session.run("self_calibrate", batch=True, **FLAGS)
     assert report.keyframes == 61
     assert abs(focal_px(session) - 310.0) <= 1.0
+
+
+def test_the_joint_filter_leaves_the_lens_alone(session: Session) -> None:
+    before = device(session.vi_map)[1]
+    report = session.run("self_calibrate", joint_ekf=True, dry_run=True, **FLAGS)
+    assert device(session.vi_map)[1] is before
+    assert not [one for one in report.parameters if "focal" in one.parameter]
+    session.run("self_calibrate", joint_ekf=True, **FLAGS)
+    after = device(session.vi_map)[1]
+    np.testing.assert_array_equal(after.cameras[0].intrinsics, before.cameras[0].intrinsics)
+    assert np.abs(after.T_B_C - before.T_B_C).max() > 1e-5
 
 
 def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
@@ -107,7 +120,45 @@ def test_mistakes_are_explained(session: Session, tmp_path: Path) -> None:
         session.run("self_calibrate", sc_states="lens")
     with pytest.raises(UserError, match="--sc_groups"):
         session.run("self_calibrate", sc_groups="imu,lens")
+    with pytest.raises(UserError, match="neither with --batch"):
+        session.run("self_calibrate", batch=True, database=tmp_path / "d")
+    with pytest.raises(UserError, match="one of"):
+        session.run("self_calibrate", batch=True, joint_ekf=True)
+    with pytest.raises(UserError, match="max_camera_shift_m"):
+        session.run("self_calibrate", max_camera_shift_m=-1.0)
+    with pytest.raises(UserError, match="sc_segments_per_group"):
+        session.run("self_calibrate", sc_segments_per_group=0)
+    (tmp_path / "notes.txt").write_text("no database")
+    with pytest.raises(UserError, match="not a segment database"):
+        session.run("segment_database_stats", database=tmp_path / "notes.txt")
+    with pytest.raises(UserError, match="is a folder"):
+        session.run("segment_database_stats", database=tmp_path)
     with pytest.raises(UserError, match="no such calibration"):
         session.run("apply_calibration", calibration=tmp_path / "nothing.yaml")
     with pytest.raises(EstimationError, match="sc_segment_keyframes"):
         session.run("collect_segments", database=tmp_path / "d", sc_segment_keyframes=1000)
+
+
+def test_sessions_of_different_calibration_can_be_merged(session: Session) -> None:
+    before = session.vi_map
+    session.run("self_calibrate", batch=True, **FLAGS)
+    calibrated = session.vi_map
+    session.maps.add("again", uncalibrated(scene_map(vertices=61, noise=1.0, seed=2)))
+    session.run("merge_map", map_key="walk", assign_new_ids=True)
+    merged = session.vi_map
+    found = [device_of(merged, np.array([row])) for row in range(2)]
+    assert found[0][0] != found[1][0]
+    assert found[0][1] != found[1][1]
+    imus = [merged.sensors.imu(ids[0]).intrinsics for ids in found]
+    assert imus[0] is None
+    np.testing.assert_array_equal(imus[1].T_a, device(calibrated)[0].intrinsics.T_a)
+    focal = [merged.sensors.camera_rig(ids[1]).cameras[0].intrinsics[0] for ids in found]
+    assert focal == [device(before)[1].cameras[0].intrinsics[0], focal_px_of(calibrated)]
+    # which of the two a calibration of both would be of is not for the program to guess
+    with pytest.raises(UserError, match="map_mission_list"):
+        session.run("self_calibrate", batch=True, **FLAGS)
+    session.run("optvi", ba_num_iterations=2)
+
+
+def focal_px_of(vi_map: VIMap) -> float:
+    return float(device(vi_map)[1].cameras[0].intrinsics[0])

@@ -16,6 +16,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.self_calibration.curvature import with_curvature
 from maplab_py.algorithms.self_calibration.database import device_of
 from maplab_py.algorithms.self_calibration.ekf_tracks import TrackResiduals, linearised, tracks_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
@@ -93,6 +94,8 @@ def filter_jointly(
     """
     began = time.perf_counter()
     device_of(vi_map, missions)
+    if options.imu_curvature:
+        vi_map = with_curvature(vi_map)
     rows = np.arange(len(vi_map.missions)) if missions is None else np.asarray(missions)
     runner = _Filter(vi_map, rows.astype(np.int64), options)
     history = []
