@@ -68,8 +68,8 @@ class Spectrum:
     share: F64  # (k,) posterior over prior variance: 1 = the data say nothing
 
     def unobservable(self, threshold: float = 0.5) -> F64:
-        """Return the directions (k, n) that the data determine no better than the prior."""
-        return np.asarray(self.directions[:, self.share > threshold])
+        """Return the directions (k, n) of which more of the prior is left, the most first."""
+        return np.asarray(self.directions[:, self.share > threshold][:, ::-1])
 
 
 def spectrum(covariance: F64, parameters: Parameters) -> Spectrum:
