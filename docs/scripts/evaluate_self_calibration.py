@@ -171,7 +171,14 @@ class DataSet:
         )
 
 
-def measure(scenario_name: str, sets: range, per_group: int, methods: list[str], out: Path) -> None:
+def measure(
+    scenario_name: str,
+    sets: range,
+    per_group: int,
+    methods: list[str],
+    judged: list[str],
+    out: Path,
+) -> None:
     """Calibrate every data set with every method; append a line each."""
     scenario = load_scenario(scenario_name)
     done = {(row["set"], row["method"]) for row in lines_of(out)}
@@ -187,7 +194,7 @@ def measure(scenario_name: str, sets: range, per_group: int, methods: list[str],
             continue
         data = DataSet.of(scenario, number)
         for method in missing:
-            row = _measured(scenario, data, method, per_group, judge)
+            row = _measured(scenario, data, method, per_group, judge if method in judged else None)
             row["selection_s_per_segment"] = data.selection_s
             _append(out, row)
             map_m = row["map_m"] or float("nan")
@@ -214,7 +221,7 @@ def _segments(scenario: Scenario, data: DataSet, method: str, per_group: int) ->
 
 
 def _measured(
-    scenario: Scenario, data: DataSet, method: str, per_group: int, judge: SimulatedData
+    scenario: Scenario, data: DataSet, method: str, per_group: int, judge: SimulatedData | None
 ) -> dict[str, Any]:
     small, count = _segments(scenario, data, method, per_group)
     began = time.process_time()
@@ -251,7 +258,7 @@ def _measured(
         "segments": count,
         "of_segments": len(data.evaluation.segments),
         "cpu_s": seconds,
-        "map_m": map_error_m(judge, sensors) if method in JUDGED else None,
+        "map_m": None if judge is None else map_error_m(judge, sensors),
         **facts,
     }
 
@@ -322,6 +329,9 @@ def main() -> int:
     parser.add_argument("--swaps", type=float, default=0.0)
     parser.add_argument("--segments_per_group", type=int, default=OPTIONS.segments_per_group)
     parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument(
+        "--judged", default=",".join(JUDGED), help="methods tried on another session"
+    )
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     if arguments.what == "consistency":
@@ -330,7 +340,9 @@ def main() -> int:
     else:
         sets = range(arguments.first, arguments.first + arguments.sets)
         methods = arguments.methods.split(",")
-        measure(arguments.scenario, sets, arguments.segments_per_group, methods, arguments.out)
+        judged = arguments.judged.split(",")
+        per_group = arguments.segments_per_group
+        measure(arguments.scenario, sets, per_group, methods, judged, arguments.out)
     return 0
 
 

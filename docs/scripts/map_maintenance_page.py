@@ -121,7 +121,7 @@ def findings(points: list[Point]) -> list[str]:
     wrong = sum(point.wrong for point in points)
     answers = sum(point.queries for point in points)
     lines.append(
-        f"- Of {answers} answers in all variants together, {wrong} were wrong by more than 0.5 m. "
+        f"- Of {answers} queries in all variants together, {wrong} were answered wrong by more than 0.5 m. "
         f"One of {queries} queries more or less changes recall by {100 / queries:.1f} points."
     )
     return lines

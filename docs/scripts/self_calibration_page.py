@@ -142,7 +142,8 @@ def quality_table(results: Results) -> list[str]:
             f"{np.median([overall(r) for r in rows]):.2f} | {map_mm} |"
         )
     known = ", ".join(
-        f"{1e3 * value:.1f} mm with the {name}" for name, value in results.map_m.items()
+        f"{1e3 * value:.1f} mm with the {name.replace('truth', 'true')}"
+        for name, value in results.map_m.items()
     )
     lines += [
         "",
@@ -232,6 +233,13 @@ def comparison_table(results: Results) -> list[str]:
             f"spread, three groups over a single one, {metric}, 8 segments each",
             "0.56-0.60 (centre, gyroscope misalignment)",
             f"median {np.median(ratio):.2f}; these: {np.median(ratio[thesis]):.2f}",
+        )
+    if results.pairs("informative", "8: A-optimality"):
+        ratio = results.spread_ratio("informative", "8: A-optimality")
+        add(
+            "spread, the 8 best of each group (9 to 12 segments) over a single group of 8",
+            "",
+            f"median {np.median(ratio):.2f}",
         )
     if pairs := results.pairs("two sessions", "batch"):
         own, batch = (

@@ -119,15 +119,26 @@ class CalibratingVisualTerms(VisualTerms):
 
     def node_system(self, states: States, damping: float, values: F64) -> NodeSystem:
         """Eliminate the landmarks; what is left goes, by node, to values (B, 3, 3) and the result."""
-        cost, poses = np.empty(self.num_chunks), values[: 4 * len(self.plan.cols)]
+        cost, poses = np.zeros(self.num_chunks), values[: 4 * len(self.plan.cols)]
         blocks = poses.reshape(-1, 6, 6)
+        self._clear(poses)
+        of_cameras = (
+            self._border,
+            self._camera_square,
+            self._camera_gradient,
+            self._camera_diagonal,
+        )
+        for sums in of_cameras:
+            sums.fill(0.0)
         self._kernels.eliminate_calibrating(
             *self._measured(), states.T_G_I, *self._calibration(states), states.p_G,
             self._prior, self._uv_motion, states.blocks[TIME_OFFSET].values, self.plan, damping,
             self._move_points, self._Y, self._square, self._gradient, self._diagonal,
-            self._border, self._camera_square, self._camera_gradient, self._camera_diagonal,
-            cost, blocks,
+            *of_cameras, cost, blocks,
         )  # fmt: skip
+        for sums in of_cameras:
+            for chunk in sums[1:]:
+                sums[0] += chunk
         self._kernels.cut_blocks(self.plan, blocks, poses)
         nodes = self.camera_nodes(states)
         gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))

@@ -329,10 +329,10 @@ def normal_equations(  # type: ignore[no-untyped-def]
         cost += trust[edge] * u
         w *= trust[edge]
         if a >= 0:
-            _product(J_a, J_a, w, blocks[a])
+            _square(J_a, w, blocks[a])
             _add(J_a, E, w, blocks[a], gradient[node_a[edge]], diagonal[node_a[edge]])
         if b >= 0:
-            _product(J_b, J_b, w, blocks[b])
+            _square(J_b, w, blocks[b])
             _add(J_b, E, w, blocks[b], gradient[node_b[edge]], diagonal[node_b[edge]])
         if below >= 0:
             _product(J_b, J_a, w, blocks[below])
@@ -347,9 +347,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
 @compiled(inline="always")
 def _ad(x, out):  # type: ignore[no-untyped-def]
     """Fill in ad_x (6, 6) of a twist [v, w]: ad_x y = [w_x x v_y + v_x x w_y, w_x x w_y]."""
-    for i in range(6):
-        for j in range(6):
-            out[i, j] = 0.0
+    out[:, :] = 0.0
     for first, offset in ((3, 0), (0, 3)):
         a, b, c = x[first], x[first + 1], x[first + 2]
         out[0, offset + 1], out[0, offset + 2] = -c, b
@@ -363,9 +361,7 @@ def _ad(x, out):  # type: ignore[no-untyped-def]
 @compiled(inline="always")
 def _dual(f, out):  # type: ignore[no-untyped-def]
     """Fill in C (6, 6) with x^T C y = f^T ad_x y: antisymmetric, as ad_x y = -ad_y x."""
-    for i in range(6):
-        for j in range(6):
-            out[i, j] = 0.0
+    out[:, :] = 0.0
     for row, col, part in ((3, 0, 0), (0, 3, 0), (3, 3, 3)):
         a, b, c = f[part], f[part + 1], f[part + 2]
         out[row + 0, col + 1], out[row + 0, col + 2] = c, -b
@@ -481,11 +477,20 @@ def _add(J, E, w, block, gradient, diagonal):  # type: ignore[no-untyped-def]
 @compiled(inline="always")
 def _product(A, B, w, out):  # type: ignore[no-untyped-def]
     """Fill in w A^T B."""
-    for i in range(6):
-        for j in range(6):
-            out[i, j] = 0.0
+    out[:, :] = 0.0
     for k in range(6):
         for i in range(6):
             a = w * A[k, i]
             for j in range(6):
                 out[i, j] += a * B[k, j]
+
+
+@compiled(inline="always")
+def _square(A, w, out):  # type: ignore[no-untyped-def]
+    """Fill in the lower triangle of w A^T A, and zeros."""
+    out[:, :] = 0.0
+    for k in range(6):
+        for i in range(6):
+            a = w * A[k, i]
+            for j in range(i + 1):
+                out[i, j] += a * A[k, j]

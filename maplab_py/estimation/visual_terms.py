@@ -181,7 +181,8 @@ class VisualTerms:
         """
         if values is None:
             values = np.empty((4 * len(self.plan.cols), 3, 3))
-        cost, blocks = np.empty(self.num_chunks), values.reshape(-1, 6, 6)
+        cost, blocks = np.zeros(self.num_chunks), values.reshape(-1, 6, 6)
+        self._clear(values)
         self._kernels.eliminate(
             *self._measured(), T_G_I, self._cameras.T_I_C, self._cameras.parameters, p_G,
             self._prior, self.plan, damping, self._move_points, self._Y, self._square,
@@ -189,6 +190,11 @@ class VisualTerms:
         )  # fmt: skip
         self._kernels.cut_blocks(self.plan, blocks, values)
         return VisualSystem(values, self._gradient[0], self._diagonal[0], 0.5 * float(cost[0]))
+
+    def _clear(self, values: F64) -> None:
+        """Set everything that an elimination adds to to zero."""
+        for sums in (values, self._square, self._gradient, self._diagonal):
+            sums.fill(0.0)
 
     def step(
         self, T_G_I: F64, p_G: F64, pose_step: F64, new_T_G_I: F64, damping: float

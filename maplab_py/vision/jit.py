@@ -3,14 +3,20 @@
 The cache entry of a kernel is valid as long as its source FILE keeps its time stamp; edits of
 jitted functions in other files go unseen. So compiled functions that call each other live in one
 file.
+
+Threads that wait for others sleep, as `estimation.linear.jit` explains: OpenMP reads the variable
+once, when whichever kernel comes first starts its threads.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any
 
 import numba
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

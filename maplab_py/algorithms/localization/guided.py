@@ -87,13 +87,22 @@ def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I6
     for number, centre in enumerate(centres):
         mine = np.flatnonzero(camera == number)
         toward = p_I - centre
-        distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
-        x, y, z = (toward / distance[:, None]).T
+        toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-9)[:, None]
+        in_view = np.flatnonzero(_in_cone(ray_I[mine], float(radius_rad[mine].max()), toward))
+        x, y, z = toward[in_view].T
         # written out: a product with an inner length of 3 is not worth the threads of BLAS
         cosine = ray_I[mine, :1] * x + ray_I[mine, 1:2] * y + ray_I[mine, 2:] * z
         ray, point = np.nonzero(cosine > np.cos(radius_rad[mine])[:, None])
         keypoints.append(mine[ray])
-        points.append(point)
+        points.append(in_view[point])
     keypoint, point = np.concatenate(keypoints), np.concatenate(points)
     order = np.argsort(keypoint, kind="stable")
     return keypoint[order], point[order]
+
+
+def _in_cone(ray: F64, radius_rad: float, toward: F64) -> NDArray[np.bool_]:
+    """Tell which directions (N, 3) lie in the cone around all rays (R, 3), or near to it."""
+    axis = ray.mean(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    widest = float(np.arccos(np.clip((ray @ axis).min(), -1.0, 1.0)))
+    return np.asarray(toward @ axis > np.cos(min(widest + radius_rad, np.pi)))

@@ -22,6 +22,9 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+_TILE_PX = 4.0
+_TILES = 1 << 20  # more than an image is high
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapFeatures:
@@ -149,13 +152,23 @@ def _rays(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, F64, Mask]:
 
 
 def _bearings(camera: Camera, uv: F64) -> tuple[F64, F64, Mask]:
-    """Return unit rays in C, the angle that one pixel covers (geometric mean), and validity."""
+    """Return unit rays in C, the angle that one pixel covers (geometric mean), and validity.
+
+    The angle hardly changes from pixel to pixel: it is that of the middle of a small tile.
+    """
     bearing, ok = back_project(camera, uv)
-    right, ok_right = back_project(camera, uv + np.array([1.0, 0.0]))
-    below, ok_below = back_project(camera, uv + np.array([0.0, 1.0]))
-    area = np.linalg.norm(np.cross(right - bearing, below - bearing), axis=1)
-    ok = ok & ok_right & ok_below & (area > 0.0)
-    return bearing, np.sqrt(np.where(ok, area, 1.0)), ok
+    tile = np.floor(np.nan_to_num(uv) / _TILE_PX).astype(np.int64)
+    first = tile.min(axis=0, initial=0)
+    key = (tile - first) @ np.array([_TILES, 1])
+    key, of_keypoint = np.unique(key, return_inverse=True)
+    middle = (np.stack(np.divmod(key, _TILES), axis=1) + first + 0.5) * _TILE_PX
+    ray, ok_middle = back_project(camera, middle)
+    right, ok_right = back_project(camera, middle + np.array([1.0, 0.0]))
+    below, ok_below = back_project(camera, middle + np.array([0.0, 1.0]))
+    area = np.linalg.norm(np.cross(right - ray, below - ray), axis=1)
+    is_sound = ok_middle & ok_right & ok_below & (area > 0.0)
+    angle = np.sqrt(np.where(is_sound, area, 1.0))
+    return bearing, angle[of_keypoint], ok & is_sound[of_keypoint]
 
 
 def points_in_mission(vi_map: VIMap, landmarks: I64, mission: I64) -> F64:

@@ -86,7 +86,9 @@ def optimize_graph(
     weight = np.ones(len(edges))
     if len(loops) == 0:
         optimizer = PoseGraphOptimizer(is_free, trajectory, loops, none, "none")
-        T, iterations = optimizer.run(graph.T_G_V, 1.0, options.num_iterations, progress)
+        T, iterations = optimizer.run(
+            graph.T_G_V, 1.0, options.num_iterations, progress, options.function_tolerance
+        )
         before, after = optimizer.cost(graph.T_G_V, 1.0), optimizer.cost(T, 1.0)
         return OptimizedGraph(T, weight, before, after, iterations)
     solution = optimize_robustly(graph.T_G_V, is_free, trajectory, loops, none, options, progress)

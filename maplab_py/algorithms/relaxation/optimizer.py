@@ -24,11 +24,10 @@ I64 = NDArray[np.int64]
 
 _FIRST_DAMPING = 1e-8
 _LARGEST_DAMPING = 1e8
-_REMAINING = 1e-8  # relative decrease of the cost that is not worth another iteration
+_TOLERANCE = 1e-7
 _SLOW = 0.02  # of the last decrease: second derivatives pay
 _NEAR = 0.05  # relative decrease of the cost; farther off they lead astray
 _UNDAMPED = (1e-12, 1e-9, 1e-6)  # enough for parts that no closure holds any more
-_EYE = np.eye(6)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,6 +81,7 @@ class PoseGraphOptimizer:
         nodes = np.arange(size)
         self._blocks = np.zeros((first + size, 6, 6))
         self._own = self._blocks[first:]
+        self._diagonal = np.einsum("nii->ni", self._own)  # a view
         self._solver = BlockCholesky(
             np.concatenate([*rows, nodes]),
             np.concatenate([*cols, nodes]),
@@ -121,7 +121,7 @@ class PoseGraphOptimizer:
         """
         linear = self._linearize(T_G_I, 1.0, bend=False)
         for damping in _UNDAMPED:
-            self._own += (damping * linear.diagonal)[:, :, None] * _EYE
+            self._diagonal += damping * linear.diagonal
             with contextlib.suppress(NotPositiveDefinite):
                 self._solver.factor(self._blocks)
                 break
@@ -139,12 +139,17 @@ class PoseGraphOptimizer:
         return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
 
     def run(
-        self, T_G_I: F64, price: float, max_iterations: int, progress: Progress
+        self,
+        T_G_I: F64,
+        price: float,
+        max_iterations: int,
+        progress: Progress,
+        tolerance: float = _TOLERANCE,
     ) -> tuple[F64, int]:
         """Iterate from poses (V, 7); return the new ones and the number of iterations.
 
         It ends when the decreases, which shrink by some factor from step to step, add up to no more
-        than 1e-7 of the cost from here on.
+        than the tolerance times the cost from here on.
 
         Raises:
             EstimationError: The poses are not determined, or not finite.
@@ -172,7 +177,7 @@ class PoseGraphOptimizer:
             progress.line(f"  relax {iteration + 1:3d}  cost {cost:12.6g}  price {price:10.4g}")
             before, decrease = decrease, linear.cost - cost
             ratio = min(decrease / before, 0.999) if before > 0.0 else 0.5
-            if decrease * ratio / (1.0 - ratio) <= _REMAINING * cost:
+            if decrease * ratio / (1.0 - ratio) <= tolerance * cost:
                 return T_G_I, iteration + 1
             bend = bend or (
                 self._loss.code == edge_kernels.QUADRATIC
@@ -193,14 +198,14 @@ class PoseGraphOptimizer:
 
     def _step(self, T_G_I: F64, linear: _Linearization, damping: float) -> F64 | None:
         """Return the poses after one damped step; None when it has no solution."""
-        undamped = self._own.copy()
-        self._own += (damping * linear.diagonal)[:, :, None] * _EYE
+        undamped = self._diagonal.copy()
+        np.add(undamped, damping * linear.diagonal, out=self._diagonal)
         try:
             self._solver.factor(self._blocks)
         except NotPositiveDefinite:
             return None
         finally:
-            self._own[:] = undamped
+            self._diagonal[:] = undamped
         step = self._solver.solve(-linear.gradient.reshape(-1)).reshape(-1, 6)
         moved: F64 = kernels.moved(T_G_I, self._free, step)
         return moved if bool(np.isfinite(step).all()) else None

@@ -56,6 +56,11 @@ class RelaxationOptions:
     num_iterations: int = option(
         30, help="Iterations of the last optimisation, at most; those before it take a few each."
     )
+    function_tolerance: float = option(
+        1e-7,
+        help="Share of the cost that further iterations of the last optimisation may be expected to "
+        "save when it ends.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)

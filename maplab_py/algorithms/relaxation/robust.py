@@ -98,7 +98,7 @@ class _Graph:
         self.optimizer = PoseGraphOptimizer(is_free, trajectory, loops, tilt, name)
 
     def plain(self) -> Solution:
-        T, iterations = self._run(self.T_G_I, 1.0, self.options.num_iterations)
+        T, iterations = self._finish(self.optimizer, self.T_G_I, 1.0)
         return self._solution(T, np.ones(len(self.loops)), iterations, 1.0)
 
     def annealed(self) -> Solution:
@@ -107,7 +107,7 @@ class _Graph:
         solutions: list[Solution] = []
         for share in _STARTS:
             T, iterations = self._anneal(share, price)
-            T, more = self._run(T, price, self.options.num_iterations)
+            T, more = self._finish(self.optimizer, T, price)
             weight = self.loss(self.loops.squared_errors(T), price)[1]
             solutions.append(self._solution(T, weight, iterations + more, price))
             if np.all(weight > _TRUSTED):
@@ -146,7 +146,7 @@ class _Graph:
             if price <= wanted * 1.5:
                 break
             price = max(price / _PRICE_RATIO, wanted)
-            T, used = self._run(T, price, _STAGE_ITERATIONS)
+            T, used = self._stage(T, price)
             iterations += used
             u = self.loops.squared_errors(T)
         kept = u < 2.0 * price
@@ -163,7 +163,7 @@ class _Graph:
             if np.array_equal(before, kept):
                 break
         optimizer.trust(kept)
-        T, used = optimizer.run(T, 1.0, self.options.num_iterations, self.progress)
+        T, used = self._finish(optimizer, T, 1.0)
         first, last = (optimizer.cost(x, 1.0) for x in (self.T_G_I, T))
         return Solution(T, kept.astype(np.float64), iterations + used, first, last), limit
 
@@ -183,13 +183,19 @@ class _Graph:
         stages = int(np.ceil(np.log(max(highest / price, 1.0)) / np.log(_PRICE_RATIO)))
         T, iterations = self.T_G_I, 0
         for stage in range(stages, -1, -1):
-            T, used = self._run(T, price * _PRICE_RATIO**stage, _STAGE_ITERATIONS)
+            T, used = self._stage(T, price * _PRICE_RATIO**stage)
             iterations += used
             self.progress.step(stages + 1 - stage, stages + 1, "relaxing")
         return T, iterations
 
-    def _run(self, T: F64, price: float, max_iterations: int) -> tuple[F64, int]:
-        return self.optimizer.run(T, price, max_iterations, self.progress)
+    def _stage(self, T: F64, price: float) -> tuple[F64, int]:
+        return self.optimizer.run(T, price, _STAGE_ITERATIONS, self.progress)
+
+    def _finish(self, optimizer: PoseGraphOptimizer, T: F64, price: float) -> tuple[F64, int]:
+        options = self.options
+        return optimizer.run(
+            T, price, options.num_iterations, self.progress, options.function_tolerance
+        )
 
     def _solution(self, T: F64, weight: F64, iterations: int, price: float) -> Solution:
         before, after = (self.optimizer.cost(x, price) for x in (self.T_G_I, T))

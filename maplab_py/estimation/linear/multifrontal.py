@@ -184,8 +184,6 @@ def _add_matrix_blocks(plan: FrontPlan, supernode: int, values: F64, panel: F64)
 def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -> None:
     """Add a child's update matrix to a front ("extend-add").
 
-    Nodes that are neighbours in both matrices are added in one go.
-
     Args:
         panel: First columns of the front, [column, row] (w, w + n).
         update: The others, [column, row] (n, n).
@@ -193,25 +191,18 @@ def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -
         place: Local node of the front for every node of the child's matrix, ascending.
         d: Rows of a node.
     """
-    width, count = panel.shape[0], len(place)
-    run_end = np.empty(count, np.int64)  # where the neighbours of a node end
-    for i in range(count - 1, -1, -1):
-        goes_on = i + 1 < count and place[i + 1] == place[i] + 1
-        run_end[i] = run_end[i + 1] if goes_on else i + 1
-    for j in range(count):
-        for c in range(j * d, (j + 1) * d):
-            col = c + (place[j] - j) * d
-            first, i = c, j
-            while i < count:
-                end, shift = run_end[i] * d, (place[i] - i) * d
-                if col < width:
-                    for r in range(first, end):
-                        panel[col, r + shift] += child[c, r]
-                else:
-                    for r in range(first, end):
-                        update[col - width, r + shift - width] += child[c, r]
-                i = run_end[i]
-                first = i * d
+    width = panel.shape[0]
+    for j in range(len(place)):
+        col = place[j] * d
+        for i in range(j, len(place)):
+            row = place[i] * d
+            for c in range(d):
+                for r in range(c if i == j else 0, d):
+                    value = child[j * d + c, i * d + r]
+                    if col < width:
+                        panel[col + c, row + r] += value
+                    else:
+                        update[col - width + c, row - width + r] += value
 
 
 @compiled()
@@ -237,8 +228,7 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
         panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + n)
         panel[:] = 0.0
         update = front[: n * n].reshape(n, n)
-        for c in range(n):
-            update[c, c:] = 0.0  # only lower triangles are read
+        update[:] = 0.0
         _add_matrix_blocks(plan, s, values, panel)
         for _ in range(plan.child_count[s]):
             num_waiting -= 1
@@ -256,9 +246,7 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
             below = factor[plan.panel_start[s] + w :]  # L21 starts below L11 in every column
             _solve_triangle(blas, RIGHT, TRANSPOSED, triangle, w + n, below, n, w, w + n)
             _subtract_square(blas, below, w + n, n, w, front)
-            waiting_update = stack[top : top + n * n].reshape(n, n)
-            for c in range(n):
-                waiting_update[c, c:] = update[c, c:]
+            stack[top : top + n * n] = front[: n * n]
             top += n * n
             waiting[num_waiting] = s
             num_waiting += 1

@@ -151,17 +151,19 @@ def subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, blocks):
                     a += 1
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_chunks(plan, square, gradient, diagonal, cost, blocks):
     """Add the sums of all chunks into chunk 0, always in the same order, and P'P to the blocks."""
     chunks = square.shape[0]
-    for pose in prange(square.shape[1]):
+    for pose in range(square.shape[1]):
         block = plan.row_start[pose + 1] - 1
         for chunk in range(chunks):
-            blocks[block] += square[chunk, pose]
-        for chunk in range(1, chunks):
-            gradient[0, pose] += gradient[chunk, pose]
-            diagonal[0, pose] += diagonal[chunk, pose]
+            for c in range(6):
+                for e in range(6):
+                    blocks[block, c, e] += square[chunk, pose, c, e]
+                if chunk > 0:
+                    gradient[0, pose, c] += gradient[chunk, pose, c]
+                    diagonal[0, pose, c] += diagonal[chunk, pose, c]
     for chunk in range(1, chunks):
         cost[0] += cost[chunk]
 
@@ -175,11 +177,14 @@ def cut_blocks(plan, blocks, parts):
     for row in prange(len(plan.row_start) - 1):
         whole = np.empty((6, 6))
         for block in range(plan.row_start[row], plan.row_start[row + 1]):
-            whole[:] = blocks[block]
             for c in range(6):
                 for e in range(6):
-                    parts[4 * block + 2 * (c // 3) + e // 3, c % 3, e % 3] = whole[c, e]
-        parts[4 * plan.row_start[row + 1] - 3] = 0.0
+                    whole[c, e] = blocks[block, c, e]
+            for c in range(6):
+                for e in range(6):
+                    is_upper = plan.cols[block] == row and c < 3 and e >= 3
+                    part = 4 * block + 2 * (c // 3) + e // 3
+                    parts[part, c % 3, e % 3] = 0.0 if is_upper else whole[c, e]
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -192,13 +197,8 @@ def eliminate(
     Room: Y (observations of the largest slab, 3, 6), square (chunks, P, 6, 6).
     Out: gradient and diagonal (chunks, P, 6), the latter that of the unreduced equations, and cost
     (chunks,), the sum of rho: chunk 0 holds the sum over all chunks at the end. blocks (B, 6, 6):
-    block [row pose, column pose] of each co-observing pair.
+    block [row pose, column pose] of each co-observing pair. Everything but Y is zero at first.
     """
-    square[:] = 0.0
-    gradient[:] = 0.0
-    diagonal[:] = 0.0
-    cost[:] = 0.0
-    blocks[:] = 0.0
     for slab in range(len(plan.slab_start) - 1):
         base = start[plan.slab_start[slab]]
         for chunk in prange(len(cost)):

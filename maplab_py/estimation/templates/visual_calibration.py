@@ -123,17 +123,9 @@ def eliminate_calibrating(
     """Form the reduced normal equations of poses and cameras.
 
     Out, beside those of `eliminate`: border (chunks, C, P, W, 6), square (chunks, C, C, W, W),
-    camera_gradient and camera_diagonal (chunks, C, W), W = CAMERA_COLUMNS. Chunk 0 holds the sums.
+    camera_gradient and camera_diagonal (chunks, C, W), W = CAMERA_COLUMNS. Chunk 0 holds the sums
+    of poses; those of cameras remain to be added. Everything but Y is zero at first.
     """
-    pose_square[:] = 0.0
-    gradient[:] = 0.0
-    diagonal[:] = 0.0
-    cost[:] = 0.0
-    blocks[:] = 0.0
-    border[:] = 0.0
-    square[:] = 0.0
-    camera_gradient[:] = 0.0
-    camera_diagonal[:] = 0.0
     for slab in range(len(plan.slab_start) - 1):
         base = start[plan.slab_start[slab]]
         for chunk in prange(len(cost)):
@@ -162,11 +154,6 @@ def eliminate_calibrating(
         if move_points:
             subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, blocks)
     add_chunks(plan, pose_square, gradient, diagonal, cost, blocks)
-    for chunk in range(1, len(cost)):
-        border[0] += border[chunk]
-        square[0] += square[chunk]
-        camera_gradient[0] += camera_gradient[chunk]
-        camera_diagonal[0] += camera_diagonal[chunk]
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})

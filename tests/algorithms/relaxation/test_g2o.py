@@ -131,11 +131,17 @@ def _rms(T, reference):
 def test_false_edges_are_switched_off_and_true_ones_kept(name, seed):
     graph = read_g2o(shared_data(f"g2o/{name}.g2o"))
     wrong, without, is_false = _disturbed(graph, seed)
-    robust, bent = optimize_graph(wrong, RelaxationOptions()), optimize_graph(wrong, PLAIN)
+    tight = {
+        "function_tolerance": 1e-10,
+        "num_iterations": 100,
+    }  # the garage hangs together loosely
+    plain = RelaxationOptions(robustness="none", **tight)
+    robust = optimize_graph(wrong, RelaxationOptions(**tight))
+    bent = optimize_graph(wrong, PLAIN)
     assert robust.weight[is_false].max() < 0.1
     assert robust.weight[~is_false].min() > 0.9
-    best = optimize_graph(graph, PLAIN).T_G_V
-    clean_error = _rms(optimize_graph(without, PLAIN).T_G_V, best)
+    best = optimize_graph(graph, plain).T_G_V
+    clean_error = _rms(optimize_graph(without, plain).T_G_V, best)
     assert _rms(robust.T_G_V, best) <= 1.1 * clean_error
     assert _rms(bent.T_G_V, best) > 3.0 * clean_error
 

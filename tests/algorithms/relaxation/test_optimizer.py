@@ -32,8 +32,10 @@ def _system(optimizer, T, bend):
     pattern, size = optimizer._solver._pattern, len(linear.gradient)
     H = np.zeros((size, size, 6, 6))
     for row, col, block in zip(pattern.rows, pattern.cols, optimizer._blocks, strict=True):
-        H[row, col] += block
-        if row != col:
+        if row == col:  # the lower triangle counts
+            H[row, col] += np.tril(block) + np.tril(block, -1).T
+        else:
+            H[row, col] += block
             H[col, row] += block.T
     return linear.gradient.reshape(-1), H.transpose(0, 2, 1, 3).reshape(6 * size, 6 * size)
 

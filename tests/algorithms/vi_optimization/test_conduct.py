@@ -62,7 +62,8 @@ def test_cancelling_between_iterations_leaves_the_map_untouched(cancel_at: int, 
     options = dataclasses.replace(OPTIONS, hide_iterations_console_output=hide)
     with pytest.raises(Cancelled):
         optimize(vi_map, options, progress=watcher)
-    assert len(watcher.lines) == (0 if hide else cancel_at - 1)
+    iterations = [line for line in watcher.lines if not line.startswith("compiling")]
+    assert len(iterations) == (0 if hide else cancel_at - 1)
     assert contents(vi_map) == before
 
 
