@@ -309,14 +309,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
         A, B = T[from_vertex[edge]], T[to_vertex[edge]]
         a, b, below = slot[edge, 0], slot[edge, 1], slot[edge, 2]
         if trust[edge] == 0.0:
-            for i in range(6):
-                for j in range(6):
-                    if a >= 0:
-                        blocks[a, i, j] = 0.0
-                    if b >= 0:
-                        blocks[b, i, j] = 0.0
-                    if below != -1:
-                        blocks[below if below >= 0 else -below - 2, i, j] = 0.0
+            _clear(blocks, a, b, below)
             continue
         _residual(A, B, measured[edge], is_log[edge], e, p, q_B_A, y, R, q_A_B, q)
         _derivatives(measured[edge], is_log[edge], e, p, q_B_A, y, D_a, D_b, parts)
@@ -342,6 +335,19 @@ def normal_equations(  # type: ignore[no-untyped-def]
             _bend(W[edge], E, e, D_a, D_b, room, dual)
             _add_bend(room, w, a, b, below, blocks)
     return cost
+
+
+@compiled()
+def _clear(blocks, a, b, below):  # type: ignore[no-untyped-def]
+    """Set the blocks of an edge without weight to zero."""
+    for i in range(6):
+        for j in range(6):
+            if a >= 0:
+                blocks[a, i, j] = 0.0
+            if b >= 0:
+                blocks[b, i, j] = 0.0
+            if below != -1:
+                blocks[below if below >= 0 else -below - 2, i, j] = 0.0
 
 
 @compiled(inline="always")
