@@ -101,8 +101,9 @@ def test_only_the_plugins_that_the_environment_names_load(tmp_path: Path) -> Non
     assert done.returncode == 2
 
 
-def test_start_up_time(tmp_path: Path) -> None:
+def test_start_up_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Time of the processor, which other programs on the machine do not prolong."""
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)  # installed, it is compiled
     run_program(tmp_path, "-c", "help")
     seconds = []
     for _ in range(3):
