@@ -53,6 +53,7 @@ def session() -> Session:
         ("optvi --map_mission_list=1", 10),
     ],
 )
+from tests.support.machine import slowness
 def test_completion_latency(session: Session, line: str, at_least: int) -> None:
     completer = CommandCompleter(session)
     seconds = []
@@ -61,4 +62,4 @@ def test_completion_latency(session: Session, line: str, at_least: int) -> None:
         found = list(completer.get_completions(Document(line), CompleteEvent()))
         seconds.append(time.process_time() - start)
         assert len(found) >= at_least
-    assert sorted(seconds)[3] <= MOST_SECONDS
+    assert sorted(seconds)[3] <= MOST_SECONDS * slowness()
