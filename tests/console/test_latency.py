@@ -15,6 +15,7 @@ from maplab_py.console.registry import Plugin, load_registry
 from maplab_py.console.session import Session
 from maplab_py.plugin import CommandContext
 from maplab_py.vimap import BaseFrames, Missions, VIMap
+from tests.support.machine import slowness
 
 MOST_SECONDS = 0.030
 COMMANDS, MAPS, MISSIONS = 100, 20, 1000
@@ -53,7 +54,6 @@ def session() -> Session:
         ("optvi --map_mission_list=1", 10),
     ],
 )
-from tests.support.machine import slowness
 def test_completion_latency(session: Session, line: str, at_least: int) -> None:
     completer = CommandCompleter(session)
     seconds = []

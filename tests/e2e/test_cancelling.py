@@ -9,6 +9,7 @@ import pytest
 
 from tests.e2e.support import Console, run_program
 from tests.registry.workspace import folder_digest
+from tests.support.machine import slowness
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +44,6 @@ LINES = (
     ("landmark_sparsify --num_landmarks_to_keep=2000", (0.5,)),
     ("load --map_folder=map --map_key=again", (0.1,)),
 )
-from tests.support.machine import slowness
 
 
 def test_ctrl_c(large: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.support import PROGRAM, environment, run_program
+from tests.support.machine import slowness
 
 
 @pytest.mark.parametrize(
@@ -34,7 +35,6 @@ from tests.e2e.support import PROGRAM, environment, run_program
         (("-c",), 2),
     ],
 )
-from tests.support.machine import slowness
 def test_exit_status(tmp_path: Path, arguments: tuple[str, ...], status: int) -> None:
     done = run_program(tmp_path, *arguments)
     assert done.returncode == status, done.stderr

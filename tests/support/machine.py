@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-_REFERENCE_SECONDS = 0.1
+_REFERENCE_SECONDS = 0.04
 """Time of the loop below on an ordinary machine that is not throttled."""
 
 

@@ -14,6 +14,7 @@ from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from maplab_py.sensors.imu_model import distort_imu
 from tests.estimation.imu.motion import one_edge, sampled, truth
+from tests.support.machine import slowness
 
 ZERO = np.zeros(3)
 INTRINSICS = ImuIntrinsics(
@@ -21,7 +22,6 @@ INTRINSICS = ImuIntrinsics(
     T_a=np.array([[0.99, -0.02, 0.01], [0, 1.03, 0.02], [0, 0, 0.98]]),
     R_A_I=so3.to_matrix(so3.exp([0.02, -0.03, 0.01])),
 )
-from tests.support.machine import slowness
 
 
 def _as_vector(edges, reference):
