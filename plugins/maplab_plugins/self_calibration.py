@@ -21,7 +21,15 @@ from maplab_py.algorithms.self_calibration.reports import (
     InformationReport,
     SelfCalibrationReport,
 )
-from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.plugin import (
+    CommandContext,
+    Message,
+    Report,
+    UserError,
+    check_writable,
+    command,
+    write_text,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -296,7 +304,7 @@ def export_segments(
     "evaluate_segment_information",
     example="evaluate_segment_information --plot=information.svg",
     see_also=("collect_segments",),
-    acts_outside=True,
+    writes_files=True,
 )
 def evaluate_segment_information(
     context: CommandContext,
@@ -307,6 +315,7 @@ def evaluate_segment_information(
     csv: Path | None = None,
     map_mission: str = "",
     map_mission_list: str = "",
+    overwrite: bool = False,
 ) -> InformationReport:
     """Say how informative every segment is for each group of parameters; less is more.
 
@@ -316,11 +325,15 @@ def evaluate_segment_information(
         csv: Write segments with their information to this file, which the viewer reads.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
         map_mission_list: Several missions, separated by commas.
+        overwrite: Replace files that exist.
     """
     import numpy as np
 
     from maplab_py.algorithms.self_calibration import drawing, workflow
 
+    for file in (plot, csv):
+        if file is not None:
+            check_writable(file, overwrite=overwrite)
     report, segments = workflow.segment_information(
         context.vi_map,
         checked(options),
@@ -330,12 +343,14 @@ def evaluate_segment_information(
     values = np.array([getattr(one, group) for one in report.segments])
     if plot is not None:
         title = f"information about {group} ({options.metric.replace('_', '-')})"
-        _write(plot, drawing.draw(context.vi_map, segments, values, title))
+        write_text(
+            plot, [drawing.draw(context.vi_map, segments, values, title)], overwrite=overwrite
+        )
     if csv is not None:
         rows = [
             (one.mission, one.start_ns, one.end_ns, getattr(one, group)) for one in report.segments
         ]
-        _write(csv, drawing.as_csv(rows))
+        write_text(csv, [drawing.as_csv(rows)], overwrite=overwrite)
     return report
 
 
@@ -372,7 +387,7 @@ def apply_calibration(
     "export_calibration",
     example="export_calibration --format=kalibr --folder=calibration",
     see_also=("apply_calibration",),
-    acts_outside=True,
+    writes_files=True,
 )
 def export_calibration(
     context: CommandContext,
@@ -381,6 +396,7 @@ def export_calibration(
     format: Literal["maplab", "kalibr", "openvins", "basalt"] = "maplab",
     map_mission: str = "",
     map_mission_list: str = "",
+    overwrite: bool = False,
 ) -> ExportedFiles:
     """Write the calibration of the map's device for maplab, kalibr, OpenVINS or Basalt.
 
@@ -389,6 +405,7 @@ def export_calibration(
         format: Whose format.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
         map_mission_list: Several missions, separated by commas.
+        overwrite: Replace files that exist.
     """
     import numpy as np
 
@@ -400,8 +417,10 @@ def export_calibration(
     steps = steps[(steps > 0) & (steps < 1e9)]
     rate = round(1e9 / float(np.median(steps)), 3) if len(steps) else 200.0
     contents = export.exported(vi_map.sensors, *ids, format, imu_rate_hz=rate)
+    for name in contents:
+        check_writable(folder / name, overwrite=overwrite)
     for name, text in contents.items():
-        _write(folder / name, text)
+        write_text(folder / name, [text], overwrite=overwrite)
     return ExportedFiles(tuple(folder / name for name in contents))
 
 
@@ -452,11 +471,3 @@ def _sensors_of(path: Path) -> SensorSet:
     if not path.is_file():
         raise UserError(f"{path}: there is no such calibration (sensors.yaml or map folder)")
     return read_sensors(path)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error

@@ -21,6 +21,7 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.parameters import Parameters
 from maplab_py.algorithms.self_calibration.problem import SegmentProblem, pose, vi_options
 from maplab_py.algorithms.self_calibration.reports import ParameterEstimate, SelfCalibrationReport
+from maplab_py.algorithms.self_calibration.scale import check_scale
 from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sensors, written_back
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -102,6 +103,8 @@ def calibrate(
     names = tuple(name_direction(one, problem.parameters) for one in directions.T)
     if names and not options.keep_unobservable_at_prior:
         raise EstimationError(_refusal(names))
+    if not names:
+        check_scale(rough.posed.states, states, vi_map.vertices.mission)
     calibration = Calibration(
         with_estimated_sensors(problem.posed, states),
         problem.parameters,
