@@ -17,9 +17,9 @@ from maplab_py.viewer.display.viewer import Viewer
 WIDTH, HEIGHT = 1000, 700
 _LAZY = """
 const draw = window.requestAnimationFrame;
-window.requestAnimationFrame = (f) => setTimeout(() => draw(f), 1500);
+window.requestAnimationFrame = (f) => setTimeout(() => draw(f), %d);
 """
-"""Draws seldom: ten pages that render in software would take all of a small machine."""
+"""Draws seldom: pages that render in software would take all of a small machine."""
 
 _TWO_FRAMES = "() => new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))"
 
@@ -49,12 +49,11 @@ class Page:
         url: str,
         size_px: tuple[int, int] = (WIDTH, HEIGHT),
         *,
-        is_lazy: bool = False,
+        frame_ms: int = 120,
     ) -> None:
         self.page = browser.new_page(viewport={"width": size_px[0], "height": size_px[1]})
         self.page.set_default_timeout(120_000)
-        if is_lazy:
-            self.page.add_init_script(_LAZY)
+        self.page.add_init_script(_LAZY % frame_ms)
         self.requests: list[str] = []
         self.errors: list[str] = []
         self.page.on("request", lambda request: self.requests.append(request.url))
@@ -63,7 +62,7 @@ class Page:
         self.page.goto(url)
         self.page.wait_for_selector("canvas", state="attached")
 
-    def wait_until(self, condition: Any, seconds: float = 60.0) -> bool:
+    def wait_until(self, condition: Any, seconds: float = 120.0) -> bool:
         """Wait until a condition of ours holds, while the page lives on."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -80,7 +79,7 @@ class Page:
     def settle(self, milliseconds: int = 900) -> None:
         self.page.wait_for_timeout(milliseconds)
 
-    def still_picture(self, seconds: float = 60.0) -> np.ndarray:
+    def still_picture(self, seconds: float = 180.0) -> np.ndarray:
         """Return the picture (H, W, 3) once it has stopped changing, however slow the machine is."""
         end = time.monotonic() + seconds
         same, last = 0, self.picture()
