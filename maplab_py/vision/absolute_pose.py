@@ -71,7 +71,7 @@ def solve_poses(
         hypotheses: One of SAMPLE_SIZES: "gravity", or "three_point", which makes no use of the
             given attitude: it only tells the tilt.
     """
-    from maplab_py.vision.pose_kernels import search_poses
+    from maplab_py.vision.pose_kernels import search_poses, search_poses_without_gravity
 
     count, matches = len(problems.key), len(problems.keypoint)
     of_match = np.repeat(np.arange(count), np.diff(problems.start))
@@ -82,11 +82,15 @@ def solve_poses(
     cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
     is_inlier = np.zeros(matches, dtype=np.bool_)
     inverse_tilt = 1.0 / tilt_sigma_rad if hypotheses == "gravity" else 0.0
-    search_poses(
-        problems.start, _mixed_seeds(problems.key, seed), origin_W, ray_W,
-        np.ascontiguousarray(problems.point_M), problems.keypoint, 1.0 / problems.tolerance,
-        max_iterations, inverse_tilt, SAMPLE_SIZES[hypotheses], R, t, H, cost, inliers,
-        np.empty(count, dtype=np.int64), is_inlier,
+    search = search_poses if hypotheses == "gravity" else search_poses_without_gravity
+    search(
+        problems.start, _mixed_seeds(problems.key, seed),
+        (
+            origin_W, ray_W, np.ascontiguousarray(problems.point_M), problems.keypoint,
+            1.0 / problems.tolerance,
+        ),
+        (max_iterations, inverse_tilt), R, t, H,
+        (cost, inliers, np.empty(count, dtype=np.int64)), is_inlier,
     )  # fmt: skip
     is_first = np.ones(matches, dtype=np.bool_)
     is_first[1:] = (of_match[1:] != of_match[:-1]) | (

@@ -408,17 +408,16 @@ def _polish(  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _draw(state, sample_size, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
-    """Fill in the poses of a random sample of matches; return how many there are."""
-    sample = np.empty(sample_size, dtype=np.int64)
-    for i in range(sample_size):
+def _draw(state, sample, three, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
+    """Fill in the poses of a random sample; `three` None leaves the three-point solver uncompiled."""
+    for i in range(len(sample)):
         sample[i] = np.int64(_next_random(state) % np.uint64(len(k)))
         for other in sample[:i]:
             if k[other] == k[sample[i]]:
                 return 0
-    if sample_size == 3:
+    if three is not None:
         return three_point(o[sample], f[sample], X[sample], R, t)
-    a, b = sample
+    a, b = sample[0], sample[1]
     yaw = np.empty(2)
     count = _two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, t)
     for s in range(count):
@@ -429,18 +428,11 @@ def _draw(state, sample_size, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _search_pose(  # type: ignore[no-untyped-def]
-    seed, o, f, X, k, w, max_iterations, inverse_tilt, sample_size, best_R, best_t, H, best_used
+    seed, o, f, X, k, w, max_iterations, inverse_tilt, three, best_R, best_t, H, best_used
 ):
-    """Search one pose; fill in its rotation, position, information and inliers.
-
-    Returns:
-        Cost, inlying keypoints and samples drawn.
-    """
+    """Search one pose, fill in R, t, H and inliers; return cost, inlying keypoints and samples."""
     count = len(k)
-    keypoints = 0
-    for i in range(count):
-        if i == 0 or k[i] != k[i - 1]:
-            keypoints += 1
+    keypoints = min(count, 1) + np.count_nonzero(k[1:] != k[:-1])
     state = np.array([seed], dtype=np.uint64)
     used = np.zeros(count, dtype=np.bool_)
     best_cost, best_inliers = float(keypoints), 0
@@ -449,9 +441,10 @@ def _search_pose(  # type: ignore[no-untyped-def]
     R_guess, t_guess = np.empty((8, 3, 3)), np.empty((8, 3))
     R, t = np.empty((3, 3)), np.empty(3)
     needed, done = max_iterations, 0
+    sample = np.empty(2 if three is None else 3, dtype=np.int64)
     while done < needed and keypoints >= 3:
         done += 1
-        for s in range(_draw(state, sample_size, k, o, f, X, R_guess, t_guess)):
+        for s in range(_draw(state, sample, three, k, o, f, X, R_guess, t_guess)):
             R[:], t[:] = R_guess[s], t_guess[s]
             cost, inliers = _score(R, t, 0, count, o, f, X, k, w_loose, used)
             if cost >= best_loose or inliers < 3:
@@ -465,7 +458,7 @@ def _search_pose(  # type: ignore[no-untyped-def]
             best_cost, best_inliers = cost, inliers
             best_R[:], best_t[:] = R, t
             best_used[:] = used
-            miss = 1.0 - (inliers / count) ** sample_size
+            miss = 1.0 - (inliers / count) ** len(sample)
             if miss < 1e-9:
                 needed = done
             else:
@@ -481,19 +474,25 @@ def _search_pose(  # type: ignore[no-untyped-def]
     return best_cost, best_inliers, done
 
 
-@compiled(parallel=True)
-def search_poses(  # type: ignore[no-untyped-def]
-    start, seeds, origin, ray, point, keypoint, inverse_sigma, max_iterations, inverse_tilt,
-    sample_size, R, t, H, cost, inliers, iterations, is_inlier,
-):  # fmt: skip
-    """Search the pose of every problem; matches of one problem are consecutive, sorted by keypoint.
+@compiled()
+def _search_problem(i, three, start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
+    a, b = start[i], start[i + 1]
+    o, f, X, k, w = data
+    found[0][i], found[1][i], found[2][i] = _search_pose(
+        seeds[i], o[a:b], f[a:b], X[a:b], k[a:b], w[a:b], settings[0], settings[1], three,
+        R[i], t[i], H[i], is_inlier[a:b],
+    )  # fmt: skip
 
-    Samples are of two matches (and gravity) or of three.
-    """
+
+@compiled(parallel=True)
+def search_poses(start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
+    """Search every problem's pose from two matches, sorted by problem and keypoint, and gravity."""
     for i in prange(len(start) - 1):
-        begin, end = start[i], start[i + 1]
-        cost[i], inliers[i], iterations[i] = _search_pose(
-            seeds[i], origin[begin:end], ray[begin:end], point[begin:end], keypoint[begin:end],
-            inverse_sigma[begin:end], max_iterations, inverse_tilt, sample_size,
-            R[i], t[i], H[i], is_inlier[begin:end],
-        )  # fmt: skip
+        _search_problem(i, None, start, seeds, data, settings, R, t, H, found, is_inlier)
+
+
+@compiled(parallel=True)
+def search_poses_without_gravity(start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
+    """Search the pose of every problem from three matches, see `search_poses`."""
+    for i in prange(len(start) - 1):
+        _search_problem(i, True, start, seeds, data, settings, R, t, H, found, is_inlier)
