@@ -19,7 +19,7 @@ from maplab_py.geometry import se3, so3
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-SAMPLE_SIZES = {"gravity": 2, "three_point": 3}
+HYPOTHESES = ("gravity", "three_point")
 """Ways to make hypotheses, and how many matches each takes."""
 
 
@@ -68,7 +68,7 @@ def solve_poses(
         seed: Seed of the random samples.
         max_iterations: Most samples per query; fewer are drawn when inliers abound.
         tilt_sigma_rad: Standard deviation of the given roll and pitch.
-        hypotheses: One of SAMPLE_SIZES: "gravity", or "three_point", which makes no use of the
+        hypotheses: One of HYPOTHESES: "gravity", or "three_point", which makes no use of the
             given attitude: it only tells the tilt.
     """
     from maplab_py.vision.pose_kernels import search_poses, search_poses_without_gravity

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.geometry import se3, so3
-from maplab_py.vision.absolute_pose import SAMPLE_SIZES, PoseProblems, solve_poses
+from maplab_py.vision.absolute_pose import HYPOTHESES, PoseProblems, solve_poses
 from maplab_py.vision.descriptors import hamming, pack_words
 from maplab_py.vision.index import INDEX_ENGINES, DescriptorSet, MatchRule, make_index
 from maplab_py.vision.projection import learn_projection
@@ -47,5 +47,5 @@ def compile_poses() -> None:
         keypoint=np.arange(points),
         tolerance=np.full(points, 0.01),
     )
-    for hypotheses in SAMPLE_SIZES:
+    for hypotheses in HYPOTHESES:
         solve_poses(problems, hypotheses=hypotheses, max_iterations=2)

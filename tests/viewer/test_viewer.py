@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from websockets.sync.client import connect
 
 from maplab_py.errors import UserError
 from maplab_py.viewer.building import Subject
+from maplab_py.viewer.display.panel import by_user
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
@@ -269,3 +271,17 @@ def test_another_map_begins_with_its_own_layers(viewer: Viewer) -> None:
     assert "landmarks" in viewer.visible_layers
     assert viewer.scene is not None
     assert viewer.scene.title == "other"
+
+
+def test_what_a_page_asks_for_in_vain_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    said: list[str] = []
+
+    def fail(event: object) -> None:
+        raise RuntimeError("broken")
+
+    callback = by_user(threading.RLock(), fail, said.append)
+    callback(SimpleNamespace(client_id=None))  # what the program itself does is none of a page's
+    assert said == []
+    callback(SimpleNamespace(client_id=1))
+    assert said == ["this could not be done: the log file has the reason"]
+    assert "RuntimeError: broken" in caplog.text

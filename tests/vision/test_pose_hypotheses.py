@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from maplab_py.geometry import se3, so3
-from maplab_py.vision.absolute_pose import SAMPLE_SIZES, solve_poses
+from maplab_py.vision.absolute_pose import HYPOTHESES, solve_poses
 from maplab_py.vision.pose_kernels import three_point
 from tests.vision.synthetic import pose_problems
 from tests.vision.test_absolute_pose import errors
@@ -71,7 +71,7 @@ def test_points_on_a_line_and_equal_points_have_no_solution():
 
 @pytest.mark.parametrize("cameras", [1, 2])
 @pytest.mark.parametrize("flatness", [1.0, 0.0])
-@pytest.mark.parametrize("hypotheses", list(SAMPLE_SIZES))
+@pytest.mark.parametrize("hypotheses", HYPOTHESES)
 def test_pose_among_wrong_matches(hypotheses, flatness, cameras):
     problems, truth, wrong = pose_problems(
         40, 80, outliers=0.5, noise_rad=0.001, tilt_rad=0.005, seed=11,
@@ -99,7 +99,7 @@ def test_three_matches_do_without_gravity(cameras):
     assert np.median(errors(upright.T_M_I, truth)[0]) > 1.0
 
 
-@pytest.mark.parametrize("hypotheses", list(SAMPLE_SIZES))
+@pytest.mark.parametrize("hypotheses", HYPOTHESES)
 def test_same_seed_same_bytes(hypotheses):
     problems, _, _ = pose_problems(20, 50, outliers=0.6, noise_rad=0.001, tilt_rad=0.0, seed=13)
     one = solve_poses(problems, seed=3, hypotheses=hypotheses)
@@ -107,7 +107,7 @@ def test_same_seed_same_bytes(hypotheses):
     assert one.T_M_I.tobytes() == two.T_M_I.tobytes()
 
 
-@pytest.mark.parametrize("hypotheses", list(SAMPLE_SIZES))
+@pytest.mark.parametrize("hypotheses", HYPOTHESES)
 def test_wrong_matches_alone_find_few_inliers(hypotheses):
     problems, _, _ = pose_problems(20, 60, outliers=1.0, noise_rad=0.001, tilt_rad=0.0, seed=14)
     assert solve_poses(problems, hypotheses=hypotheses).inlier_count.max() < 9

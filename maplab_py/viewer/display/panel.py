@@ -63,8 +63,10 @@ class Actions(Protocol):
         """Forget what was picked."""
 
 
-def by_user(lock: threading.RLock, action: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Make a callback: only for what a page does, one at a time, errors to the log."""
+def by_user(
+    lock: threading.RLock, action: Callable[[Any], None], say: Callable[[str], None]
+) -> Callable[[Any], None]:
+    """Make a callback: only for what a page does, one at a time; errors are said and logged."""
 
     def callback(event: Any) -> None:
         if getattr(event, "client_id", None) is None:
@@ -74,6 +76,7 @@ def by_user(lock: threading.RLock, action: Callable[[Any], None]) -> Callable[[A
                 action(event)
         except Exception:
             logger.exception("the viewer could not do what a page asked for")
+            say("this could not be done: the log file has the reason")
 
     return callback
 
@@ -104,7 +107,7 @@ class Panel:
         self._add_view()
 
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
-        widget.on_update(by_user(self._lock, action))
+        widget.on_update(by_user(self._lock, action, self.say))
 
     def show_colouring(self, colouring: str) -> None:
         """Show by which rule landmarks are coloured."""
@@ -118,7 +121,7 @@ class Panel:
             self.measuring: Any = self._gui.add_checkbox("measure between picks", False)
             self.clear = self._gui.add_button("clear", visible=False)
         self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
-        self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick()))
+        self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
 
     def _add_playback(self, steps: int) -> None:
         with self._playback:
@@ -144,7 +147,11 @@ class Panel:
             self.ground = self._gui.add_checkbox("ground grid", True)
             self.point_scale = self._gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         self.views.on_click(
-            by_user(self._lock, lambda event: self._actions.look(event.client, event.target.value))
+            by_user(
+                self._lock,
+                lambda event: self._actions.look(event.client, event.target.value),
+                self.say,
+            )
         )
         self._bind(self.dark, lambda event: self._actions.set_dark(event.target.value))
         self._bind(self.ground, lambda event: self._actions.set_ground(event.target.value))

@@ -86,7 +86,7 @@ class Viewer:
         self._is_stopped = False
         self._next_live = 0.0
         self.set_dark(is_dark)
-        self._server.scene.on_click()(by_user(self._lock, self._clicked))
+        self._server.scene.on_click()(by_user(self._lock, self._clicked, self._panel.say))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
         self._ticker = threading.Thread(target=self._tick, name="maplab playback", daemon=True)
@@ -452,6 +452,10 @@ class Viewer:
                 self._panel.say(str(error))
         except Exception:
             logger.exception("the viewer could not follow the map")
+            with self._lock:
+                self._panel.say(
+                    "this state of the map cannot be shown: the log file has the reason"
+                )
 
     def _show(self, subject: Subject, drawing: Drawing, scene: Scene) -> None:
         is_new_map = self.subject is None or self.subject.vi_map is not subject.vi_map

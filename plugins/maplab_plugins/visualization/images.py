@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
 from maplab_py.plugin import CommandContext, UserError, command
 from maplab_py.viewer.options import PlaybackOptions
@@ -10,81 +12,32 @@ _VIEWER = ViewerOptions()
 _PLAYBACK = PlaybackOptions()
 
 
-@command("visualize_raw_images", example="visualize_raw_images", acts_outside=True)
-def visualize_raw_images(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their grey images as recorded."""
-    return _show(context, "raw_images", playback, viewer)
+def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewReport]:
+    """Make the command that plays the missions with one type of image resource."""
+
+    def play(
+        context: CommandContext,
+        *,
+        playback: PlaybackOptions = _PLAYBACK,
+        viewer: ViewerOptions = _VIEWER,
+    ) -> ViewReport:
+        return _show(context, resource, playback, viewer)
+
+    play.__doc__ = f"Play the missions with {what}."
+    return command(f"visualize_{resource}", example=example, acts_outside=True)(play)
 
 
-@command("visualize_raw_color_images", acts_outside=True)
-def visualize_raw_color_images(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their colour images as recorded."""
-    return _show(context, "raw_color_images", playback, viewer)
-
-
-@command("visualize_undistorted_images", acts_outside=True)
-def visualize_undistorted_images(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their undistorted grey images."""
-    return _show(context, "undistorted_images", playback, viewer)
-
-
-@command("visualize_undistorted_color_images", acts_outside=True)
-def visualize_undistorted_color_images(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their undistorted colour images."""
-    return _show(context, "undistorted_color_images", playback, viewer)
-
-
-@command("visualize_disparity_maps", acts_outside=True)
-def visualize_disparity_maps(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their disparity maps."""
-    return _show(context, "disparity_maps", playback, viewer)
-
-
-@command("visualize_raw_depth_maps", acts_outside=True)
-def visualize_raw_depth_maps(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their depth maps as recorded."""
-    return _show(context, "raw_depth_maps", playback, viewer)
-
-
-@command("visualize_optimized_depth_maps", acts_outside=True)
-def visualize_optimized_depth_maps(
-    context: CommandContext,
-    *,
-    playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
-) -> ViewReport:
-    """Play the missions with their optimised depth maps."""
-    return _show(context, "optimized_depth_maps", playback, viewer)
+visualize_raw_images = _player(
+    "raw_images", "their grey images as recorded", "visualize_raw_images"
+)
+visualize_raw_color_images = _player("raw_color_images", "their colour images as recorded")
+visualize_undistorted_images = _player("undistorted_images", "their undistorted grey images")
+visualize_undistorted_color_images = _player(
+    "undistorted_color_images", "their undistorted colour images"
+)
+visualize_disparity_maps = _player("disparity_maps", "their disparity maps")
+visualize_raw_depth_maps = _player("raw_depth_maps", "their depth maps as recorded")
+visualize_optimized_depth_maps = _player("optimized_depth_maps", "their optimised depth maps")
 
 
 def _show(
