@@ -65,6 +65,48 @@ class PairedClosures:
         )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class PairClarity:
+    """How clearly the closures of two missions tell one alignment."""
+
+    mission_A: int
+    mission_B: int
+    rows: I64  # (K,) candidates between the two
+    follows: Mask  # (K,) which of them follow the best alignment
+    rival_share: float  # inliers that follow the second best, over those of the best
+    alike_share: float  # queries that fit several places, over closures that follow the best
+
+    @property
+    def share(self) -> float:
+        """What is compared with the limit: the larger of the two."""
+        return max(self.rival_share, self.alike_share)
+
+
+def clarity_of_pairs(
+    closures: PairedClosures, candidate: Mask, looks_alike: Mask, rule: PairRule
+) -> list[PairClarity]:
+    """Judge every pair of missions that candidates join; arguments as of `without_alignment`."""
+    rows = np.flatnonzero(candidate)
+    key = closures.mission_A * (int(closures.mission_B.max(initial=0)) + 1) + closures.mission_B
+    pairs = []
+    for pair in np.unique(key[rows]):
+        mine = rows[key[rows] == pair]
+        follows, rival = _followings(closures.take(mine), rule)
+        weight = closures.weight[mine]
+        alike = np.count_nonzero(looks_alike & (key == pair))
+        pairs.append(
+            PairClarity(
+                int(closures.mission_A[mine[0]]),
+                int(closures.mission_B[mine[0]]),
+                mine,
+                follows,
+                float(weight[rival].sum() / weight[follows].sum()),
+                float(alike / np.count_nonzero(follows)),
+            )
+        )
+    return pairs
+
+
 def without_alignment(
     closures: PairedClosures, candidate: Mask, looks_alike: Mask, rule: PairRule
 ) -> Mask:
@@ -77,17 +119,8 @@ def without_alignment(
         rule: When alignments are the same, and when one is clearly the best.
     """
     refused = np.zeros(len(candidate), dtype=np.bool_)
-    rows = np.flatnonzero(candidate)
-    key = closures.mission_A * (int(closures.mission_B.max(initial=0)) + 1) + closures.mission_B
-    for pair in np.unique(key[rows]):
-        mine = rows[key[rows] == pair]
-        following, rival = _followings(closures.take(mine), rule)
-        alike = np.count_nonzero(looks_alike & (key == pair))
-        weight = closures.weight[mine]
-        is_clear = weight[rival].sum() <= rule.max_share * weight[
-            following
-        ].sum() and alike <= rule.max_share * np.count_nonzero(following)
-        refused[mine] = ~following if is_clear else True
+    for pair in clarity_of_pairs(closures, candidate, looks_alike, rule):
+        refused[pair.rows] = ~pair.follows if pair.share <= rule.max_share else True
     return refused
 
 

@@ -1,0 +1,114 @@
+"""Rooms that look alike: does anything end up where it does not belong?
+
+Every seed makes a world and three sessions (scenario aliased_rooms), anchors them from a known
+mission that changes with the seed, relaxes, closes loops and optimises.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.loop_closure.closing import close_loops
+from maplab_py.algorithms.loop_closure.closures import VERDICTS
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.record import read_record
+from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.geometry import se3
+from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.simulation.merge_evaluation import sightings
+from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.truth import Truth
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import IdIndex
+from tests.algorithms.loop_closure.against_truth import joined
+
+FAR_M = 0.5
+"""A merge of points farther apart is wrong (nearer ones are hard to tell from one point)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AliasedFigures:
+    """What became of one seed's sessions."""
+
+    seed: int
+    known: int  # the mission that was known
+    anchored: int
+    farthest_m: float  # that an anchored mission is off, against the known one
+    accepted: int  # closures of the last search
+    accepted_wrong: int  # of these, off by 0.5 m or 5 deg
+    merges: int  # landmarks joined to another one that are still joined after optvi
+    wrong_merges: int  # of these, with a point more than FAR_M away
+
+
+def measure(seed: int) -> AliasedFigures:
+    """Run the workflow on the sessions of one seed."""
+    data = simulate(load_scenario("aliased_rooms").with_seed(seed))
+    vi_map = joined(data)
+    known = seed % len(vi_map.missions)
+    flags = np.arange(len(vi_map.baseframes)) == vi_map.missions.baseframe[known]
+    vi_map = vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=flags))
+    anchored, report = anchor_missions(vi_map)
+    farthest_m = _farthest_m(anchored, data.truth, known)
+    relaxed, _, _ = relax_over_loops(anchored, RelaxationOptions(), LoopClosureOptions())
+    closed, _ = close_loops(relaxed)
+    accepted, wrong = _wrong_closures(closed, data.truth)
+    optimised, _ = optimize(closed, VIOptimizationOptions())
+    merges, wrong_merges = _wrong_merges(optimised, data.truth)
+    return AliasedFigures(
+        seed, known, len(report.anchored), farthest_m, accepted, wrong, merges, wrong_merges
+    )
+
+
+def _farthest_m(vi_map: VIMap, truth: Truth, known: int) -> float:
+    """Return how far the middle of an anchored mission is from its place beside the known one."""
+    row = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
+    own = vi_map.vertices.mission == known
+    T_true_G = align_yaw_position(truth.T_G_I[row[own], 4:], vi_map.T_G_I[own, 4:])
+    farthest = 0.0
+    for mission in np.flatnonzero(vi_map.baseframes.is_known[vi_map.missions.baseframe]):
+        mine = vi_map.vertices.mission == mission
+        p_true, p_G = truth.T_G_I[row[mine], 4:], vi_map.T_G_I[mine, 4:]
+        middle = p_G.mean(axis=0)
+        gap = se3.transform(align_yaw_position(p_true, p_G), middle) - se3.transform(
+            T_true_G, middle
+        )
+        farthest = max(farthest, float(np.linalg.norm(gap)))
+    return farthest
+
+
+def _wrong_closures(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
+    """Count the accepted closures of the map's record, and those of them that are not true."""
+    closures = read_record(vi_map).closures
+    closures = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
+    index = IdIndex(truth.vertex_id)
+    a, b = index.rows(closures.query), index.rows(closures.place)
+    error = se3.local(se3.relative(truth.T_G_I[a], truth.T_G_I[b]), closures.T_A_B)
+    far = np.linalg.norm(error[:, :3], axis=1) > 0.5
+    turned = np.linalg.norm(error[:, 3:], axis=1) > np.deg2rad(5.0)
+    return len(closures), int(np.count_nonzero(far | turned))
+
+
+def _wrong_merges(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
+    """Count tracks that were joined to others, and those joined to a point far from theirs.
+
+    Of a landmark's tracks those of the most frequent point are right together.
+    """
+    seen = sightings(vi_map, truth)
+    known = seen.track >= 0
+    pairs = np.unique(np.stack([seen.landmark[known], seen.track[known]], axis=1), axis=0)
+    landmark, point = pairs[:, 0], truth.landmark_point[pairs[:, 1]]
+    groups, size = np.unique(np.stack([landmark, point], axis=1), axis=0, return_counts=True)
+    order = np.lexsort((groups[:, 1], -size, groups[:, 0]))
+    owner, first = np.unique(groups[order, 0], return_index=True)
+    main = groups[order[first], 1]
+    apart = truth.point_G[point] - truth.point_G[main[np.searchsorted(owner, landmark)]]
+    merges = len(pairs) - len(owner)
+    return merges, int(np.count_nonzero(np.linalg.norm(apart, axis=1) > FAR_M))
