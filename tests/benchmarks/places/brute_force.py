@@ -117,7 +117,7 @@ def _pose(features: MapFeatures, rows: I64, point_M: F64) -> tuple[int, F64]:
     plane = ray_C[:, :2] / ray_C[:, 2:]
     cv2.setRNGSeed(1)
     found, turn, shift, _ = cv2.solvePnPRansac(
-        point_M, plane, np.eye(3), None, iterationsCount=500, confidence=0.999,
+        point_M, plane, np.eye(3), None, iterationsCount=300, confidence=0.999,
         reprojectionError=float(2.0 * INLIER_PX * np.median(rad)), flags=cv2.SOLVEPNP_P3P,
     )  # fmt: skip
     if not found:

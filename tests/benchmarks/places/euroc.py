@@ -14,7 +14,7 @@ from maplab_py.geometry.alignment import umeyama
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.submaps import append_submaps
 from tests.algorithms.loop_closure.test_real_maps import ground_truth_poses, load
-from tests.benchmarks.places.brute_force import search
+from tests.benchmarks.places.brute_force import FramePairs, search
 
 WRONG_M, WRONG_DEG = 0.3, 3.0
 MIN_TIME_S = 10.0
@@ -38,9 +38,26 @@ class EurocFigures:
     largest_deg: float
 
 
-def measure() -> Iterator[EurocFigures]:
-    """Compare at several limits of inliers, as the issue names none."""
+def measure(query_step: int = 3) -> Iterator[EurocFigures]:
+    """Compare every third vertex with all, at several limits of inliers: the issue names none."""
+    vi_map, pairs = _flight(query_step)
+    for min_inliers in (12, 15, 20, 30):
+        yield _figures(vi_map, pairs, min_inliers)
+
+
+def compare(query_step: int, min_inliers: int = 12) -> EurocFigures:
+    """Compare with an exhaustive search for some of the vertices only."""
+    return _figures(*_flight(query_step), min_inliers)
+
+
+def _flight(query_step: int) -> tuple[VIMap, FramePairs]:
+    """Return the flight as one mission, and pairs of frames by exhaustive search."""
     vi_map, _ = append_submaps([load(f"euroc_v1_01/euroc_v1_01_submap_{i}") for i in range(8)])
+    every = np.arange(len(vi_map.vertices))
+    return vi_map, search(vi_map, every[::query_step], every, min_time_s=MIN_TIME_S)
+
+
+def _figures(vi_map: VIMap, pairs: FramePairs, min_inliers: int) -> EurocFigures:
     truth, has_truth = _truth(vi_map)
     c = search_loops(vi_map)[0].closures
     c = c.take(np.flatnonzero(c.accepted))
@@ -49,20 +66,26 @@ def measure() -> Iterator[EurocFigures]:
     is_right = ~judged | ((far_m <= WRONG_M) & (far_deg <= WRONG_DEG))
     closed = np.zeros(len(vi_map.vertices), dtype=np.bool_)
     closed[c.query_vertex[is_right]] = True
-    every = np.arange(len(vi_map.vertices))
-    pairs = search(vi_map, every, every, min_time_s=MIN_TIME_S)
     pairs = pairs.take(has_truth[pairs.query] & has_truth[pairs.place])
+    pairs = pairs.take(pairs.inliers >= min_inliers)
     pair_m, pair_deg = _error(truth, pairs.query, pairs.place, pairs.T_A_B(vi_map))
     wrong = (pair_m > WRONG_M) | (pair_deg > WRONG_DEG)
-    for min_inliers in (12, 15, 20, 30):
-        enough = pairs.inliers >= min_inliers
-        brute = np.unique(pairs.query[enough & ~wrong])
-        found = int(closed[brute].sum())
-        yield EurocFigures(
-            len(vi_map.vertices), min_inliers, int(enough.sum()), float(wrong[enough].mean()),
-            len(brute), found, found / len(brute), len(c), int(judged.sum()),
-            int((~is_right).sum()), float(far_m[judged].max()), float(far_deg[judged].max()),
-        )  # fmt: skip
+    brute = np.unique(pairs.query[~wrong])
+    found = int(closed[brute].sum())
+    return EurocFigures(
+        vertices=len(vi_map.vertices),
+        min_inliers=min_inliers,
+        brute_pairs=len(pairs),
+        brute_wrong=float(wrong.mean()),
+        brute_vertices=len(brute),
+        found=found,
+        recall=found / len(brute),
+        closures=len(c),
+        closures_judged=int(judged.sum()),
+        closures_wrong=int((~is_right).sum()),
+        largest_m=float(far_m[judged].max()),
+        largest_deg=float(far_deg[judged].max()),
+    )
 
 
 def _truth(vi_map: VIMap) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

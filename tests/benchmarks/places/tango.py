@@ -56,22 +56,47 @@ def measure_pairs(step: int = 14) -> Iterator[PairsFigures]:
     vi_map = _load()
     frames = np.arange(0, len(vi_map.vertices), step)
     every = search(vi_map, frames, frames, later_only=True)
-    closures = search_loops(vi_map)[0].closures
-    closures = closures.take(np.flatnonzero(closures.accepted))
-    apart_s = _apart_s(vi_map, closures.query_vertex, closures.place_vertex)
-    elsewhere = int(np.count_nonzero(~_in_loop(apart_s)))
+    closures = _accepted(vi_map)
     for min_inliers in (12, 15, 20, 30):
-        pairs = every.take(every.inliers >= min_inliers)
-        in_loop = _in_loop(_apart_s(vi_map, pairs.query, pairs.place))
-        of_loop = pairs.take(in_loop)
-        one, one_near = _found(vi_map, of_loop, closures)
-        other, other_near = _found(vi_map, _turned(vi_map, of_loop), closures)
-        both = np.union1d(of_loop.query, of_loop.place)
-        yield PairsFigures(
-            step, min_inliers, int(np.count_nonzero(~in_loop)), len(of_loop),
-            int((one | other).sum()), int((one_near | other_near).sum()),
-            len(both), int(np.isin(both, closures.query_vertex).sum()), len(closures), elsewhere,
-        )  # fmt: skip
+        yield _figures(vi_map, step, every, closures, min_inliers)
+
+
+def pairs_of_loop(step: int, min_inliers: int = 20) -> PairsFigures:
+    """Do the same for the two ends of the walk only."""
+    vi_map = _load()
+    since_s = _apart_s(vi_map, np.arange(len(vi_map.vertices)), 0)
+    early, late = np.flatnonzero(since_s < 20.0)[::step], np.flatnonzero(since_s > 95.0)[::step]
+    every = search(vi_map, late, early, later_only=True)
+    return _figures(vi_map, step, every, _accepted(vi_map), min_inliers)
+
+
+def _accepted(vi_map: VIMap) -> Closures:
+    closures = search_loops(vi_map)[0].closures
+    return closures.take(np.flatnonzero(closures.accepted))
+
+
+def _figures(
+    vi_map: VIMap, step: int, every: FramePairs, closures: Closures, min_inliers: int
+) -> PairsFigures:
+    apart_s = _apart_s(vi_map, closures.query_vertex, closures.place_vertex)
+    pairs = every.take(every.inliers >= min_inliers)
+    in_loop = _in_loop(_apart_s(vi_map, pairs.query, pairs.place))
+    of_loop = pairs.take(in_loop)
+    one, one_near = _found(vi_map, of_loop, closures)
+    other, other_near = _found(vi_map, _turned(vi_map, of_loop), closures)
+    both = np.union1d(of_loop.query, of_loop.place)
+    return PairsFigures(
+        step=step,
+        min_inliers=min_inliers,
+        elsewhere=int(np.count_nonzero(~in_loop)),
+        pairs=len(of_loop),
+        found=int((one | other).sum()),
+        found_near=int((one_near | other_near).sum()),
+        frames=len(both),
+        frames_closed=int(np.isin(both, closures.query_vertex).sum()),
+        closures=len(closures),
+        closures_elsewhere=int(np.count_nonzero(~_in_loop(apart_s))),
+    )
 
 
 def _load() -> VIMap:
@@ -137,8 +162,7 @@ def measure_gap() -> Iterator[GapFigures]:
     merged: Any = session.run("lc")
     session.run("optvi")
     vi_map = session.maps.selected.vi_map
-    closures = search_loops(vi_map)[0].closures
-    closures = closures.take(np.flatnonzero(closures.accepted))
+    closures = _accepted(vi_map)
     correction = closures.correction_m
     variance = np.trace(closures.covariance[:, :3, :3], axis1=1, axis2=2)
     yield GapFigures(
