@@ -74,10 +74,8 @@ def find_candidates(
     seen = _observers(vi_map)  # (L, V)
     query_vertex = features.vertex[matches.query]
     landmark = features.descriptors.label[matches.database]
-    pair = np.unique(np.stack([query_vertex, landmark], axis=1), axis=0)
-    matched = csr_array(
-        (np.ones(len(pair), dtype=np.int32), (pair[:, 0], pair[:, 1])), shape=(vertices, landmarks)
-    )
+    pair = np.divmod(np.unique(query_vertex * landmarks + landmark), max(landmarks, 1))
+    matched = csr_array((np.ones(len(pair[0]), dtype=np.int32), pair), shape=(vertices, landmarks))
     shared = (seen.T @ seen).tocsr()
     queries = np.unique(query_vertex)
     found: list[I64] = []

@@ -30,7 +30,7 @@ class LoopClosureOptions:
     )
     num_neighbors: int = option(-1, help="Landmarks to retrieve per keypoint; -1 = 3")
     num_words_for_nn_search: int = option(
-        32, help="Cells of the multi-index that are searched per keypoint"
+        16, help="Cells of the multi-index that are searched per keypoint"
     )
     max_bit_fraction: float = option(
         0.26, help="Largest part of a descriptor's bits in which a match may differ"
