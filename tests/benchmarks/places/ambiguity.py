@@ -14,12 +14,14 @@ from maplab_py.algorithms.loop_closure.closing import with_quality
 from maplab_py.algorithms.loop_closure.detection import detect
 from maplab_py.algorithms.loop_closure.mission_pairs import PairClarity, clarity_of_pairs
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.console.registry import load_registry
+from maplab_py.console.session import Session
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.merge import merge_maps
 from tests.algorithms.loop_closure.against_truth import joined, sessions
-from tests.algorithms.loop_closure.test_real_maps import load
+from tests.e2e.test_real_workflows import SUBMAPS
+from tests.support.data import shared_data
 
 
 def clarity(vi_map: VIMap, options: LoopClosureOptions | None = None) -> list[PairClarity]:
@@ -52,10 +54,9 @@ def aliased_rooms(seed: int, rate_hz: float = 5.0) -> VIMap:
 
 def flight() -> VIMap:
     """Return the eight EuRoC submaps as missions."""
-    vi_map = load("euroc_v1_01/euroc_v1_01_submap_0")
-    for number in range(1, 8):
-        vi_map, _ = merge_maps(vi_map, load(f"euroc_v1_01/euroc_v1_01_submap_{number}"))
-    return vi_map
+    session = Session(load_registry())
+    session.run("load_merge_all_maps", maps_folder=shared_data(SUBMAPS), assign_new_ids=True)
+    return session.maps.selected.vi_map
 
 
 @dataclasses.dataclass(frozen=True)

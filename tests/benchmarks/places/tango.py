@@ -23,7 +23,8 @@ from tests.support.data import shared_data
 from tests.support.machine import slowness
 
 TANGO = "maplab_maps/tango_handheld"
-BETWEEN_S = (97.0, 118.0)
+BETWEEN_S = (96.0, 118.0)
+"""Pairs of the exhaustive search are 97 to 118 s apart, a few closures of the same loop 96.6 s."""
 NEAR_S = 1.0
 SHARED_LANDMARKS = 12
 AGREE_M, AGREE_RAD = 0.3, np.deg2rad(3.0)
