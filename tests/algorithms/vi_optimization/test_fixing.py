@@ -86,3 +86,11 @@ def test_base_frames_measurements_and_sensors_stay() -> None:
     assert result.keypoints is start().keypoints
     assert result.imu_samples is start().imu_samples
     assert result.sensors is start().sensors
+
+
+def test_base_frames_that_nothing_could_move_are_refused() -> None:
+    options = dataclasses.replace(
+        OPTIONS, fix_vertices=True, absolute_pose_sensor_fix_mission_baseframes=False
+    )
+    with pytest.raises(UserError, match="--ba_fix_vertices keeps the base frames as well"):
+        optimize(start(), options)
