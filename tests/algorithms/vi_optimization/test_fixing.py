@@ -10,6 +10,7 @@ import pytest
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import UserError
 from maplab_py.vimap import VIMap
 from tests.support.scene import Scene, corrupted
 
