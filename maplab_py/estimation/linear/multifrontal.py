@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.blas import dgemm, dpotrf, dsyrk, dtrsm
-from maplab_py.estimation.linear.jit import compiled
 from maplab_py.estimation.linear.symbolic import FrontPlan
 
 F64 = NDArray[np.float64]
