@@ -16,6 +16,7 @@ import functools
 import gzip
 import json
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,8 @@ from maplab_py.vision.projection import DescriptorProjection
 
 DOCS = Path(__file__).resolve().parents[1]
 QUERY_EVERY = 10
+COMMANDS = ("elq", "optvi", "sbk", "aam", "relax", "lc", "optvi", "rtl")
+"""That make one map of the sessions."""
 UNITED_SHARE = 0.6
 """Of the tracks, that are united with others of the same point."""
 MIN_ANGLE_DEG = 2.0
@@ -82,13 +85,7 @@ def full_map(work: Path, truth: Truth, *, optimised: bool) -> VIMap:
     # distant landmarks help as well: accept smaller angles than mapping does
     options = LandmarkQualityOptions(min_observation_angle_deg=MIN_ANGLE_DEG)
     if optimised:
-        if not (work / "full").is_dir():
-            session = Session()
-            session.run("load_merge_all_maps", maps_folder=work / "sessions", target_map_key="full")
-            for command in ("elq", "optvi", "sbk", "aam", "relax", "lc", "rtl"):
-                session.run(command)
-            session.run("save", map_folder=work / "full")
-        return evaluate_quality(load_map(work / "full")[0], options)[0]
+        return evaluate_quality(optimised_map(work), options)[0]
     parts = [true_map(load_map(f)[0], truth) for f in sorted((work / "sessions").iterdir())]
     vi_map = functools.reduce(lambda a, b: merge_maps(a, b)[0], parts)
     point = truth.landmark_point[IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)]
@@ -98,6 +95,26 @@ def full_map(work: Path, truth: Truth, *, optimised: bool) -> VIMap:
     into = rows[first[np.searchsorted(points, point[rows])]]
     vi_map = merge_landmarks(vi_map, rows[rows != into], into[rows != into])
     return retriangulate(vi_map, options)[0]
+
+
+def optimised_map(work: Path) -> VIMap:
+    """Return the map that the console makes of the sessions, continued where an earlier run ended."""
+    session = Session()
+    done = [n for n in range(len(COMMANDS)) if (work / f"after_{n}_{COMMANDS[n]}").is_dir()]
+    first = done[-1] + 1 if done else 0
+    if done:
+        place = work / f"after_{done[-1]}_{COMMANDS[done[-1]]}"
+        session.run("load", map_folder=place, map_key="full")
+    else:
+        session.run("load_merge_all_maps", maps_folder=work / "sessions", target_map_key="full")
+    for number in range(first, len(COMMANDS)):
+        begin, wall = time.process_time(), time.perf_counter()
+        report = session.run(COMMANDS[number])
+        used, waited = time.process_time() - begin, time.perf_counter() - wall
+        print(f"{COMMANDS[number]}: {used:.0f} s processor, {waited:.0f} s wall", flush=True)  # noqa: T201
+        print(report, flush=True)  # noqa: T201
+        session.run("save", map_folder=work / f"after_{number}_{COMMANDS[number]}")
+    return session.vi_map
 
 
 def maplab_megabytes(summary: SummaryMap) -> float:

@@ -8,9 +8,11 @@ import numpy as np
 
 FRACTIONS = (0.0, 0.5, 0.75, 0.9, 0.95, 0.98)
 METHODS = ("ilp", "most_observed", "random")
-COLOURS = {"ilp": "#0b6fb8", "most_observed": "#c8501e", "random": "#888888"}
+COLOURS = {"ilp": "#7db8e8", "most_observed": "#b8400e", "random": "#555555"}
 NAMES = {"ilp": "integer programme", "most_observed": "most observed", "random": "random"}
 _WANTED_SHARE = 0.85
+_WIDTHS = {"ilp": 7.0, "most_observed": 3.0, "random": 1.5}
+_LEFT, _TOP, _WIDTH, _HEIGHT, _GAP = 70.0, 36.0, 370.0, 300.0, 70.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,41 +64,71 @@ def _find(points: list[Point], keyframed: bool, pruned: float, method: str) -> P
 
 
 def plot(points: list[Point]) -> str:
-    """Return the figure as SVG: recall over the pruned part; dashed = keyframed."""
-    left, top, width, height = 60.0, 20.0, 560.0, 300.0
+    """Return the figure as SVG: recall over the pruned part, a panel for each kind of map.
 
-    def at(pruned: float, recall: float) -> str:
-        # the axis is the logarithm of what is kept, so that 98 % is not squeezed into a corner
-        x = left + width * np.log(1.0 - pruned) / np.log(1.0 - FRACTIONS[-1])
-        return f"{x:.1f},{top + height * (1.0 - recall):.1f}"
-
-    size = 'width="660" height="400" viewBox="0 0 660 400"'
+    Lines lie upon each other where choices do equally well, so they differ in width: what is drawn
+    later is narrower.
+    """
+    size = 'width="900" height="420" viewBox="0 0 900 420"'
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="12">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="13">',
         '<rect width="100%" height="100%" fill="white"/>',
+        f'<text transform="translate(20,{_TOP + _HEIGHT / 2}) rotate(-90)" text-anchor="middle">'
+        "queries localised within 0.5 m [%]</text>",
     ]
-    for step in range(0, 101, 20):
-        y = top + height * (1.0 - step / 100.0)
-        lines.append(f'<path d="M{left} {y} h{width}" stroke="#dddddd"/>')
-        lines.append(f'<text x="{left - 8}" y="{y + 4}" text-anchor="end">{step} %</text>')
-    for pruned in FRACTIONS:
-        x = at(pruned, 0.0).split(",")[0]
-        y = top + height + 18
-        lines.append(f'<text x="{x}" y="{y}" text-anchor="middle">{100 * pruned:.0f} %</text>')
-    middle = left + width / 2
-    lines.append(f'<text x="{middle}" y="358" text-anchor="middle">landmarks pruned</text>')
-    for number, method in enumerate(METHODS):
-        for keyframed in (False, True):
+    for keyframed, title in ((False, "all keyframes"), (True, "keyframed")):
+        left = _LEFT + keyframed * (_WIDTH + _GAP)
+        lines += _axes(left, title)
+        for method in METHODS:
             found = [_find(points, keyframed, pruned, method) for pruned in FRACTIONS]
-            path = " ".join(at(p.pruned, p.recall) for p in found if p is not None)
-            dash = ' stroke-dasharray="6 4"' if keyframed else ""
-            style = f'stroke="{COLOURS[method]}" stroke-width="2" fill="none"{dash}'
-            lines.append(f'<polyline points="{path}" {style}/>')
-        x = left + 190 * number
-        lines.append(f'<path d="M{x} 380 h24" stroke="{COLOURS[method]}" stroke-width="2"/>')
-        lines.append(f'<text x="{x + 30}" y="384">{NAMES[method]}</text>')
-    lines.append(f'<text x="{left + width}" y="384" text-anchor="end">dashed: keyframed</text>')
+            lines += _line([p for p in found if p is not None], left, method)
+    for number, method in enumerate(METHODS):
+        x, y = _LEFT + 190 * number, _TOP + _HEIGHT + 68
+        lines.append(f'<path d="M{x} {y} h34" {_stroke(method)}/>')
+        lines.append(_marker(x + 17.0, y, method))
+        lines.append(f'<text x="{x + 42}" y="{y + 5}">{NAMES[method]}</text>')
     return "\n".join([*lines, "</svg>", ""])
+
+
+def _axes(left: float, title: str) -> list[str]:
+    middle = left + _WIDTH / 2
+    lines = [f'<text x="{middle}" y="22" text-anchor="middle" font-weight="bold">{title}</text>']
+    for step in range(0, 101, 20):
+        y = _TOP + _HEIGHT * (1.0 - step / 100.0)
+        lines.append(f'<path d="M{left} {y:.1f} h{_WIDTH}" stroke="#dddddd"/>')
+        lines.append(f'<text x="{left - 8}" y="{y + 5:.1f}" text-anchor="end">{step}</text>')
+    for pruned in FRACTIONS:
+        x = _x(left, pruned)
+        lines.append(f'<path d="M{x:.1f} {_TOP + _HEIGHT} v5" stroke="#888888"/>')
+        y = _TOP + _HEIGHT + 20
+        lines.append(f'<text x="{x:.1f}" y="{y}" text-anchor="middle">{100 * pruned:.0f}</text>')
+    y = _TOP + _HEIGHT + 42
+    lines.append(f'<text x="{middle}" y="{y}" text-anchor="middle">landmarks pruned [%]</text>')
+    return lines
+
+
+def _line(points: list[Point], left: float, method: str) -> list[str]:
+    at = [(_x(left, p.pruned), _TOP + _HEIGHT * (1.0 - p.recall)) for p in points]
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in at)
+    lines = [f'<polyline points="{path}" fill="none" {_stroke(method)}/>']
+    return lines + [_marker(x, y, method) for x, y in at]
+
+
+def _x(left: float, pruned: float) -> float:
+    """Return where a pruned part is drawn.
+
+    The axis is the logarithm of what is kept, so that 98 % is not squeezed into a corner.
+    """
+    return float(left + _WIDTH * np.log(1.0 - pruned) / np.log(1.0 - FRACTIONS[-1]))
+
+
+def _stroke(method: str) -> str:
+    return f'stroke="{COLOURS[method]}" stroke-width="{_WIDTHS[method]}" stroke-linejoin="round"'
+
+
+def _marker(x: float, y: float, method: str) -> str:
+    radius = 2.5 + 0.5 * _WIDTHS[method]
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{COLOURS[method]}"/>'
 
 
 def findings(points: list[Point]) -> list[str]:

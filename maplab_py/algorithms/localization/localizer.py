@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
+from collections.abc import Iterable, Iterator
 from enum import Enum
 
 import numpy as np
@@ -81,15 +83,16 @@ class Localizer:
         """
         self._map = database
         self._options = options
+        bits = 8 * database.projection.descriptor_size
+        self._max_distance = (
+            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+        )
         self._index = InvertedMultiIndex(
             database.descriptors,
             seed=options.seed,
             cells_per_query=options.num_words_for_nn_search,
             rank_by_bits=database.has_bits,
-        )
-        bits = 8 * database.projection.descriptor_size
-        self._max_distance = (
-            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+            max_distance=self._max_distance,
         )
 
     def localize(self, query: Query) -> Localization:
@@ -98,8 +101,9 @@ class Localizer:
         descriptors = self._described(query)
         keypoint, landmark = self._match(descriptors)
         places = self._places(keypoint, landmark)
+        first = list(itertools.islice(places, 1))
         matched = time.perf_counter()
-        answer = self._solve(query, descriptors, keypoint, landmark, places)
+        answer = self._solve(query, descriptors, keypoint, landmark, itertools.chain(first, places))
         return dataclasses.replace(
             answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
         )
@@ -122,14 +126,13 @@ class Localizer:
         keypoint, rank = np.nonzero((found.row >= 0) & (found.distance <= self._max_distance))
         return keypoint, self._map.descriptors.label[found.row[keypoint, rank]]
 
-    def _places(self, keypoint: I64, landmark: I64) -> list[I64]:
-        """Return the rows of the matches in each of the best places.
+    def _places(self, keypoint: I64, landmark: I64) -> Iterator[I64]:
+        """Yield the rows of the matches in each of the best places, as far as they are asked for.
 
         Every matched landmark votes for its observers; the observer with most votes and those
         that share landmarks with it are a place (Sattler et al., ICCV 2015).
         """
         o = self._options
-        found: list[I64] = []
         distinct, index = np.unique(landmark, return_inverse=True)
         offset, observers = self._map.observers_of
         rows = ragged_rows(offset, distinct)
@@ -144,9 +147,8 @@ class Localizer:
             inside = np.bincount(owner, near[voter], minlength=len(distinct)) > 0
             matches = np.flatnonzero(inside[index.reshape(-1)])
             if len(np.unique(keypoint[matches])) >= o.min_matches:
-                found.append(matches)
+                yield matches
             votes = np.where(near, 0, votes)
-        return found
 
     def _solve(
         self,
@@ -154,7 +156,7 @@ class Localizer:
         descriptors: DescriptorSet,
         keypoint: I64,
         landmark: I64,
-        places: list[I64],
+        places: Iterable[I64],
     ) -> Localization:
         """Search the pose place by place; the most inliers win, and many inliers end the search.
 
