@@ -25,7 +25,7 @@ class Point:
     landmarks: int
     observations: int
     maplab_megabytes: float | None  # maplab's fields only, as exact as it writes them
-    megabytes: float  # our file
+    megabytes: float | None  # our file
     queries: int
     recall: float
     wrong: int
