@@ -43,8 +43,8 @@ def table(points: list[Point]) -> list[str]:
         pair = [_find(points, keyframed, pruned, METHODS[0]) for keyframed in (False, True)]
         cells = [f"{100 * pruned:.0f} %"]
         cells.append(_cell([str(p.landmarks) if p else None for p in pair]))
-        cells.append(_cell([f"{p.maplab_megabytes:.3f}" if p else None for p in pair]))
-        cells.append(_cell([f"{p.megabytes:.3f}" if p else None for p in pair]))
+        cells.append(_cell([_megabytes(p.maplab_megabytes) if p else None for p in pair]))
+        cells.append(_cell([_megabytes(p.megabytes) if p else None for p in pair]))
         for method in METHODS:
             found = [_find(points, keyframed, pruned, method) for keyframed in (False, True)]
             cells.append(_cell([f"{100 * p.recall:.1f} %" if p else None for p in found]))
@@ -54,6 +54,10 @@ def table(points: list[Point]) -> list[str]:
 
 def _cell(values: list[str | None]) -> str:
     return f"{values[0] or '-'} ({values[1] or '-'})"
+
+
+def _megabytes(value: float | None) -> str | None:
+    return None if value is None else f"{value:.3f}"
 
 
 def _find(points: list[Point], keyframed: bool, pruned: float, method: str) -> Point | None:
@@ -141,7 +145,7 @@ def findings(points: list[Point]) -> list[str]:
             f"smaller and ours {_ratio(whole, thin):.1f} times, and costs "
             f"{_points(whole, thin)} points of recall."
         )
-        lines += _smallest(points, whole)
+        lines += _at_90_percent(points, whole) + _smallest(points, whole)
     for keyframed, name in ((False, "the map with all keyframes"), (True, "the keyframed map")):
         before, after = (_find(points, keyframed, share, METHODS[0]) for share in (0.0, 0.9))
         if before and after:
@@ -153,10 +157,23 @@ def findings(points: list[Point]) -> list[str]:
     wrong = sum(point.wrong for point in points)
     answers = sum(point.queries for point in points)
     lines.append(
-        f"- Of {answers} queries in all variants together, {wrong} were answered wrong by more than 0.5 m. "
+        f"- Of {answers} queries in all variants together, {wrong} were answered wrong by more "
+        "than 0.5 m. "
         f"One of {queries} queries more or less changes recall by {100 / queries:.1f} points."
     )
     return lines
+
+
+def _at_90_percent(points: list[Point], whole: Point) -> list[str]:
+    """Tell how small the keyframed map is with a tenth of its landmarks."""
+    small = _find(points, True, 0.9, METHODS[0])
+    if small is None:
+        return []
+    return [
+        f"- Keyframed and pruned by 90 %, maplab's file is {_ratio(whole, small, maplab=True):.1f} "
+        f"times smaller, ours {_ratio(whole, small):.1f} times, and it keeps "
+        f"{100 * small.recall / whole.recall:.1f} % of the recall."
+    ]
 
 
 def _smallest(points: list[Point], whole: Point) -> list[str]:
@@ -164,7 +181,7 @@ def _smallest(points: list[Point], whole: Point) -> list[str]:
     enough = [
         p for p in points if p.method == METHODS[0] and p.recall >= _WANTED_SHARE * whole.recall
     ]
-    best = min(enough, key=lambda p: p.megabytes)
+    best = min(enough, key=lambda p: p.megabytes or np.inf)
     how = "keyframed and " if best.keyframed else ""
     return [
         f"- The smallest map that keeps {100 * _WANTED_SHARE:.0f} % of the recall is {how}pruned by "
@@ -197,9 +214,9 @@ def _against(points: list[Point], keyframed: bool, name: str) -> list[str]:
 
 
 def _ratio(whole: Point, small: Point, *, maplab: bool = False) -> float:
-    if maplab and whole.maplab_megabytes and small.maplab_megabytes:
-        return whole.maplab_megabytes / small.maplab_megabytes
-    return whole.megabytes / small.megabytes
+    if maplab:
+        return (whole.maplab_megabytes or np.nan) / (small.maplab_megabytes or np.nan)
+    return (whole.megabytes or np.nan) / (small.megabytes or np.nan)
 
 
 def _points(before: Point, after: Point) -> str:

@@ -61,7 +61,8 @@ class DescriptorProjection:
         """What a byte adds: (bytes, 256, dimensions), the sum over its 8 bits for all its values."""
         values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
         by_byte = self.matrix.T.reshape(self.descriptor_size, 8, len(self.matrix))
-        return np.einsum("vb,pbd->pvd", values, by_byte, optimize=False).astype(np.float32)
+        table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False)
+        return np.asarray(table, dtype=np.float32)
 
 
 def learn_projection(
