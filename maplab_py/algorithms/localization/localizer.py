@@ -274,7 +274,7 @@ class _Found:
     @cached_property
     def T_G_I(self) -> F64:
         """Pose (7,)."""
-        return self.solutions.poses(self.query.q_M_I[None])[0]
+        return np.asarray(self.solutions.poses(self.query.q_M_I[None])[0])
 
 
 def _failed(outcome: Outcome, keypoints: int) -> Localization:
