@@ -64,6 +64,9 @@ METHODS = (
     "8: entropy by groups",
     "8: random",
     "8: least informative",
+    "4: entropy",
+    "4 each: entropy by groups",
+    "8 each: entropy by groups",
 )
 JUDGED = ("informative", "batch", "8: A-optimality", "8: random", "8: least informative")
 """Their calibrations are also tried on another session."""
@@ -112,15 +115,19 @@ def in_turn(tables: dict[str, F64], count: int) -> list[int]:
     return list(chosen)[:count]
 
 
+def best_of_each(tables: dict[str, F64], count: int) -> set[int]:
+    """Return what tables of so many segments hold together, as the database does."""
+    orders = [np.argsort(values, kind="stable") for values in tables.values()]
+    return {int(k) for order in orders for k in order[:count]}
+
+
 def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> list[I64]:
     """Return the segments (vertex rows) that a method takes."""
-    count = min(FEW, len(evaluation.segments))
-    what = method.removeprefix("8: ")
+    capacity, _, what = method.rpartition(": ")
+    count = min(int(capacity.split()[0]) if capacity else FEW, len(evaluation.segments))
     if what == "informative":
         tables = scores_of(evaluation, "a_optimality", OPTIONS.groups)
-        best = {
-            int(k) for one in tables.values() for k in np.argsort(one, kind="stable")[:per_group]
-        }
+        best = best_of_each(tables, per_group)
     elif what == "random":
         rng = np.random.default_rng(number)
         best = set(rng.choice(len(evaluation.segments), size=count, replace=False).tolist())
@@ -130,7 +137,10 @@ def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> 
     else:
         metric = what.split(" by ")[0].replace("-", "_").lower()
         groups = OPTIONS.groups if what.endswith("by groups") else WHOLE
-        best = set(in_turn(scores_of(evaluation, metric, groups), count))
+        tables = scores_of(evaluation, metric, groups)
+        best = set(in_turn(tables, count))
+        if capacity.endswith("each"):
+            best = best_of_each(tables, count)
     return [evaluation.segments[k].rows for k in sorted(best)]
 
 
@@ -245,6 +255,8 @@ def _measured(
             "noise_factor": report.keypoint_noise_factor,
             "inconsistent": report.inconsistent_landmarks,
             "unobservable": list(report.unobservable),
+            "without_scale": list(report.without_scale),
+            "partitions": report.partitions,
         }
     seconds = time.process_time() - began
     return {

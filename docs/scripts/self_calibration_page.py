@@ -221,16 +221,23 @@ def comparison_table(results: Results) -> list[str]:
             "",
             f"{np.median(own) / np.median(worse):.2f}; worse in {np.mean(worse > own):.0%} of sets",
         )
-    for metric, label in (("entropy", "D-optimality"), ("A-optimality", "A-optimality")):
-        if not results.pairs(f"8: {metric} by groups", f"8: {label}"):
+    for groups, single, what in (
+        ("4 each: entropy by groups", "4: entropy", "tables of 4, entropy"),
+        ("8 each: entropy by groups", "8: D-optimality", "tables of 8, entropy"),
+        ("8: entropy by groups", "8: D-optimality", "8 segments in all, entropy"),
+        ("8: A-optimality by groups", "8: A-optimality", "8 segments in all, A-optimality"),
+    ):
+        if not (pairs := results.pairs(groups, single)):
             continue
-        ratio = results.spread_ratio(f"8: {metric} by groups", f"8: {label}")
-        names = next(iter(results.by_method["batch"].values()))["names"]
+        ratio = results.spread_ratio(groups, single)
+        names = pairs[0][0]["names"]
         thesis = [
             k for k, n in enumerate(names) if kind_of(n) in ("centre", "gyroscope misalignment")
         ]
+        taken = [np.mean([row["segments"] for row in side]) for side in zip(*pairs, strict=True)]
         add(
-            f"spread, three groups over a single one, {metric}, 8 segments each",
+            f"spread, three groups over a single one, {what} ({taken[0]:.1f} segments against "
+            f"{taken[1]:.1f}, {len(pairs)} sets)",
             "0.56-0.60 (centre, gyroscope misalignment)",
             f"median {np.median(ratio):.2f}; these: {np.median(ratio[thesis]):.2f}",
         )
