@@ -18,7 +18,6 @@ from maplab_py.algorithms.self_calibration.problem import SegmentProblem
 from maplab_py.algorithms.self_calibration.segments import pieces
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.states import States
-from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 
 F64 = NDArray[np.float64]
@@ -59,9 +58,7 @@ def distances_m(problem: SegmentProblem, states: States, partition: I64) -> F64:
     return np.array([np.median(one) if len(one) else np.nan for one in found])
 
 
-def partitions_without_scale(
-    problem: SegmentProblem, after: States, begun: SegmentProblem
-) -> I64:
+def partitions_without_scale(problem: SegmentProblem, after: States, begun: SegmentProblem) -> I64:
     """Return the partitions whose paths and distances solving has halved or doubled at least.
 
     Args:

@@ -29,9 +29,7 @@ def scaled(problem: SegmentProblem, partition: int, path: float, distance: float
     T_G_I, p_G = np.array(states.T_G_I), np.array(states.p_G)
     vi_map, selection = problem.posed.vi_map, problem.posed.selection
     vertex = vi_map.keypoint_vertex[selection.keypoints]
-    landmark = np.searchsorted(
-        selection.landmarks, vi_map.keypoints.landmark[selection.keypoints]
-    )
+    landmark = np.searchsorted(selection.landmarks, vi_map.keypoints.landmark[selection.keypoints])
     seen = np.unique(landmark[np.isin(vertex, own)])
     middle = T_G_I[own[0], 4:]
     T_G_I[own, 4:] = middle + path * (T_G_I[own, 4:] - middle)
