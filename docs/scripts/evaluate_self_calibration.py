@@ -197,7 +197,7 @@ def measure(
     if first is not None:
         for method, sensors in (("nominal", first.vi_map.sensors), ("truth", first.true_sensors)):
             row = {"set": -1, "method": method, "map_m": map_error_m(judge, sensors)}
-            _append(out, row)
+            append_line(out, row)
     for number in sets:
         missing = [method for method in methods if (number, method) not in done]
         if not missing:
@@ -206,7 +206,7 @@ def measure(
         for method in missing:
             row = _measured(scenario, data, method, per_group, judge if method in judged else None)
             row["selection_s_per_segment"] = data.selection_s
-            _append(out, row)
+            append_line(out, row)
             map_m = row["map_m"] or float("nan")
             sys.stdout.write(
                 f"{number:3d} {method:26s} NEES {row['nees']:8.1f}  map error {map_m:.4f} m\n"
@@ -315,10 +315,11 @@ def consistency(scenario_name: str, seeds: range, swaps: float, out: Path) -> No
             "noise_factor": report.keypoint_noise_factor,
             "inconsistent": report.inconsistent_landmarks,
         }
-        _append(out, row)
+        append_line(out, row)
 
 
-def _append(path: Path, row: dict[str, Any]) -> None:
+def append_line(path: Path, row: dict[str, Any]) -> None:
+    """Append a result to a file."""
     with path.open("a") as file:
         file.write(json.dumps(row) + "\n")
 

@@ -27,7 +27,7 @@ from maplab_py.algorithms.self_calibration.scale import (
     refuse_lost_scale,
     without_partitions,
 )
-from maplab_py.algorithms.self_calibration.segments import restricted
+from maplab_py.algorithms.self_calibration.segments import parallax_rad, restricted
 from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sensors, written_back
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -41,6 +41,7 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_p_G
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _ROUGH = 8
 """Iterations before landmarks are triangulated anew and outliers judged again."""
@@ -162,7 +163,8 @@ def _settled(
     )
     states, robust = solve(problem, nearly, progress)
     posed = problem.posed
-    consistency = keep_consistent(posed, states, options.inconsistent_probability)
+    is_wide = _is_wide(problem, states, options)
+    consistency = keep_consistent(posed, states, options.inconsistent_probability, is_wide)
 
     def refresh(_: int, now: States) -> bool:
         return posed.problem.visual is not None and posed.problem.visual.refresh(now)
@@ -170,6 +172,13 @@ def _settled(
     states, plain = _minimised(problem, states, options, progress, refresh)
     summary = dataclasses.replace(plain, iterations=robust.iterations + plain.iterations)
     return states, summary, consistency
+
+
+def _is_wide(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> Mask:
+    """Return which landmarks (L,) of the problem have parallax, now that poses have settled."""
+    found_rad = parallax_rad(written_back(problem.posed, states, vi_options(options)))
+    limit_rad = np.deg2rad(options.min_parallax_deg)
+    return np.asarray(found_rad[problem.posed.selection.landmarks] >= limit_rad)
 
 
 def _begun_anew(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> VIMap:

@@ -69,12 +69,14 @@ def partitions_without_scale(problem: SegmentProblem, after: States, begun: Segm
     rows = problem.posed.selection.vertices
     run, partition = pieces(problem.posed.vi_map)[rows], problem.partition[rows]
     before = begun.posed.states
-    factors = [
-        path_lengths_m(after.T_G_I, run, partition) / path_lengths_m(before.T_G_I, run, partition),
-        distances_m(problem, after, partition) / distances_m(begun, before, partition),
-    ]
-    shrunk = np.all([factor < _LOST for factor in factors], axis=0)
-    grown = np.all([factor * _LOST > 1.0 for factor in factors], axis=0)
+    known = np.array(
+        [path_lengths_m(before.T_G_I, run, partition), distances_m(begun, before, partition)]
+    )
+    found = np.array(
+        [path_lengths_m(after.T_G_I, run, partition), distances_m(problem, after, partition)]
+    )
+    shrunk = np.all(found < _LOST * known, axis=0)
+    grown = np.all(_LOST * found > known, axis=0)
     return np.flatnonzero(shrunk | grown)
 
 
