@@ -1,6 +1,8 @@
 """Write docs/self_calibration_results.md and its picture from what evaluate_self_calibration.py measured.
 
 python docs/scripts/self_calibration_page.py --results=ar_room.jsonl --consistency=clean.jsonl,swaps.jsonl
+
+Beside NAME.jsonl, NAME_vio.jsonl of evaluate_calibrated_odometry.py is read where there is one.
 """
 
 from __future__ import annotations
@@ -67,8 +69,9 @@ def overall(row: dict[str, Any]) -> float:
 class Results:
     """Rows of one scenario, by method."""
 
-    def __init__(self, rows: list[dict[str, Any]]) -> None:
-        """Sort rows by method and data set."""
+    def __init__(self, rows: list[dict[str, Any]], odometry: list[dict[str, Any]]) -> None:
+        """Sort rows, and errors of odometry that used the calibrations, by method and data set."""
+        self.odometry_m = {(row["set"], row["method"]): row["vio_m"] for row in odometry}
         self.map_m = {row["method"]: row["map_m"] for row in rows if row["set"] < 0}
         self.by_method: dict[str, dict[int, dict[str, Any]]] = {}
         for row in rows:
@@ -89,6 +92,27 @@ class Results:
         """Return the ratio (k,) of the spreads of two methods over the data sets of both."""
         sets = sorted(self.by_method[one].keys() & self.by_method[other].keys())
         return self.spread(one, sets) / self.spread(other, sets)
+
+
+def odometry_lines(results: Results) -> list[str]:
+    """Return the rows on odometry with the calibrations, in the thesis' way."""
+    errors_m, lines = results.odometry_m, []
+    best = "8: A-optimality"
+    for other in ("8: random", "8: least informative"):
+        sets = [k for k, name in errors_m if name == best and (k, other) in errors_m]
+        if not sets:
+            continue
+        own, worse = (np.array([errors_m[k, name] for k in sets]) for name in (best, other))
+        what = other.removeprefix("8: ")
+        lines.append(
+            f"| error of odometry, 8 informative over {what} ({len(sets)} sets) | "
+            f"{'0.23-0.55' if 'random' in what else 'worse'} | "
+            f"{np.median(own) / np.median(worse):.2f} ({1e3 * np.median(own):.0f} mm over "
+            f"{1e3 * np.median(worse):.0f} mm; true calibration {1e3 * errors_m[-1, 'truth']:.0f} mm, "
+            f"nominal {1e3 * errors_m[-1, 'nominal']:.0f} mm); {what} worse in "
+            f"{np.mean(worse > own):.0%} of sets |"
+        )
+    return lines
 
 
 def consistency_table(paths: list[Path]) -> list[str]:
@@ -221,6 +245,7 @@ def comparison_table(results: Results) -> list[str]:
             "",
             f"{np.median(own) / np.median(worse):.2f}; worse in {np.mean(worse > own):.0%} of sets",
         )
+    lines += odometry_lines(results)
     for groups, single, what in (
         ("4 each: entropy by groups", "4: entropy", "tables of 4, entropy"),
         ("8 each: entropy by groups", "8: D-optimality", "tables of 8, entropy"),
@@ -305,7 +330,7 @@ def picture(results: Results) -> str:
 
 def of_scenario(path: Path) -> list[str]:
     """Return the sections on one scenario; write its picture."""
-    results = Results(lines_of(path))
+    results = Results(lines_of(path), lines_of(path.with_name(f"{path.stem}_vio.jsonl")))
     image = f"images/self_calibration_{path.stem}.svg"
     (DOCS / image).write_text(picture(results))
     each = np.median(

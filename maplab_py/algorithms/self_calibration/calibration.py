@@ -195,7 +195,8 @@ def _begun_anew(problem: SegmentProblem, states: States, options: SelfCalibratio
 
 def _refusal(names: tuple[str, ...]) -> str:
     shown = "; ".join(f"{name}: not excited" for name in names[:6])
-    more = f"; and {len(names) - 6} more" if len(names) > 6 else ""
+    sensors = dict.fromkeys(one.split()[0] for one in names[6:])
+    more = f"; and {len(names) - 6} more, of {', '.join(sensors)}" if sensors else ""
     return (
         f"the data do not determine the calibration ({shown}{more}): record motion with turns and "
         "accelerations about all axes, estimate fewer --sc_states, or accept the prior there with "
