@@ -2,6 +2,7 @@
 
 python docs/scripts/self_calibration_page.py --results=ar_room.jsonl --consistency=clean.jsonl,swaps.jsonl
 
+Files of consistency are labelled with what follows the first _ of their names.
 Beside NAME.jsonl, NAME_vio.jsonl of evaluate_calibrated_odometry.py is read where there is one.
 """
 
@@ -32,6 +33,8 @@ THESIS = {
     "camera rotation": (0.07, float(np.rad2deg(1.0)), "deg"),
 }
 """Level of the thesis' table 6.1, factor to its unit, unit."""
+FEW_SETS = 3
+"""With fewer data sets there is no deviation over them to speak of."""
 
 INTRODUCTION = """# Self-calibration: results
 
@@ -134,10 +137,11 @@ def consistency_table(paths: list[Path]) -> list[str]:
         error = np.array([row["error"] for row in rows])
         normalised = error / np.array([row["sigma"] for row in rows])
         n, k = error.shape
+        label = f" ({path.stem.split('_', 1)[1].replace('_', ' ')})" if "_" in path.stem else ""
         band = 1.96 * np.sqrt(2.0 * k / n)
         mean, deviation = normalised.mean(axis=0), normalised.std(axis=0, ddof=1)
         lines.append(
-            f"| {100 * rows[0]['swaps']:.0f} % | {n} | {np.mean([r['nees'] for r in rows]):.1f} | "
+            f"| {100 * rows[0]['swaps']:.0f} %{label} | {n} | {np.mean([r['nees'] for r in rows]):.1f} | "
             f"{k - band:.1f} .. {k + band:.1f} | {np.sqrt(np.mean(mean**2)):.2f} "
             f"(largest {np.abs(mean).max():.2f}) | {1 / np.sqrt(n):.2f} | "
             f"{np.sqrt(np.mean(deviation**2)):.2f} | "
@@ -186,7 +190,7 @@ def parameter_table(results: Results) -> list[str]:
         for m in ("informative", "batch", "8: A-optimality", "8: random")
         if m in results.by_method
     ]
-    names = next(iter(results.by_method["batch"].values()))["names"]
+    names = next(iter(results.by_method[methods[0]].values()))["names"]
     lines = [
         "### Parameters: standard deviation over the data sets (root mean square error)",
         "",
@@ -200,8 +204,10 @@ def parameter_table(results: Results) -> list[str]:
             error = (
                 factor * np.array([r["error"] for r in results.by_method[method].values()])[:, own]
             )
-            deviation = np.sqrt(np.mean(error.var(axis=0, ddof=1)))
-            cells.append(f"{deviation:.2g} ({np.sqrt(np.mean(error**2)):.2g})")
+            cell = f"({np.sqrt(np.mean(error**2)):.2g})"
+            if len(error) >= FEW_SETS:
+                cell = f"{np.sqrt(np.mean(error.var(axis=0, ddof=1))):.2g} {cell}"
+            cells.append(cell)
         lines.append(f"| {kind} | {unit} | {level:.2g} | " + " | ".join(cells) + " |")
     return [*lines, ""]
 
@@ -213,7 +219,7 @@ def comparison_table(results: Results) -> list[str]:
     def add(what: str, thesis: str, here: str) -> None:
         lines.append(f"| {what} | {thesis} | {here} |")
 
-    if results.pairs("informative", "batch"):
+    if len(results.pairs("informative", "batch")) >= FEW_SETS:
         ratio = results.spread_ratio("informative", "batch")
         add(
             "spread of the parameters, informative over batch",
@@ -252,7 +258,7 @@ def comparison_table(results: Results) -> list[str]:
         ("8: entropy by groups", "8: D-optimality", "8 segments in all, entropy"),
         ("8: A-optimality by groups", "8: A-optimality", "8 segments in all, A-optimality"),
     ):
-        if not (pairs := results.pairs(groups, single)):
+        if len(pairs := results.pairs(groups, single)) < FEW_SETS:
             continue
         ratio = results.spread_ratio(groups, single)
         names = pairs[0][0]["names"]
@@ -266,14 +272,14 @@ def comparison_table(results: Results) -> list[str]:
             "0.56-0.60 (centre, gyroscope misalignment)",
             f"median {np.median(ratio):.2f}; these: {np.median(ratio[thesis]):.2f}",
         )
-    if results.pairs("informative", "8: A-optimality"):
+    if len(results.pairs("informative", "8: A-optimality")) >= FEW_SETS:
         ratio = results.spread_ratio("informative", "8: A-optimality")
         add(
             "spread, the 8 best of each group (9 to 12 segments) over a single group of 8",
             "",
             f"median {np.median(ratio):.2f}",
         )
-    if pairs := results.pairs("two sessions", "batch"):
+    if len(pairs := results.pairs("two sessions", "batch")) >= FEW_SETS:
         own, batch = (
             np.median([overall(row) for row in side]) for side in zip(*pairs, strict=True)
         )

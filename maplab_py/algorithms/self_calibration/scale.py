@@ -39,7 +39,8 @@ def path_lengths_m(T_G_I: F64, run: I64, partition: I64) -> F64:
     """
     step = np.linalg.norm(np.diff(T_G_I[:, 4:], axis=0), axis=1)
     step[run[1:] != run[:-1]] = 0.0
-    return np.bincount(partition[1:], step, minlength=int(partition.max(initial=-1)) + 1)
+    count = int(partition.max(initial=-1)) + 1
+    return np.asarray(np.bincount(partition[1:], step, minlength=count), dtype=np.float64)
 
 
 def distances_m(problem: SegmentProblem, states: States, partition: I64) -> F64:
