@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 from maplab_py.estimation.loss import Loss, robust
 from maplab_py.estimation.states import F64, States
 

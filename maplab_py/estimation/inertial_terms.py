@@ -26,10 +26,10 @@ I64 = NDArray[np.int64]
 FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
 """Added to covariances: edges of a few microseconds stay finite (1 um, 0.1 urad, 1 um/s)."""
 
-_GYRO_MOVED_RADPS = 1e-4
-_ACCEL_MOVED_MPS2 = 1e-3
-"""Beyond these the first-order bias correction, wrong by up to 0.1 nm in 0.2 s then, is replaced by
-a new integration."""
+TURNED_RAD = 2e-4
+SPEEDED_MPS = 2e-3
+"""What a change of bias may make of an edge in all before the first-order correction is replaced by
+a new integration. The second order is lost until then: 1 nm, 1 nrad and 20 nm/s of a lively 0.2 s."""
 
 
 class InertialTerm:
@@ -60,8 +60,9 @@ class InertialTerm:
             self._whitening = _whitening(new)
             self._set_measured(new)
             return True
-        has_moved = (np.abs(b_g - old.gyro_bias) > _GYRO_MOVED_RADPS).any(axis=1)
-        has_moved |= (np.abs(b_a - old.accel_bias) > _ACCEL_MOVED_MPS2).any(axis=1)
+        duration_s = old.duration_s[:, None]
+        has_moved = (np.abs(b_g - old.gyro_bias) * duration_s > TURNED_RAD).any(axis=1)
+        has_moved |= (np.abs(b_a - old.accel_bias) * duration_s > SPEEDED_MPS).any(axis=1)
         rows = np.flatnonzero(has_moved)
         if not len(rows):
             return False

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 
 
 @compiled(inline="always")

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 from maplab_py.vimap.table import starts_of_counts
 
 I64 = NDArray[np.int64]

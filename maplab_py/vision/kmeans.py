@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.vision.jit import compiled, prange
+from maplab_py.compilation import compiled, prange
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.vision.jit import compiled, prange
+from maplab_py.compilation import compiled, prange
 
 _MIN_DEPTH_M = 0.05
 _CONFIDENCE = 0.999

@@ -13,8 +13,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.compilation import compiled, prange
 from maplab_py.errors import EstimationError
-from maplab_py.vision.jit import compiled, prange
 
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]

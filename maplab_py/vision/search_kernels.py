@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.vision.jit import compiled, prange
+from maplab_py.compilation import compiled, prange
 
 
 @compiled(inline="always")

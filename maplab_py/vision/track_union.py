@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.vision.jit import compiled
+from maplab_py.compilation import compiled
 
 I64 = NDArray[np.int64]
 

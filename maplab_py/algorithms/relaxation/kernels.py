@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 
 
 @compiled()

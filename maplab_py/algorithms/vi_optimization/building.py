@@ -36,7 +36,7 @@ from maplab_py.algorithms.vi_optimization.terms import (
     landmark_prior,
     prior_terms,
 )
-from maplab_py.errors import EstimationError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.camera_terms import (
     EXTRINSICS,
     INTRINSICS,
@@ -91,9 +91,15 @@ def build(
     """Pose the problem of some missions (rows, None = all).
 
     Raises:
+        UserError: Flags contradict each other.
         EstimationError: Nothing can be optimised.
         MapError: Calibrations that the terms need are missing.
     """
+    if options.fix_vertices and not options.absolute_pose_sensor_fix_mission_baseframes:
+        raise UserError(
+            "--ba_fix_vertices keeps the base frames as well: drop it, or leave "
+            "--ba_absolute_pose_sensor_fix_mission_baseframes on"
+        )
     selection = select(vi_map, options, missions)
     if not len(selection.vertices):
         raise EstimationError("nothing to optimise: the map has no vertices")

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

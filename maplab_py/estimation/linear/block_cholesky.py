@@ -68,22 +68,12 @@ class BlockCholesky:
     def solve(self, right_side: F64, *, refinements: int = 0) -> F64:
         """Return x of A x = b for b (n,) or (n, k); see `protocol.LinearSolver`."""
         values = self._factorised()
-        b = self._pattern.check_right_side(right_side)
         with single_blas_thread():
-            x = self._solve(b)
-            for _ in range(refinements):
-                x += self._solve(b - self._pattern.multiply(values, x))
-        return x.reshape(right_side.shape)
+            return self._pattern.refined(self._solve, values, right_side, refinements)
 
     def marginal_covariance(self, nodes: ArrayLike) -> F64:
         """Return the joint covariance of some nodes; see `protocol.LinearSolver`."""
-        d = self._pattern.node_size
-        chosen = np.asarray(nodes, dtype=np.int64)
-        rows = (chosen[:, None] * d + np.arange(d)).reshape(-1)
-        unit = np.zeros((self._pattern.size, len(rows)))
-        unit[rows, np.arange(len(rows))] = 1.0
-        covariance = self.solve(unit)[rows]
-        return np.asarray(0.5 * (covariance + covariance.T))
+        return self._pattern.joint_covariance(self.solve, nodes)
 
     def inverse_blocks(self) -> F64:
         """Return the inverse at every given block; see `protocol.LinearSolver`."""

@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.blas import dgemm, dpotrf, dsyrk, dtrsm
-from maplab_py.estimation.linear.jit import compiled
 from maplab_py.estimation.linear.symbolic import FrontPlan
 
 F64 = NDArray[np.float64]
@@ -109,9 +109,12 @@ def _solve_triangle(
 
 @compiled()
 def _subtract_square(
-    blas: Blas, factor: F64, leading: int, rows: int, cols: int, result: F64
+    blas: Blas, factor: F64, leading: int, rows: int, cols: int, keep: int, result: F64
 ) -> None:
-    """Lower triangle of result (rows, rows) -= factor factor^T, for factor (rows, cols)."""
+    """Overwrite the lower triangle of result (rows, rows) by keep result - factor factor^T.
+
+    The factor is (rows, cols).
+    """
     letters, sizes = blas.letters, blas.sizes
     sizes[0], sizes[1], sizes[2], sizes[3] = rows, cols, leading, rows
     dsyrk(
@@ -122,7 +125,7 @@ def _subtract_square(
         blas.factors[MINUS_ONE:].ctypes,
         factor.ctypes,
         sizes[2:].ctypes,
-        blas.factors[ONE:].ctypes,
+        blas.factors[keep:].ctypes,
         result.ctypes,
         sizes[3:].ctypes,
     )
@@ -172,17 +175,22 @@ def _add_matrix_blocks(plan: FrontPlan, supernode: int, values: F64, panel: F64)
     d = plan.node_size
     for block in plan.block_of[plan.block_start[supernode] : plan.block_start[supernode + 1]]:
         row, col = plan.block_row[block] * d, plan.block_col[block] * d
-        for c in range(d):
-            for r in range(d):
-                if plan.block_is_transposed[block]:
+        if plan.block_is_transposed[block]:
+            for c in range(d):
+                for r in range(d):
                     panel[col + c, row + r] += values[block, c, r]
-                else:
+        else:
+            for c in range(d):
+                for r in range(d):
                     panel[col + c, row + r] += values[block, r, c]
 
 
 @compiled()
-def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -> None:
+def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int, runs: I64) -> None:
     """Add a child's update matrix to a front ("extend-add").
+
+    Rows of the child that are neighbours in the front as well make one run, and whole runs are
+    added at a time.
 
     Args:
         panel: First columns of the front, [column, row] (w, w + n).
@@ -190,19 +198,45 @@ def _add_child_update(panel: F64, update: F64, child: F64, place: I64, d: int) -
         child: The child's update matrix, [column, row], lower triangle.
         place: Local node of the front for every node of the child's matrix, ascending.
         d: Rows of a node.
+        runs: Room (nodes + 1, 2) for the first row of every run in the child and in the front.
     """
     width = panel.shape[0]
-    for j in range(len(place)):
-        col = place[j] * d
-        for i in range(j, len(place)):
-            row = place[i] * d
-            for c in range(d):
-                for r in range(c if i == j else 0, d):
-                    value = child[j * d + c, i * d + r]
-                    if col < width:
-                        panel[col + c, row + r] += value
-                    else:
-                        update[col - width + c, row - width + r] += value
+    count = 0
+    for node in range(len(place)):
+        if node == 0 or place[node] != place[node - 1] + 1:
+            runs[count, 0], runs[count, 1] = node * d, place[node] * d
+            count += 1
+    runs[count, 0] = len(place) * d
+    for run in range(count):
+        for j in range(runs[run, 0], runs[run + 1, 0]):
+            col = runs[run, 1] + j - runs[run, 0]
+            source = child[j]
+            target, before = (panel[col], 0) if col < width else (update[col - width], width)
+            for other in range(run, count):
+                shift = runs[other, 1] - runs[other, 0] - before
+                for i in range(max(j, runs[other, 0]), runs[other + 1, 0]):
+                    target[i + shift] += source[i]
+
+
+@compiled()
+def _clear_triangle(matrix: F64) -> None:
+    for col in range(len(matrix)):
+        matrix[col, col:] = 0.0
+
+
+@compiled()
+def _copy_triangle(matrix: F64, result: F64) -> None:
+    for col in range(len(matrix)):
+        result[col, col:] = matrix[col, col:]
+
+
+@compiled()
+def _most_below(plan: FrontPlan) -> int:
+    """Return the largest number of nodes below a supernode."""
+    most = 0
+    for s in range(len(plan.first_node) - 1):
+        most = max(most, plan.below_start[s + 1] - plan.below_start[s])
+    return most
 
 
 @compiled()
@@ -222,13 +256,16 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
     top = 0  # first free number of the stack
     waiting = np.empty(supernodes, np.int64)  # supernodes whose updates are on the stack
     num_waiting = 0
+    runs = np.empty((_most_below(plan) + 1, 2), np.int64)
     for s in range(supernodes):
         w = (plan.first_node[s + 1] - plan.first_node[s]) * d
         n = (plan.below_start[s + 1] - plan.below_start[s]) * d
         panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + n)
         panel[:] = 0.0
         update = front[: n * n].reshape(n, n)
-        update[:] = 0.0
+        is_leaf = plan.child_count[s] == 0
+        if not is_leaf:
+            _clear_triangle(update)
         _add_matrix_blocks(plan, s, values, panel)
         for _ in range(plan.child_count[s]):
             num_waiting -= 1
@@ -237,7 +274,7 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
             rows = len(place) * d
             top -= rows * rows
             child_update = stack[top : top + rows * rows].reshape(rows, rows)
-            _add_child_update(panel, update, child_update, place, d)
+            _add_child_update(panel, update, child_update, place, d, runs)
         triangle = panel.reshape(-1)
         bad_column = _cholesky(blas, triangle, w, w + n)
         if bad_column != 0:
@@ -245,8 +282,12 @@ def factorise(plan: FrontPlan, values: F64, factor: F64, front: F64, stack: F64,
         if n > 0:
             below = factor[plan.panel_start[s] + w :]  # L21 starts below L11 in every column
             _solve_triangle(blas, RIGHT, TRANSPOSED, triangle, w + n, below, n, w, w + n)
-            _subtract_square(blas, below, w + n, n, w, front)
-            stack[top : top + n * n] = front[: n * n]
+            waits = stack[top : top + n * n]
+            if is_leaf:
+                _subtract_square(blas, below, w + n, n, w, ZERO, waits)
+            else:
+                _subtract_square(blas, below, w + n, n, w, ONE, front)
+                _copy_triangle(update, waits.reshape(n, n))
             top += n * n
             waiting[num_waiting] = s
             num_waiting += 1
@@ -267,10 +308,7 @@ def solve(plan: FrontPlan, factor: F64, right_sides: F64, blas: Blas) -> F64:
             for r in range(d):
                 x[col, place * d + r] = right_sides[col, order[place] * d + r]
     supernodes = len(plan.first_node) - 1
-    tallest = 1
-    for s in range(supernodes):
-        tallest = max(tallest, (plan.below_start[s + 1] - plan.below_start[s]) * d)
-    gathered = np.empty((k, tallest))
+    gathered = np.empty((k, max(_most_below(plan) * d, 1)))
     for s in range(supernodes):
         _solve_up(plan, s, factor, x, gathered, blas)
     for s in range(supernodes - 1, -1, -1):

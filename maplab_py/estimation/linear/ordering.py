@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct
 
 I64 = NDArray[np.int64]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -80,6 +81,26 @@ class BlockPattern:
         both = np.concatenate([lower, values[strict].transpose(0, 2, 1)])[order]
         matrix = bsr_array((both, cols, start), shape=(self.size, self.size))
         return np.asarray(matrix @ x)
+
+    def refined(
+        self, solve: Callable[[F64], F64], values: F64, right_side: F64, refinements: int
+    ) -> F64:
+        """Return x of A x = b, in the shape of b, by a solver of (n, k) and steps of refinement."""
+        b = self.check_right_side(right_side)
+        x = solve(b)
+        for _ in range(refinements):
+            x += solve(b - self.multiply(values, x))
+        return x.reshape(right_side.shape)
+
+    def joint_covariance(self, solve: Callable[[F64], F64], nodes: ArrayLike) -> F64:
+        """Return the inverse at the rows of some nodes (m d, m d), by solving for their columns."""
+        d = self.node_size
+        chosen = np.asarray(nodes, dtype=np.int64)
+        rows = (chosen[:, None] * d + np.arange(d)).reshape(-1)
+        unit = np.zeros((self.size, len(rows)))
+        unit[rows, np.arange(len(rows))] = 1.0
+        covariance = solve(unit)[rows]
+        return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def symmetric_of_lower(blocks: F64) -> F64:

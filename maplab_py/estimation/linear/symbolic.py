@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.linear.jit import compiled
+from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.ordering import minimum_degree
 from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct
 from maplab_py.estimation.linear.protocol import FactorStatistics

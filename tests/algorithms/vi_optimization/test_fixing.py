@@ -10,6 +10,7 @@ import pytest
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import UserError
 from maplab_py.vimap import VIMap
 from tests.support.scene import Scene, corrupted
 
@@ -86,3 +87,11 @@ def test_base_frames_measurements_and_sensors_stay() -> None:
     assert result.keypoints is start().keypoints
     assert result.imu_samples is start().imu_samples
     assert result.sensors is start().sensors
+
+
+def test_base_frames_that_nothing_could_move_are_refused() -> None:
+    options = dataclasses.replace(
+        OPTIONS, fix_vertices=True, absolute_pose_sensor_fix_mission_baseframes=False
+    )
+    with pytest.raises(UserError, match="--ba_fix_vertices keeps the base frames as well"):
+        optimize(start(), options)

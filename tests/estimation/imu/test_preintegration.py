@@ -10,6 +10,7 @@ import pytest
 from maplab_py.errors import MapError
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.inertial_terms import SPEEDED_MPS, TURNED_RAD
 from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from maplab_py.sensors.imu_model import distort_imu
@@ -69,6 +70,18 @@ def test_bias_jacobians_match_finite_differences():
         forward, backward = integrate(data, b_g, b_a + d), integrate(data, b_g, b_a - d)
         numeric = (_as_vector(forward, center) - _as_vector(backward, center)) / (2 * step)
         np.testing.assert_allclose(center.jacobian_accel_bias[0, :, axis], numeric, atol=2e-8)
+
+
+def test_first_order_correction_suffices_where_edges_are_kept():
+    data = one_edge(*sampled(0.2, 200))
+    kept = integrate(data, ZERO, ZERO)
+    for axis in range(6):
+        change = np.eye(6)[axis] * (TURNED_RAD if axis < 3 else SPEEDED_MPS) / 0.2
+        exact = integrate(data, change[:3], change[3:])
+        jacobian = np.concatenate([kept.jacobian_gyro_bias, kept.jacobian_accel_bias], axis=2)[0]
+        error = _as_vector(exact, kept) - _as_vector(kept, kept) - jacobian @ change
+        assert np.all(np.abs(error[:6]) < 1e-9)  # metres and radians
+        assert np.all(np.abs(error[6:]) < 2e-8)  # metres per second
 
 
 def test_covariance_matches_monte_carlo():

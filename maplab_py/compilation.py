@@ -1,4 +1,4 @@
-"""The decorator that compiles hand-written kernels with numba and keeps them on disk.
+"""The decorator that compiles hand-written kernels with numba and keeps them on disk; `prange`.
 
 numba stores machine code beside the source file, or in `NUMBA_CACHE_DIR`, or in the user's cache
 folder when the package folder is read-only; the entry is valid as long as the source FILE keeps
@@ -38,3 +38,6 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
             return numba.njit(nogil=True, **settings)(function)  # type: ignore[no-any-return]
 
     return decorate
+
+
+prange: Any = numba.prange
