@@ -103,7 +103,13 @@ def calibrate(
     posed = time.perf_counter()
     roughly = dataclasses.replace(options, num_iterations=_ROUGH, function_tolerance=1e-3)
     states, first = solve(rough, roughly, progress)
-    problem = pose(_begun_anew(rough, states, options), options, prior_at=before, progress=progress)
+    problem = pose(
+        _begun_anew(rough, states, options),
+        options,
+        missions=missions,
+        prior_at=before,
+        progress=progress,
+    )
     states, summary, consistency = _settled(problem, options, progress)
     lost = partitions_without_scale(problem, states, rough)
     rest = without_partitions(problem, lost)
