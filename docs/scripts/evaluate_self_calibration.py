@@ -64,6 +64,9 @@ METHODS = (
     "8: entropy by groups",
     "8: random",
     "8: least informative",
+    "4: entropy",
+    "4 each: entropy by groups",
+    "8 each: entropy by groups",
 )
 JUDGED = ("informative", "batch", "8: A-optimality", "8: random", "8: least informative")
 """Their calibrations are also tried on another session."""
@@ -112,15 +115,19 @@ def in_turn(tables: dict[str, F64], count: int) -> list[int]:
     return list(chosen)[:count]
 
 
+def best_of_each(tables: dict[str, F64], count: int) -> set[int]:
+    """Return what tables of so many segments hold together, as the database does."""
+    orders = [np.argsort(values, kind="stable") for values in tables.values()]
+    return {int(k) for order in orders for k in order[:count]}
+
+
 def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> list[I64]:
     """Return the segments (vertex rows) that a method takes."""
-    count = min(FEW, len(evaluation.segments))
-    what = method.removeprefix("8: ")
+    capacity, _, what = method.rpartition(": ")
+    count = min(int(capacity.split()[0]) if capacity else FEW, len(evaluation.segments))
     if what == "informative":
         tables = scores_of(evaluation, "a_optimality", OPTIONS.groups)
-        best = {
-            int(k) for one in tables.values() for k in np.argsort(one, kind="stable")[:per_group]
-        }
+        best = best_of_each(tables, per_group)
     elif what == "random":
         rng = np.random.default_rng(number)
         best = set(rng.choice(len(evaluation.segments), size=count, replace=False).tolist())
@@ -130,7 +137,10 @@ def chosen(evaluation: Evaluation, method: str, number: int, per_group: int) -> 
     else:
         metric = what.split(" by ")[0].replace("-", "_").lower()
         groups = OPTIONS.groups if what.endswith("by groups") else WHOLE
-        best = set(in_turn(scores_of(evaluation, metric, groups), count))
+        tables = scores_of(evaluation, metric, groups)
+        best = set(in_turn(tables, count))
+        if capacity.endswith("each"):
+            best = best_of_each(tables, count)
     return [evaluation.segments[k].rows for k in sorted(best)]
 
 
@@ -187,7 +197,7 @@ def measure(
     if first is not None:
         for method, sensors in (("nominal", first.vi_map.sensors), ("truth", first.true_sensors)):
             row = {"set": -1, "method": method, "map_m": map_error_m(judge, sensors)}
-            _append(out, row)
+            append_line(out, row)
     for number in sets:
         missing = [method for method in methods if (number, method) not in done]
         if not missing:
@@ -196,7 +206,7 @@ def measure(
         for method in missing:
             row = _measured(scenario, data, method, per_group, judge if method in judged else None)
             row["selection_s_per_segment"] = data.selection_s
-            _append(out, row)
+            append_line(out, row)
             map_m = row["map_m"] or float("nan")
             sys.stdout.write(
                 f"{number:3d} {method:26s} NEES {row['nees']:8.1f}  map error {map_m:.4f} m\n"
@@ -245,6 +255,8 @@ def _measured(
             "noise_factor": report.keypoint_noise_factor,
             "inconsistent": report.inconsistent_landmarks,
             "unobservable": list(report.unobservable),
+            "without_scale": list(report.without_scale),
+            "partitions": report.partitions,
         }
     seconds = time.process_time() - began
     return {
@@ -303,10 +315,11 @@ def consistency(scenario_name: str, seeds: range, swaps: float, out: Path) -> No
             "noise_factor": report.keypoint_noise_factor,
             "inconsistent": report.inconsistent_landmarks,
         }
-        _append(out, row)
+        append_line(out, row)
 
 
-def _append(path: Path, row: dict[str, Any]) -> None:
+def append_line(path: Path, row: dict[str, Any]) -> None:
+    """Append a result to a file."""
     with path.open("a") as file:
         file.write(json.dumps(row) + "\n")
 

@@ -1,6 +1,9 @@
 """Write docs/self_calibration_results.md and its picture from what evaluate_self_calibration.py measured.
 
 python docs/scripts/self_calibration_page.py --results=ar_room.jsonl --consistency=clean.jsonl,swaps.jsonl
+
+Files of consistency are labelled with what follows the first _ of their names.
+Beside NAME.jsonl, NAME_vio.jsonl of evaluate_calibrated_odometry.py is read where there is one.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ THESIS = {
     "camera rotation": (0.07, float(np.rad2deg(1.0)), "deg"),
 }
 """Level of the thesis' table 6.1, factor to its unit, unit."""
+FEW_SETS = 3
+"""With fewer data sets there is no deviation over them to speak of."""
 
 INTRODUCTION = """# Self-calibration: results
 
@@ -67,8 +72,9 @@ def overall(row: dict[str, Any]) -> float:
 class Results:
     """Rows of one scenario, by method."""
 
-    def __init__(self, rows: list[dict[str, Any]]) -> None:
-        """Sort rows by method and data set."""
+    def __init__(self, rows: list[dict[str, Any]], odometry: list[dict[str, Any]]) -> None:
+        """Sort rows, and errors of odometry that used the calibrations, by method and data set."""
+        self.odometry_m = {(row["set"], row["method"]): row["vio_m"] for row in odometry}
         self.map_m = {row["method"]: row["map_m"] for row in rows if row["set"] < 0}
         self.by_method: dict[str, dict[int, dict[str, Any]]] = {}
         for row in rows:
@@ -91,6 +97,27 @@ class Results:
         return self.spread(one, sets) / self.spread(other, sets)
 
 
+def odometry_lines(results: Results) -> list[str]:
+    """Return the rows on odometry with the calibrations, in the thesis' way."""
+    errors_m, lines = results.odometry_m, []
+    best = "8: A-optimality"
+    for other in ("8: random", "8: least informative"):
+        sets = [k for k, name in errors_m if name == best and (k, other) in errors_m]
+        if not sets:
+            continue
+        own, worse = (np.array([errors_m[k, name] for k in sets]) for name in (best, other))
+        what = other.removeprefix("8: ")
+        lines.append(
+            f"| error of odometry, 8 informative over {what} ({len(sets)} sets) | "
+            f"{'0.23-0.55' if 'random' in what else 'worse'} | "
+            f"{np.median(own) / np.median(worse):.2f} ({1e3 * np.median(own):.0f} mm over "
+            f"{1e3 * np.median(worse):.0f} mm; true calibration {1e3 * errors_m[-1, 'truth']:.0f} mm, "
+            f"nominal {1e3 * errors_m[-1, 'nominal']:.0f} mm); {what} worse in "
+            f"{np.mean(worse > own):.0%} of sets |"
+        )
+    return lines
+
+
 def consistency_table(paths: list[Path]) -> list[str]:
     """Return the section on errors and announced deviations."""
     lines = [
@@ -110,10 +137,11 @@ def consistency_table(paths: list[Path]) -> list[str]:
         error = np.array([row["error"] for row in rows])
         normalised = error / np.array([row["sigma"] for row in rows])
         n, k = error.shape
+        label = f" ({path.stem.split('_', 1)[1].replace('_', ' ')})" if "_" in path.stem else ""
         band = 1.96 * np.sqrt(2.0 * k / n)
         mean, deviation = normalised.mean(axis=0), normalised.std(axis=0, ddof=1)
         lines.append(
-            f"| {100 * rows[0]['swaps']:.0f} % | {n} | {np.mean([r['nees'] for r in rows]):.1f} | "
+            f"| {100 * rows[0]['swaps']:.0f} %{label} | {n} | {np.mean([r['nees'] for r in rows]):.1f} | "
             f"{k - band:.1f} .. {k + band:.1f} | {np.sqrt(np.mean(mean**2)):.2f} "
             f"(largest {np.abs(mean).max():.2f}) | {1 / np.sqrt(n):.2f} | "
             f"{np.sqrt(np.mean(deviation**2)):.2f} | "
@@ -162,7 +190,7 @@ def parameter_table(results: Results) -> list[str]:
         for m in ("informative", "batch", "8: A-optimality", "8: random")
         if m in results.by_method
     ]
-    names = next(iter(results.by_method["batch"].values()))["names"]
+    names = next(iter(results.by_method[methods[0]].values()))["names"]
     lines = [
         "### Parameters: standard deviation over the data sets (root mean square error)",
         "",
@@ -176,8 +204,10 @@ def parameter_table(results: Results) -> list[str]:
             error = (
                 factor * np.array([r["error"] for r in results.by_method[method].values()])[:, own]
             )
-            deviation = np.sqrt(np.mean(error.var(axis=0, ddof=1)))
-            cells.append(f"{deviation:.2g} ({np.sqrt(np.mean(error**2)):.2g})")
+            cell = f"({np.sqrt(np.mean(error**2)):.2g})"
+            if len(error) >= FEW_SETS:
+                cell = f"{np.sqrt(np.mean(error.var(axis=0, ddof=1))):.2g} {cell}"
+            cells.append(cell)
         lines.append(f"| {kind} | {unit} | {level:.2g} | " + " | ".join(cells) + " |")
     return [*lines, ""]
 
@@ -189,7 +219,7 @@ def comparison_table(results: Results) -> list[str]:
     def add(what: str, thesis: str, here: str) -> None:
         lines.append(f"| {what} | {thesis} | {here} |")
 
-    if results.pairs("informative", "batch"):
+    if len(results.pairs("informative", "batch")) >= FEW_SETS:
         ratio = results.spread_ratio("informative", "batch")
         add(
             "spread of the parameters, informative over batch",
@@ -221,27 +251,35 @@ def comparison_table(results: Results) -> list[str]:
             "",
             f"{np.median(own) / np.median(worse):.2f}; worse in {np.mean(worse > own):.0%} of sets",
         )
-    for metric, label in (("entropy", "D-optimality"), ("A-optimality", "A-optimality")):
-        if not results.pairs(f"8: {metric} by groups", f"8: {label}"):
+    lines += odometry_lines(results)
+    for groups, single, what in (
+        ("4 each: entropy by groups", "4: entropy", "tables of 4, entropy"),
+        ("8 each: entropy by groups", "8: D-optimality", "tables of 8, entropy"),
+        ("8: entropy by groups", "8: D-optimality", "8 segments in all, entropy"),
+        ("8: A-optimality by groups", "8: A-optimality", "8 segments in all, A-optimality"),
+    ):
+        if len(pairs := results.pairs(groups, single)) < FEW_SETS:
             continue
-        ratio = results.spread_ratio(f"8: {metric} by groups", f"8: {label}")
-        names = next(iter(results.by_method["batch"].values()))["names"]
+        ratio = results.spread_ratio(groups, single)
+        names = pairs[0][0]["names"]
         thesis = [
             k for k, n in enumerate(names) if kind_of(n) in ("centre", "gyroscope misalignment")
         ]
+        taken = [np.mean([row["segments"] for row in side]) for side in zip(*pairs, strict=True)]
         add(
-            f"spread, three groups over a single one, {metric}, 8 segments each",
+            f"spread, three groups over a single one, {what} ({taken[0]:.1f} segments against "
+            f"{taken[1]:.1f}, {len(pairs)} sets)",
             "0.56-0.60 (centre, gyroscope misalignment)",
             f"median {np.median(ratio):.2f}; these: {np.median(ratio[thesis]):.2f}",
         )
-    if results.pairs("informative", "8: A-optimality"):
+    if len(results.pairs("informative", "8: A-optimality")) >= FEW_SETS:
         ratio = results.spread_ratio("informative", "8: A-optimality")
         add(
             "spread, the 8 best of each group (9 to 12 segments) over a single group of 8",
             "",
             f"median {np.median(ratio):.2f}",
         )
-    if pairs := results.pairs("two sessions", "batch"):
+    if len(pairs := results.pairs("two sessions", "batch")) >= FEW_SETS:
         own, batch = (
             np.median([overall(row) for row in side]) for side in zip(*pairs, strict=True)
         )
@@ -298,7 +336,7 @@ def picture(results: Results) -> str:
 
 def of_scenario(path: Path) -> list[str]:
     """Return the sections on one scenario; write its picture."""
-    results = Results(lines_of(path))
+    results = Results(lines_of(path), lines_of(path.with_name(f"{path.stem}_vio.jsonl")))
     image = f"images/self_calibration_{path.stem}.svg"
     (DOCS / image).write_text(picture(results))
     each = np.median(

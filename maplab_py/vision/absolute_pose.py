@@ -71,13 +71,92 @@ def solve_poses(
         hypotheses: One of HYPOTHESES: "gravity", or "three_point", which makes no use of the
             given attitude: it only tells the tilt.
     """
-    from maplab_py.vision.pose_kernels import search_poses, search_poses_without_gravity
-
     count, matches = len(problems.key), len(problems.keypoint)
     of_match = np.repeat(np.arange(count), np.diff(problems.start))
     q_W_I = problems.q_M_I  # W: the frame of the attitude, with its origin at the body
-    origin_W = so3.rotate(q_W_I[of_match], problems.origin_I)
-    ray_W = so3.rotate(q_W_I[of_match], problems.ray_I)
+    found = search_level(
+        LevelProblems(
+            start=problems.start,
+            key=problems.key,
+            origin_W=so3.rotate(q_W_I[of_match], problems.origin_I),
+            ray_W=so3.rotate(q_W_I[of_match], problems.ray_I),
+            point_M=np.ascontiguousarray(problems.point_M),
+            keypoint=problems.keypoint,
+            tolerance=problems.tolerance,
+        ),
+        seed=seed,
+        max_iterations=max_iterations,
+        tilt_sigma_rad=tilt_sigma_rad,
+        hypotheses=hypotheses,
+    )
+    is_first = np.ones(matches, dtype=np.bool_)
+    is_first[1:] = (of_match[1:] != of_match[:-1]) | (
+        problems.keypoint[1:] != problems.keypoint[:-1]
+    )
+    keypoints = np.bincount(of_match[is_first], minlength=count)
+    inlier_cost = np.maximum(found.cost - (keypoints - found.inlier_count), 0.0)
+    return PoseSolutions(
+        T_M_I=found.poses(q_W_I),
+        inlier_count=found.inlier_count,
+        keypoint_count=keypoints,
+        is_inlier=found.is_inlier,
+        rms=np.sqrt(inlier_cost / np.maximum(found.inlier_count, 1)),
+        covariance=found.covariances(q_W_I),
+        tilt_rad=found.tilt_rad,
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LevelProblems:
+    """Like PoseProblems, with what belongs to the query turned to W: level, at the body."""
+
+    start: I64  # (P + 1,)
+    key: I64  # (P,)
+    origin_W: F64  # (N, 3)
+    ray_W: F64  # (N, 3)
+    point_M: F64  # (N, 3)
+    keypoint: I64  # (N,)
+    tolerance: F64  # (N,)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LevelSolutions:
+    """Poses T_M_W as found; what takes time to derive from them is asked for."""
+
+    R_M_W: F64  # (P, 3, 3)
+    p_M_W: F64  # (P, 3)
+    information: F64  # (P, 6, 6) of [dp, dtheta_W]
+    cost: F64  # (P,)
+    inlier_count: I64  # (P,)
+    is_inlier: NDArray[np.bool_]  # (N,)
+
+    @property
+    def tilt_rad(self) -> F64:
+        """Angle (P,) between gravity as given and as found."""
+        return np.asarray(np.arccos(np.clip(self.R_M_W[:, 2, 2], -1.0, 1.0)))
+
+    def poses(self, q_W_I: F64) -> F64:
+        """Return the poses T_M_I (P, 7)."""
+        T_M_W = se3.make(so3.from_matrix(self.R_M_W), self.p_M_W)
+        return se3.compose(T_M_W, se3.make(q_W_I, np.zeros((len(q_W_I), 3))))
+
+    def covariances(self, q_W_I: F64) -> F64:
+        """Return the covariances (P, 6, 6) of [dp, dtheta], NaN where undetermined."""
+        return _covariances(self.information, q_W_I)
+
+
+def search_level(
+    problems: LevelProblems,
+    *,
+    seed: int = 0,
+    max_iterations: int = 200,
+    tilt_sigma_rad: float = 0.02,
+    hypotheses: str = "gravity",
+) -> LevelSolutions:
+    """Find poses, see `solve_poses`, for those who turn their queries to W once and search often."""
+    from maplab_py.vision.pose_kernels import search_poses, search_poses_without_gravity
+
+    count, matches = len(problems.key), len(problems.keypoint)
     R, t, H = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.empty((count, 6, 6))
     cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
     is_inlier = np.zeros(matches, dtype=np.bool_)
@@ -86,29 +165,13 @@ def solve_poses(
     search(
         problems.start, _mixed_seeds(problems.key, seed),
         (
-            origin_W, ray_W, np.ascontiguousarray(problems.point_M), problems.keypoint,
+            problems.origin_W, problems.ray_W, problems.point_M, problems.keypoint,
             1.0 / problems.tolerance,
         ),
         (max_iterations, inverse_tilt), R, t, H,
         (cost, inliers, np.empty(count, dtype=np.int64)), is_inlier,
     )  # fmt: skip
-    is_first = np.ones(matches, dtype=np.bool_)
-    is_first[1:] = (of_match[1:] != of_match[:-1]) | (
-        problems.keypoint[1:] != problems.keypoint[:-1]
-    )
-    keypoints = np.bincount(of_match[is_first], minlength=count)
-    inlier_cost = np.maximum(cost - (keypoints - inliers), 0.0)
-    T_M_W = se3.make(so3.from_matrix(R), t)
-    T_W_I = se3.make(q_W_I, np.zeros((count, 3)))
-    return PoseSolutions(
-        T_M_I=se3.compose(T_M_W, T_W_I),
-        inlier_count=inliers,
-        keypoint_count=keypoints,
-        is_inlier=is_inlier,
-        rms=np.sqrt(inlier_cost / np.maximum(inliers, 1)),
-        covariance=_covariances(H, q_W_I),
-        tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)),
-    )
+    return LevelSolutions(R, t, H, cost, inliers, is_inlier)
 
 
 def _covariances(H: F64, q_W_I: F64) -> F64:

@@ -33,6 +33,7 @@ class InvertedMultiIndex:
         seed: int = 0,
         cells_per_query: int = 24,
         rank_by_bits: bool = True,
+        max_distance: float = np.inf,
     ) -> None:
         """Build the vocabularies and the cell lists.
 
@@ -42,6 +43,7 @@ class InvertedMultiIndex:
             cells_per_query: Cells that a query visits.
             rank_by_bits: Compare descriptors inside the cells by Hamming distance, which tells
                 more than the projection; else by squared distance in the projected space.
+            max_distance: What differs by more is no neighbour; a bound saves time.
         """
         points = database.projected
         # dimensions come sorted by how much they tell: give each half every other one
@@ -52,6 +54,8 @@ class InvertedMultiIndex:
         self._centres = tuple(kmeans(half, words, seed=seed + i) for i, half in enumerate(halves))
         self._cells_per_query = cells_per_query
         self._rank_by_bits = rank_by_bits
+        # the kernel wants less than a bound
+        self._bound = np.nextafter(np.float32(max_distance), np.float32(np.inf))
         self._next = len(points)
         self._fill(database, np.arange(len(points)))
 
@@ -86,9 +90,9 @@ class InvertedMultiIndex:
     def nearest(self, queries: DescriptorSet, k: int, rule: MatchRule) -> Neighbours:
         """Return the nearest database descriptors that the rule allows, one per label."""
         row = np.full((len(queries), k), -1, dtype=np.int32)
-        distance = np.full((len(queries), k), np.inf, dtype=np.float32)
         if len(self._rows) == 0:
-            return Neighbours(row, distance)
+            return Neighbours(row, np.full(row.shape, np.inf, dtype=np.float32))
+        distance = np.full((len(queries), k), self._bound, dtype=np.float32)
         d = self._sorted
         search_cells(
             queries.projected, queries.words, queries.label, queries.session, queries.time_ns,
@@ -99,4 +103,5 @@ class InvertedMultiIndex:
         )  # fmt: skip
         found = row >= 0
         row[found] = self._rows[row[found]]
+        distance[~found] = np.inf
         return Neighbours(row, distance)

@@ -9,6 +9,7 @@ Source: Lynen et al., Get Out of My Lab, RSS 2015, section IV; Bosse and Zlot 20
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,14 +52,17 @@ class DescriptorProjection:
                 f"the projection takes descriptors of {self.descriptor_size} bytes, not "
                 f"{descriptors.shape[1]}"
             )
-        dimensions = len(self.matrix)
-        values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
-        by_byte = self.matrix.T.reshape(self.descriptor_size, 8, dimensions)
-        # sum over the 8 bits of a byte, tabulated for its 256 values
-        table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False).astype(np.float32)
-        projected = np.empty((len(descriptors), dimensions), dtype=np.float32)
-        _sum_table(np.ascontiguousarray(descriptors), table, projected)
+        projected = np.empty((len(descriptors), len(self.matrix)), dtype=np.float32)
+        _sum_table(np.ascontiguousarray(descriptors), self._table, projected)
         return projected
+
+    @cached_property
+    def _table(self) -> F32:
+        """What a byte adds: (bytes, 256, dimensions), the sum over its 8 bits for all its values."""
+        values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
+        by_byte = self.matrix.T.reshape(self.descriptor_size, 8, len(self.matrix))
+        table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False)
+        return np.asarray(table, dtype=np.float32)
 
 
 def learn_projection(

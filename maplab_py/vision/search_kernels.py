@@ -119,9 +119,16 @@ def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type
 
 
 @compiled(inline="always")
-def _squared_distance(a, i, b, j):  # type: ignore[no-untyped-def]
+def _squared_distance(a, i, b, j, limit):  # type: ignore[no-untyped-def]
+    """Return the squared distance, or only a part of it where that reaches the limit already."""
     total = np.float32(0.0)
-    for k in range(a.shape[1]):
+    half = a.shape[1] // 2
+    for k in range(half):
+        difference = a[i, k] - b[j, k]
+        total += difference * difference
+    if total >= limit:
+        return total
+    for k in range(half, a.shape[1]):
         difference = a[i, k] - b[j, k]
         total += difference * difference
     return total
@@ -133,7 +140,10 @@ def search_cells(  # type: ignore[no-untyped-def]
     d_points, d_words, d_label, d_session, d_time,
     cells_per_query, rank_by_bits, min_time, others_only, row, distance,
 ):  # fmt: skip
-    """Walk the nearest cells of a multi-index; compare inside by bits or in projected space."""
+    """Walk the nearest cells of a multi-index; compare inside by bits or in projected space.
+
+    `distance` comes filled with a bound that neighbours must stay below.
+    """
     words_a, words_b, k = len(centres_a), len(centres_b), row.shape[1]
     for q in prange(len(q_points)):
         distance_a = np.empty(words_a, dtype=np.float32)
@@ -159,7 +169,7 @@ def search_cells(  # type: ignore[no-untyped-def]
                 if rank_by_bits:
                     value = np.float32(_different_bits(q_words, q, d_words, d))
                 else:
-                    value = _squared_distance(q_points, q, d_points, d)
+                    value = _squared_distance(q_points, q, d_points, d, distance[q, k - 1])
                 if value < distance[q, k - 1] and _allowed(
                     q_label[q], q_session[q], q_time[q],
                     d_label[d], d_session[d], d_time[d], min_time, others_only,

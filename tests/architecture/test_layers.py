@@ -67,9 +67,7 @@ def test_heavy_libraries_stay_at_home(library: str, homes: tuple[str, ...]) -> N
         str(path.relative_to(REPOSITORY))
         for path in SOURCES
         if library in _imported(path)
-        and not str(path.relative_to(REPOSITORY)).startswith(
-            tuple(f"maplab_py/{h}" for h in homes)
-        )
+        and not str(path.relative_to(REPOSITORY)).startswith(tuple(f"maplab_py/{h}" for h in homes))
     ]
     assert strangers == []
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
+from collections.abc import Iterable, Iterator
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +15,9 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
-from maplab_py.vision.absolute_pose import PoseProblems, solve_poses
+from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level
 from maplab_py.vision.descriptors import pack_words
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
@@ -81,15 +85,16 @@ class Localizer:
         """
         self._map = database
         self._options = options
+        bits = 8 * database.projection.descriptor_size
+        self._max_distance = (
+            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+        )
         self._index = InvertedMultiIndex(
             database.descriptors,
             seed=options.seed,
             cells_per_query=options.num_words_for_nn_search,
             rank_by_bits=database.has_bits,
-        )
-        bits = 8 * database.projection.descriptor_size
-        self._max_distance = (
-            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+            max_distance=self._max_distance,
         )
 
     def localize(self, query: Query) -> Localization:
@@ -98,8 +103,9 @@ class Localizer:
         descriptors = self._described(query)
         keypoint, landmark = self._match(descriptors)
         places = self._places(keypoint, landmark)
+        first = list(itertools.islice(places, 1))
         matched = time.perf_counter()
-        answer = self._solve(query, descriptors, keypoint, landmark, places)
+        answer = self._solve(query, descriptors, keypoint, landmark, itertools.chain(first, places))
         return dataclasses.replace(
             answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
         )
@@ -122,14 +128,13 @@ class Localizer:
         keypoint, rank = np.nonzero((found.row >= 0) & (found.distance <= self._max_distance))
         return keypoint, self._map.descriptors.label[found.row[keypoint, rank]]
 
-    def _places(self, keypoint: I64, landmark: I64) -> list[I64]:
-        """Return the rows of the matches in each of the best places.
+    def _places(self, keypoint: I64, landmark: I64) -> Iterator[I64]:
+        """Yield the rows of the matches in each of the best places, as far as they are asked for.
 
         Every matched landmark votes for its observers; the observer with most votes and those
         that share landmarks with it are a place (Sattler et al., ICCV 2015).
         """
         o = self._options
-        found: list[I64] = []
         distinct, index = np.unique(landmark, return_inverse=True)
         offset, observers = self._map.observers_of
         rows = ragged_rows(offset, distinct)
@@ -144,9 +149,8 @@ class Localizer:
             inside = np.bincount(owner, near[voter], minlength=len(distinct)) > 0
             matches = np.flatnonzero(inside[index.reshape(-1)])
             if len(np.unique(keypoint[matches])) >= o.min_matches:
-                found.append(matches)
+                yield matches
             votes = np.where(near, 0, votes)
-        return found
 
     def _solve(
         self,
@@ -154,7 +158,7 @@ class Localizer:
         descriptors: DescriptorSet,
         keypoint: I64,
         landmark: I64,
-        places: list[I64],
+        places: Iterable[I64],
     ) -> Localization:
         """Search the pose place by place; the most inliers win, and many inliers end the search.
 
@@ -163,11 +167,12 @@ class Localizer:
         o = self._options
         best = _failed(Outcome.FEW_MATCHES, len(query.descriptors))
         enough = _CERTAIN * o.min_inlier_count
+        level = _Level.of(query)
         for number, rows in enumerate(places):
             key = query.key * o.places + number
-            found = self._search(query, key, keypoint[rows], landmark[rows])
+            found = self._search(level, key, keypoint[rows], landmark[rows])
             for _ in range(_GUIDED_ROUNDS):
-                if not _MIN_HYPOTHESIS <= found.inliers < enough:
+                if not _MIN_HYPOTHESIS <= found.landmarks < enough:
                     break
                 near = guided_matches(
                     self._map,
@@ -179,39 +184,43 @@ class Localizer:
                     radius_rad=_GUIDED_RADIUS * o.ransac_pixel_sigma * query.rad_per_px,
                     max_distance=_GUIDED_DISTANCE * self._max_distance,
                 )
-                guided = self._search(query, key, *near)
-                if guided.inliers <= found.inliers:
+                guided = self._search(level, key, *near)
+                if guided.landmarks <= found.landmarks:
                     break
                 found = guided
-            if best.outcome is Outcome.FEW_MATCHES or found.inliers > best.inliers:
-                best = found
+            if best.outcome is Outcome.FEW_MATCHES or found.landmarks > best.inliers:
+                best = self._judged(query, found)
             if best.outcome is Outcome.LOCALIZED and best.inliers >= enough:
                 break
         return best
 
-    def _search(self, query: Query, key: int, keypoint: I64, landmark: I64) -> Localization:
+    def _search(self, level: _Level, key: int, keypoint: I64, landmark: I64) -> _Found:
         """Search the pose from some matches, sorted by keypoint."""
-        o = self._options
-        solutions = solve_poses(
-            PoseProblems(
+        solutions = search_level(
+            LevelProblems(
                 start=np.array([0, len(keypoint)]),
                 key=np.array([key]),
-                q_M_I=query.q_M_I[None],
-                origin_I=query.origin_I[keypoint],
-                ray_I=query.ray_I[keypoint],
+                origin_W=level.origin_W[keypoint],
+                ray_W=level.ray_W[keypoint],
                 point_M=self._map.p_G[landmark],
                 keypoint=keypoint,
-                tolerance=o.ransac_pixel_sigma * query.rad_per_px[keypoint],
+                tolerance=self._options.ransac_pixel_sigma * level.query.rad_per_px[keypoint],
             ),
-            seed=o.seed,
-            max_iterations=o.num_ransac_iters,
+            seed=self._options.seed,
+            max_iterations=self._options.num_ransac_iters,
         )
         agreeing = np.flatnonzero(solutions.is_inlier)
-        landmarks = len(np.unique(landmark[agreeing]))
-        covariance = solutions.covariance[0]
-        matched, inliers = int(solutions.keypoint_count[0]), int(solutions.inlier_count[0])
+        return _Found(
+            level.query, solutions, len(np.unique(keypoint)), keypoint[agreeing], landmark[agreeing]
+        )
+
+    def _judged(self, query: Query, found: _Found) -> Localization:
+        """Decide whether a pose is to be believed."""
+        o = self._options
+        solutions, inliers = found.solutions, int(found.solutions.inlier_count[0])
+        covariance = solutions.covariances(query.q_M_I[None])[0]
         sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
-        if landmarks < o.min_inlier_count or inliers < o.min_inlier_ratio * matched:
+        if found.landmarks < o.min_inlier_count or inliers < o.min_inlier_ratio * found.matched:
             outcome = Outcome.FEW_INLIERS
         elif np.degrees(solutions.tilt_rad[0]) > o.max_gravity_misalignment_deg:
             outcome = Outcome.TILTED
@@ -221,16 +230,51 @@ class Localizer:
             outcome = Outcome.LOCALIZED
         return Localization(
             outcome=outcome,
-            T_G_I=solutions.T_M_I[0],
+            T_G_I=found.T_G_I,
             covariance=covariance,
             keypoints=len(query.descriptors),
-            matches=matched,
-            inliers=landmarks,
-            keypoint=keypoint[agreeing],
-            landmark=landmark[agreeing],
+            matches=found.matched,
+            inliers=found.landmarks,
+            keypoint=found.keypoint,
+            landmark=found.landmark,
             matching_s=0.0,
             ransac_s=0.0,
         )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Level:
+    """A query, turned once to W, the frame of its attitude with the origin at the body."""
+
+    query: Query
+    origin_W: F64  # (N, 3)
+    ray_W: F64  # (N, 3)
+
+    @classmethod
+    def of(cls, query: Query) -> _Level:
+        q_W_I = query.q_M_I
+        return cls(query, so3.rotate(q_W_I, query.origin_I), so3.rotate(q_W_I, query.ray_I))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Found:
+    """What a search found, before it is judged."""
+
+    query: Query
+    solutions: LevelSolutions
+    matched: int  # keypoints with a match
+    keypoint: I64  # (inliers,) of the query
+    landmark: I64  # (inliers,) of the map
+
+    @cached_property
+    def landmarks(self) -> int:
+        """How many landmarks agree."""
+        return len(np.unique(self.landmark))
+
+    @cached_property
+    def T_G_I(self) -> F64:
+        """Pose (7,)."""
+        return np.asarray(self.solutions.poses(self.query.q_M_I[None])[0])
 
 
 def _failed(outcome: Outcome, keypoints: int) -> Localization:

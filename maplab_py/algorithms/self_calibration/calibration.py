@@ -21,7 +21,13 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.parameters import Parameters
 from maplab_py.algorithms.self_calibration.problem import SegmentProblem, pose, vi_options
 from maplab_py.algorithms.self_calibration.reports import ParameterEstimate, SelfCalibrationReport
-from maplab_py.algorithms.self_calibration.scale import check_scale
+from maplab_py.algorithms.self_calibration.scale import (
+    names_of,
+    partitions_without_scale,
+    refuse_lost_scale,
+    without_partitions,
+)
+from maplab_py.algorithms.self_calibration.segments import parallax_rad, restricted
 from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sensors, written_back
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -35,6 +41,7 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_p_G
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _ROUGH = 8
 """Iterations before landmarks are triangulated anew and outliers judged again."""
@@ -75,6 +82,8 @@ def calibrate(
 ) -> tuple[Calibration, SelfCalibrationReport]:
     """Calibrate on all that a map holds: segments, or whole missions (a full batch).
 
+    Partitions whose path has lost its length (the device only turned there) are left out.
+
     Args:
         vi_map: Segments of a database, or a whole map.
         options: What to estimate.
@@ -88,23 +97,34 @@ def calibrate(
         MapError: Calibrations are missing.
     """
     began = time.perf_counter()
-    if options.imu_curvature:
-        vi_map = with_curvature(vi_map)
-    rough = pose(vi_map, options, missions=missions, progress=progress)
+    sampled = with_curvature(vi_map) if options.imu_curvature else vi_map
+    rough = pose(sampled, options, missions=missions, progress=progress)
     before = rough.posed.states.blocks
     posed = time.perf_counter()
     roughly = dataclasses.replace(options, num_iterations=_ROUGH, function_tolerance=1e-3)
     states, first = solve(rough, roughly, progress)
-    problem = pose(_begun_anew(rough, states, options), options, prior_at=before, progress=progress)
+    problem = pose(
+        _begun_anew(rough, states, options),
+        options,
+        missions=missions,
+        prior_at=before,
+        progress=progress,
+    )
     states, summary, consistency = _settled(problem, options, progress)
+    lost = partitions_without_scale(problem, states, rough)
+    rest = without_partitions(problem, lost)
+    if len(lost) and len(rest):
+        return _without_lost(
+            restricted(vi_map, rest), options, names_of(problem, lost), segments, progress
+        )
     covariance = posterior_covariance(problem, states)
     found = spectrum(covariance, problem.parameters)
     directions = found.unobservable(_UNDETERMINED)
     names = tuple(name_direction(one, problem.parameters) for one in directions.T)
     if names and not options.keep_unobservable_at_prior:
         raise EstimationError(_refusal(names))
-    if not names:
-        check_scale(rough.posed.states, states, vi_map.vertices.mission)
+    if len(lost) and not names:
+        refuse_lost_scale(problem, rough.posed.states, states)
     calibration = Calibration(
         with_estimated_sensors(problem.posed, states),
         problem.parameters,
@@ -120,6 +140,23 @@ def calibrate(
     )
 
 
+def _without_lost(
+    vi_map: VIMap,
+    options: SelfCalibrationOptions,
+    lost: tuple[str, ...],
+    segments: int,
+    progress: Progress,
+) -> tuple[Calibration, SelfCalibrationReport]:
+    """Calibrate on what is left when parts without a scale are gone, from the beginning."""
+    try:
+        result, report = calibrate(vi_map, options, segments=segments, progress=progress)
+    except EstimationError as error:
+        raise EstimationError(
+            f"{error} (without {'; '.join(lost)}, where the device only turns and lengths are lost)"
+        ) from error
+    return result, dataclasses.replace(report, without_scale=(*lost, *report.without_scale))
+
+
 def _settled(
     problem: SegmentProblem, options: SelfCalibrationOptions, progress: Progress
 ) -> tuple[States, SolverSummary, Consistency]:
@@ -132,7 +169,8 @@ def _settled(
     )
     states, robust = solve(problem, nearly, progress)
     posed = problem.posed
-    consistency = keep_consistent(posed, states, options.inconsistent_probability)
+    is_wide = _is_wide(problem, states, options)
+    consistency = keep_consistent(posed, states, options.inconsistent_probability, is_wide)
 
     def refresh(_: int, now: States) -> bool:
         return posed.problem.visual is not None and posed.problem.visual.refresh(now)
@@ -140,6 +178,13 @@ def _settled(
     states, plain = _minimised(problem, states, options, progress, refresh)
     summary = dataclasses.replace(plain, iterations=robust.iterations + plain.iterations)
     return states, summary, consistency
+
+
+def _is_wide(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> Mask:
+    """Return which landmarks (L,) of the problem have parallax, now that poses have settled."""
+    found_rad = parallax_rad(written_back(problem.posed, states, vi_options(options)))
+    limit_rad = np.deg2rad(options.min_parallax_deg)
+    return np.asarray(found_rad[problem.posed.selection.landmarks] >= limit_rad)
 
 
 def _begun_anew(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> VIMap:
@@ -156,7 +201,8 @@ def _begun_anew(problem: SegmentProblem, states: States, options: SelfCalibratio
 
 def _refusal(names: tuple[str, ...]) -> str:
     shown = "; ".join(f"{name}: not excited" for name in names[:6])
-    more = f"; and {len(names) - 6} more" if len(names) > 6 else ""
+    sensors = dict.fromkeys(one.split()[0] for one in names[6:])
+    more = f"; and {len(names) - 6} more, of {', '.join(sensors)}" if sensors else ""
     return (
         f"the data do not determine the calibration ({shown}{more}): record motion with turns and "
         "accelerations about all axes, estimate fewer --sc_states, or accept the prior there with "
@@ -202,6 +248,7 @@ def _report(
     return SelfCalibrationReport(
         parameters=_estimates(calibration),
         unobservable=unobservable,
+        without_scale=(),
         segments=segments,
         partitions=problem.num_partitions,
         gaps=problem.gaps,

@@ -17,6 +17,7 @@ from maplab_py.algorithms.vi_optimization.building import PosedProblem
 from maplab_py.estimation.states import States
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _LEAST_LEFT = 2.0 / 3.0
 """A landmark that keeps a smaller share of its observations is not one point: what is left of it may
@@ -34,7 +35,9 @@ class Consistency:
     noise_factor: float  # keypoint noise over what the map says
 
 
-def keep_consistent(posed: PosedProblem, states: States, probability: float) -> Consistency:
+def keep_consistent(
+    posed: PosedProblem, states: States, probability: float, is_wide: Mask | None = None
+) -> Consistency:
     """Leave out landmarks with too large residuals; weigh the others in full, by their true noise.
 
     Under the hypothesis that a landmark's n observations are of one point, the sum of their squared
@@ -46,6 +49,7 @@ def keep_consistent(posed: PosedProblem, states: States, probability: float) -> 
         posed: The problem; its weights and its losses are exchanged.
         states: Converged under a robust loss.
         probability: Of leaving out a good landmark.
+        is_wide: Landmarks (L,) with enough parallax, None = all; the others are left out, too.
     """
     from scipy.stats import chi2
 
@@ -56,11 +60,17 @@ def keep_consistent(posed: PosedProblem, states: States, probability: float) -> 
     owner, count = data.landmark, len(data.start) - 1
     squares = np.nan_to_num(visual.errors(states)[0] * data.inverse_sigma) ** 2
     total = np.bincount(owner, squares, minlength=count)
+    if is_wide is not None:
+        data = dataclasses.replace(
+            data, inverse_sigma=np.where(is_wide[owner], data.inverse_sigma, 0.0)
+        )
     left = np.bincount(owner, data.inverse_sigma > 0.0, minlength=count)
     freedom = 2.0 * left - 3.0
     alive = np.flatnonzero(freedom > 0.0)
     whole = alive[left[alive] >= _LEAST_LEFT * np.diff(data.start)[alive]]
     if not len(whole):
+        rejection.is_used = data.inverse_sigma > 0.0
+        visual.use(data)
         return Consistency(len(alive), 0, 1.0)
     variance = float(np.median(total[whole] / chi2.median(freedom[whole])))
     limit = chi2.isf(probability, freedom)

@@ -52,6 +52,12 @@ def draw(vi_map: VIMap, segments: list[I64], information: F64, title: str) -> st
             'stroke-width="4" stroke-linecap="round"/>'
         )
     lines += _legend()
+    right, y = _SIZE_PX - _MARGIN_PX, _SIZE_PX + 12.0
+    lines += [
+        f'<line x1="{right - scale:.1f}" x2="{right:.1f}" y1="{y:g}" y2="{y:g}" stroke="#333333" '
+        'stroke-width="2"/>',
+        f'<text x="{right - scale / 2.0:.1f}" y="{y - 5:g}" text-anchor="middle">1 m</text>',
+    ]
     return "\n".join([*lines, "</svg>"]) + "\n"
 
 

@@ -20,6 +20,7 @@ def report_of(result: FilteredCalibration) -> SelfCalibrationReport:
     return SelfCalibrationReport(
         parameters=_estimates(result),
         unobservable=tuple(name_direction(one, result.parameters) for one in directions.T),
+        without_scale=(),
         segments=0,
         partitions=1,
         gaps=0,

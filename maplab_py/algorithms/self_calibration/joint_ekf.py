@@ -66,6 +66,7 @@ class FilteredCalibration:
     blocks: ParameterBlocks
     covariance: F64  # (k, k)
     history: F64  # (V, k) change from before, after every vertex
+    T_G_I: F64  # (V, 7) poses of all vertices; of those filtered as the filter left them
     tracks: int  # that were used
     tracks_rejected: int
     observations: int  # that were used
@@ -303,6 +304,7 @@ class _Filter:
             self.blocks,
             self.P[np.ix_(self._columns, self._columns)],
             history,
+            self.T_G_I,
             self.used,
             self.rejected,
             self._observations,

@@ -14,6 +14,12 @@ STATES = ("intrinsics", "extrinsics_rotation", "extrinsics_translation", "imu", 
 GROUPS = ("imu", "camera", "extrinsics")
 """Parameter groups, each with its own table of segments; the time offset is one of the extrinsics."""
 
+_STATES_OF = {
+    "imu": {"imu"},
+    "camera": {"intrinsics"},
+    "extrinsics": {"extrinsics_rotation", "extrinsics_translation", "time_offset"},
+}
+
 METRICS = ("a_optimality", "d_optimality", "e_optimality", "entropy")
 SELECTIONS = ("informative", "least_informative", "random", "information_gain", "all")
 
@@ -129,6 +135,8 @@ class SelfCalibrationOptions:
     def grouping(self) -> dict[str, tuple[str, ...]]:
         """Return the basic groups of every table of the database, by the table's name.
 
+        Groups of which nothing is estimated have no table: every segment would be as good there.
+
         Raises:
             UserError: A name is unknown, or there is none.
         """
@@ -139,7 +147,11 @@ class SelfCalibrationOptions:
                 raise UserError(
                     f"--sc_groups: there is no group '{unknown[0]}'; there are: {', '.join(GROUPS)}"
                 )
-            tables[name] = members
+            if any(self.estimated() & _STATES_OF[member] for member in members):
+                tables[name] = members
         if not tables:
-            raise UserError(f"--sc_groups: name at least one of {', '.join(GROUPS)}")
+            raise UserError(
+                f"--sc_groups: name at least one of {', '.join(GROUPS)}, of which something is "
+                "estimated"
+            )
         return tables

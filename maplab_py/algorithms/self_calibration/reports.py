@@ -26,6 +26,7 @@ class SelfCalibrationReport(Report):
 
     parameters: tuple[ParameterEstimate, ...]
     unobservable: tuple[str, ...]  # directions that the data do not determine
+    without_scale: tuple[str, ...]  # left out: the device only turns there and lengths are lost
     segments: int
     partitions: int
     gaps: int  # between segments of a mission, bridged by the walk of the biases

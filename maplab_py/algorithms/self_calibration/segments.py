@@ -26,6 +26,9 @@ Mask = NDArray[np.bool_]
 
 _FAR_M = 10.0
 """Parallax is judged as if no landmark were farther away."""
+_USUALLY_WITHIN = 0.9
+"""Nor is it judged as if one were nearer than this share of the landmarks seem to be: where there is
+little parallax, and where poses have drifted, landmarks are estimated too near and seem to have it."""
 
 
 def cut(vi_map: VIMap, missions: NDArray[np.integer] | None, keyframes: int) -> list[I64]:
@@ -184,8 +187,9 @@ def _observers(vi_map: VIMap) -> I64:
 def parallax_rad(vi_map: VIMap) -> F64:
     """Return under which angle (L,) the camera moved as seen from each landmark.
 
-    The motion across the line of sight counts, over the distance or the map's median distance,
-    whichever is more, but at most `_FAR_M`: distances of landmarks without parallax are noise.
+    The motion across the line of sight counts, over the distance or that within which nine tenths
+    of the map's landmarks are, whichever is more, but at most `_FAR_M`: distances of landmarks
+    without parallax are noise, and mostly too small (decision 109).
     """
     rows = vi_map.observations
     start, landmark = vi_map.observation_start, vi_map.keypoints.landmark[vi_map.observations]
@@ -201,7 +205,7 @@ def parallax_rad(vi_map: VIMap) -> F64:
     across = np.linalg.norm(offset - along[:, None] * sight[landmark], axis=1)
     widest = np.zeros(len(count))
     np.maximum.at(widest, landmark, across)
-    usual = min(float(np.median(depth)), _FAR_M) if len(depth) else _FAR_M
+    usual = min(float(np.quantile(depth, _USUALLY_WITHIN)), _FAR_M) if len(depth) else _FAR_M
     return np.asarray(2.0 * widest / np.clip(depth, max(usual, 0.1), _FAR_M))
 
 

@@ -66,7 +66,7 @@ def self_calibrate(
     device_of(vi_map, missions)
     if batch:
         result, report = calibrate(vi_map, options, missions=missions, progress=progress)
-        return result.sensors, None, result, report
+        return with_calibration(vi_map.sensors, result.sensors), None, result, report
     if options.selection == "information_gain":
         chosen = select_by_gain(vi_map, options, missions=missions, progress=progress)
         if not chosen.kept:
@@ -152,9 +152,9 @@ def segment_information(
             mission=one.mission,
             start_ns=one.begin_ns,
             end_ns=int(time[segment.rows[-1]]),
-            imu=one.scores["imu"],
-            camera=one.scores["camera"],
-            extrinsics=one.scores["extrinsics"],
+            imu=one.scores.get("imu", 0.0),
+            camera=one.scores.get("camera", 0.0),
+            extrinsics=one.scores.get("extrinsics", 0.0),
             unobservable=one.unobservable,
             gyro_rms_degps=float(np.rad2deg(one.gyro_rms_radps)),
             accel_change_mps2=one.accel_change_mps2,

@@ -74,8 +74,8 @@ def test_merged_edges_predict_what_the_single_ones_did():
     assert rotation < 1e-9
 
 
-@pytest.mark.slow
-def test_ten_minutes_at_ten_hertz():
+def ten_minutes() -> VIMap:
+    """Return a map of ten minutes at 10 Hz, with 200 Hz of inertial samples."""
     scenario = Scenario(
         measurement=MeasurementOptions(frame_rate_hz=10.0, max_keypoints=40),
         sessions=(SessionOptions(duration_s=600.0, turns=12.0),),
@@ -83,7 +83,12 @@ def test_ten_minutes_at_ten_hertz():
     scenario = dataclasses.replace(
         scenario, world=dataclasses.replace(scenario.world, landmarks_per_room=600)
     )
-    before = simulate(scenario).maps[0]
+    return simulate(scenario).maps[0]
+
+
+@pytest.mark.slow
+def test_ten_minutes_at_ten_hertz():
+    before = ten_minutes()
     assert len(before.vertices) == 6001
     begin = time.process_time()
     after, report = keyframe(before, KeyframingOptions(min_shared_landmarks_obs=5))

@@ -14,6 +14,8 @@ from maplab_py.algorithms.self_calibration.problem import pose
 from maplab_py.algorithms.self_calibration.segments import cut, restricted
 from maplab_py.errors import EstimationError
 from maplab_py.sensors import Distortion
+from maplab_py.vimap.edits import with_new_ids
+from maplab_py.vimap.stacking import stack
 from tests.algorithms.self_calibration.scenes import EXACT, OPTIONS, scene_map, uncalibrated
 
 
@@ -25,6 +27,19 @@ def test_without_noise_every_parameter_returns(distortion: Distortion) -> None:
     compared = compare(truth.sensors, ids, result.sensors, ids)
     for one in compared.parameters:
         assert abs(one.difference) <= 1e-6 * max(1.0, abs(one.first)), one
+
+
+def test_only_the_missions_that_were_asked_for_take_part() -> None:
+    start = uncalibrated(scene_map())
+    # another device's: it would spoil the calibration
+    shaken = start.keypoints.uv_px + np.random.default_rng(1).normal(
+        0.0, 20.0, start.keypoints.uv_px.shape
+    )
+    other = with_new_ids(start.replace(keypoints=start.keypoints.replace(uv_px=shaken)))
+    result, report = calibrate(stack(other, start), EXACT, missions=np.array([1]))
+    alone, _ = calibrate(start, EXACT)
+    assert report.keyframes == len(start.vertices)
+    np.testing.assert_allclose(result.change, alone.change, atol=1e-8)
 
 
 def test_without_noise_segments_alone_are_enough() -> None:

@@ -44,6 +44,35 @@ def test_a_summary_holds_the_good_landmarks_as_seen_from_g(vi_map):
     assert len(pairs) > 0.99 * len(expected)
 
 
+def test_descriptors_stay_with_landmark_and_observer(vi_map):
+    options = SummaryMapOptions(descriptor_step=0.0, landmark_ids=True)
+    summary = make_summary_map(vi_map, options)
+    assert np.all(np.diff(summary.landmark.astype(np.int64)) >= 0)
+    features, _ = map_features(vi_map, np.arange(len(vi_map.missions)))
+    landmark = IdIndex(vi_map.landmarks.id).rows(summary.landmark_id)[summary.landmark]
+    vertex = IdIndex(vi_map.vertices.id).rows(summary.observer_id)[summary.observer]
+    known = {
+        (label, vertex, point.tobytes())
+        for label, vertex, point in zip(
+            features.descriptors.label.tolist(),
+            features.vertex.tolist(),
+            features.descriptors.projected,
+            strict=True,
+        )
+    }
+    rows = zip(landmark.tolist(), vertex.tolist(), summary.descriptors, strict=True)
+    assert all((row, seer, point.tobytes()) in known for row, seer, point in rows)
+
+
+def test_neighbours_in_space_follow_each_other(vi_map):
+    p_G = make_summary_map(vi_map, SummaryMapOptions()).p_G
+    shuffled = np.random.default_rng(0).permutation(p_G)
+    step, random_step = (
+        np.median(np.linalg.norm(np.diff(p, axis=0), axis=1)) for p in (p_G, shuffled)
+    )
+    assert step < 0.25 * random_step
+
+
 def test_rounded_descriptors_are_near_the_exact_ones(vi_map):
     exact = make_summary_map(vi_map, SummaryMapOptions(descriptor_step=0.0))
     rounded = make_summary_map(vi_map, SummaryMapOptions())
