@@ -30,10 +30,17 @@ TURNED_RAD = 2e-4
 SPEEDED_MPS = 2e-3
 """What a change of bias may make of an edge in all before the first-order correction is replaced by
 a new integration. The second order is lost until then: 1 nm, 1 nrad and 20 nm/s of a lively 0.2 s."""
+_SETTLED = 0.2
+_KEPT = 0.1
+"""A bias that changes by no more than the first share of its way from the point of integration has
+settled; then only the second share of the above may remain, and a hundredth of the error."""
 
 
 class InertialTerm:
-    """Preintegrated edges between vertices; each is re-integrated when its bias has moved far."""
+    """Preintegrated edges between vertices.
+
+    Each is integrated anew when its bias has moved far, and once more when it has settled.
+    """
 
     name = "inertial"
     loss = (Loss.NONE, 1.0)
@@ -59,11 +66,12 @@ class InertialTerm:
             new = integrate(self._data, b_g, b_a)
             self._whitening = _whitening(new)
             self._set_measured(new)
+            self._seen = (b_g, b_a)
             return True
-        duration_s = old.duration_s[:, None]
-        has_moved = (np.abs(b_g - old.gyro_bias) * duration_s > TURNED_RAD).any(axis=1)
-        has_moved |= (np.abs(b_a - old.accel_bias) * duration_s > SPEEDED_MPS).any(axis=1)
-        rows = np.flatnonzero(has_moved)
+        away = _effect(b_g - old.gyro_bias, b_a - old.accel_bias, old.duration_s)
+        change = _effect(b_g - self._seen[0], b_a - self._seen[1], old.duration_s)
+        self._seen = (b_g, b_a)
+        rows = np.flatnonzero((away > 1.0) | ((away > _KEPT) & (change <= _SETTLED * away)))
         if not len(rows):
             return False
         new = integrate(self._data.of_edges(rows), b_g[rows], b_a[rows])
@@ -138,6 +146,12 @@ class BiasWalkTerm:
         """Return whitened residuals (E, 6) and Jacobians (E, 6, 12)."""
         biases = np.concatenate([states.gyro_bias, states.accel_bias], axis=1)
         return (biases[self._b] - biases[self._a]) * self._weight, self._jacobian
+
+
+def _effect(gyro_radps: F64, accel_mps2: F64, duration_s: F64) -> F64:
+    """Return what changes (E, 3) of biases make of edges (E,), as parts of what they may."""
+    effect = np.maximum(np.abs(gyro_radps) / TURNED_RAD, np.abs(accel_mps2) / SPEEDED_MPS)
+    return np.asarray(effect.max(axis=1) * duration_s)
 
 
 def _whitening(measured: Preintegrated) -> F64:

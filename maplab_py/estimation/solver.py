@@ -69,9 +69,10 @@ class _Run:
         self.singular: list[int] = []
 
     def linearize(self) -> Linearization:
+        self.integrated = False
         for term in self.problem.factors:
             if isinstance(term, InertialTerm):
-                term.integrate(self.states)
+                self.integrated |= term.integrate(self.states)
         return self.problem.linearize(self.states, 1.0 / self.region.radius)
 
     def try_step(self) -> tuple[States, float, float, float]:
@@ -95,6 +96,7 @@ class _Run:
     def look_around(self, *, is_last: bool) -> None:
         """Linearise at the present states; after the last step only their cost is wanted."""
         if is_last:
+            self.integrated = False
             costs = self.problem.costs(self.states)
             self.linear = dataclasses.replace(self.linear, costs=costs)
         else:
@@ -117,6 +119,12 @@ class _Run:
         """Judge anew: costs before and after the change cannot be compared."""
         self.judge.restart(self.linear.cost)
         self.best, self.best_cost = self.states, self.linear.cost
+
+    def cost_corrected(self, cost_before: float) -> None:
+        """Go on from the cost as it is now that edges are integrated anew, earlier ones alike."""
+        difference = self.linear.cost - cost_before
+        self.judge.shift(difference)
+        self.best_cost += difference
 
     def reject(self) -> None:
         self.region.reject()
@@ -204,13 +212,18 @@ def _iterate(run: _Run, iteration: int, progress: Progress, after_step: AfterSte
         if run.region.is_exhausted:
             return "no step lowers the cost"
         run.linear = run.linearize()  # the elimination of the landmarks depends on the damping
+        if run.integrated:
+            run.cost_corrected(cost)
         return ""
     run.accept(moved, new_cost, promised, gain)
     changed = after_step is not None and after_step(iteration, run.states)
     run.look_around(is_last=iteration == options.num_iterations)
     if changed:
         run.problem_changed()
-    elif abs(cost - new_cost) <= options.function_tolerance * cost:
+        return ""
+    if run.integrated:
+        run.cost_corrected(new_cost)
+    if abs(cost - new_cost) <= options.function_tolerance * cost:
         return "cost has settled"
     return ""
 

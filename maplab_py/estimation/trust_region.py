@@ -98,6 +98,13 @@ class StepJudge:
             self._reference, self._since_reference = self._highest, self._since_highest
         return False
 
+    def shift(self, difference: float) -> None:
+        """Add to all costs: the problem is the same, but known better."""
+        self._cost += difference
+        self._least += difference
+        self._reference += difference
+        self._highest += difference
+
     def restart(self, cost: float) -> None:
         """Begin again: the problem has changed."""
         self.__init__(cost, self._max_uphill)  # type: ignore[misc]

@@ -84,3 +84,13 @@ def test_a_changed_problem_begins_anew() -> None:
     judge.restart(50.0)
     assert judge.gain(60.0, 1.0) < 0.0
     assert judge.accept(49.0, 1.0)
+
+
+def test_a_problem_known_better_shifts_all_costs() -> None:
+    known, shifted = StepJudge(10.0, max_uphill=2), StepJudge(10.0, max_uphill=2)
+    for judge in (known, shifted):
+        judge.accept(4.0, 6.0)
+        judge.accept(5.0, 1.0)
+    shifted.shift(3.0)
+    assert shifted.gain(9.0, 1.0) == pytest.approx(known.gain(6.0, 1.0))
+    assert shifted.accept(6.5, 1.0)  # less than the least was, with the difference
