@@ -92,6 +92,8 @@ def judge(
     tilted = np.degrees(s.tilt_rad) > options.max_gravity_deviation_deg
     judgement.refuse(tilted, Verdict.TILTED)
     judgement.refuse(np.isnan(s.covariance[:, 0, 0]), Verdict.FEW_INLIERS)
+    uncertain = rotation_sigma_deg(s.covariance) > options.max_rotation_sigma_deg
+    judgement.refuse(uncertain, Verdict.UNCERTAIN)
     geometric = judgement.passing
     way = path_lengths(vi_map)
     drift = _DRIFT_OFFSET_M + options.max_drift_ratio * np.abs(way[query] - way[place])
@@ -113,6 +115,18 @@ def judge(
     _check_neighbours(vi_map, query, place, s, options, judgement)
     _check_pairs(vi_map, query, place, s, options, judgement, ~limited)
     return judgement
+
+
+def rotation_sigma_deg(covariance: F64) -> F64:
+    """Return the standard deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta].
+
+    It is nan where nothing is determined.
+    """
+    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
+    sigma_rad = np.full(len(covariance), np.nan)
+    largest = np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1]
+    sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
+    return np.degrees(sigma_rad)
 
 
 def _beyond(options: LoopClosureOptions, judgement: Judgement, limited: Mask) -> Mask:

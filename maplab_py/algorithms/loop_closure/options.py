@@ -61,6 +61,11 @@ class LoopClosureOptions:
         help="Largest angle between gravity as the query vertex has it and as found",
         unit="deg",
     )
+    max_rotation_sigma_deg: float = option(
+        1.0,
+        help="Largest standard deviation of the rotation, by the inliers' own geometry",
+        unit="deg",
+    )
     max_delta_position_m: float = option(
         -1.0, help="Largest change of the query's position; negative = by drift alone", unit="m"
     )

@@ -20,6 +20,7 @@ class Verdict(Enum):
     NO_SUPPORT = "no closures nearby agree"
     CONTRADICTED = "closures nearby disagree"
     REMOVED = "removed by hand"
+    UNCERTAIN = "too uncertain rotation"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -171,6 +171,7 @@ def test_stricter_gates_refuse():
     for gate, reason in (
         ({"min_inlier_count": 1000}, "too few inliers"),
         ({"min_inlier_ratio": 1.01}, "too low a part of inliers"),
+        ({"max_rotation_sigma_deg": 1e-4}, "too uncertain rotation"),
         ({"max_delta_position_m": 0.01}, "corrects more than the mission can have drifted"),
         ({"min_support": 1000}, "no closures nearby agree"),
     ):
