@@ -126,7 +126,7 @@ def rotation_sigma_deg(covariance: F64) -> F64:
     sigma_rad = np.full(len(covariance), np.nan)
     largest = np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1]
     sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
-    return np.degrees(sigma_rad)
+    return np.asarray(np.degrees(sigma_rad))
 
 
 def _beyond(options: LoopClosureOptions, judgement: Judgement, limited: Mask) -> Mask:
