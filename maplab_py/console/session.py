@@ -63,7 +63,7 @@ class Session:
         self.variables: dict[str, str] = {}  # $NAME in typed lines, before the environment's
         self.marks: dict[str, str] = {}  # shown around the prompt: the sheep, a viewer's address
         self.lock = threading.RLock()  # held while a command of the foreground runs
-        self.watchers = Watchers()  # follow the maps, as the viewer does
+        self.watchers = Watchers(self.terminal.note)  # follow the maps, as the viewer does
 
     @property
     def vi_map(self) -> VIMap:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol, TypeVar
 
+from maplab_py.console.log import log_path
 from maplab_py.console.maps import MapManager
 from maplab_py.vimap import VIMap
 
@@ -29,11 +30,17 @@ class Watcher(Protocol):
 
 
 class Watchers:
-    """The watchers of a session by name. An error of theirs goes to the log, never to a command."""
+    """The watchers of a session by name.
 
-    def __init__(self) -> None:
-        """Start without any."""
+    An error of theirs never fails a command: the traceback goes to the log, and the user is told
+    once, until the watcher follows again.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        """Start without any; `say` tells the user something in a line."""
         self._watchers: dict[str, Watcher] = {}
+        self._say = say
+        self._told: set[str] = set()
 
     def set(self, name: str, watcher: Watcher) -> None:
         """Add a watcher, or exchange the one of this name."""
@@ -48,26 +55,32 @@ class Watchers:
         """Close a watcher and forget it."""
         watcher = self._watchers.pop(name, None)
         if watcher is not None:
-            self._guarded(watcher.close)
+            self._guarded(name, watcher.close)
+        self._told.discard(name)
 
     def after_command(self, maps: MapManager) -> None:
         """Let all look at the maps."""
-        for watcher in list(self._watchers.values()):
-            self._guarded(partial(watcher.after_command, maps))
+        for name, watcher in list(self._watchers.items()):
+            if self._guarded(name, partial(watcher.after_command, maps)):
+                self._told.discard(name)
 
     def during_command(self, make_map: Callable[[], VIMap]) -> None:
         """Let all look at what a running command has so far."""
-        for watcher in list(self._watchers.values()):
-            self._guarded(partial(watcher.during_command, make_map))
+        for name, watcher in list(self._watchers.items()):
+            self._guarded(name, partial(watcher.during_command, make_map))
 
     def close(self) -> None:
         """Close all."""
         for name in list(self._watchers):
             self.remove(name)
 
-    @staticmethod
-    def _guarded(action: Callable[[], None]) -> None:
+    def _guarded(self, name: str, action: Callable[[], None]) -> bool:
         try:
             action()
         except Exception:
-            logger.exception("a watcher failed")
+            logger.exception("the %s failed", name)
+            if name not in self._told:
+                self._told.add(name)
+                self._say(f"the {name} could not follow the map (see {log_path()})")
+            return False
+        return True

@@ -76,7 +76,8 @@ def by_user(
                 action(event)
         except Exception:
             logger.exception("the viewer could not do what a page asked for")
-            say("this could not be done: the log file has the reason")
+            with lock:
+                say("this could not be done: the log file has the reason")
 
     return callback
 

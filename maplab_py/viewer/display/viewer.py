@@ -396,7 +396,9 @@ class Viewer:
                         self.set_step(self._player.step + 1)
             except Exception:
                 logger.exception("the viewer cannot play on")
-                self._panel.playing.value = False
+                with self._lock:
+                    self._panel.playing.value = False
+                    self._panel.say("playing stopped: the log file has the reason")
 
     # -- picking ----------------------------------------------------------------------------------
 

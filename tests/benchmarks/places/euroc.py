@@ -39,7 +39,7 @@ class EurocFigures:
 
 
 def measure(query_step: int = 3) -> Iterator[EurocFigures]:
-    """Compare every third vertex with all, at several limits of inliers: the issue names none."""
+    """Compare every third vertex with all, at several limits of inliers."""
     vi_map, pairs = _flight(query_step)
     for min_inliers in (12, 15, 20, 30):
         yield _figures(vi_map, pairs, min_inliers)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 from maplab_py.algorithms.loop_closure.closing import close_loops, search_loops
 from tests.algorithms.loop_closure.against_truth import score, sessions
+from tests.benchmarks.places.timing import Times, timed
 from tests.support.machine import slowness
 
 RATE_HZ, DURATION_S, LONG_S = 10.0, 60.0, 120.0
@@ -53,23 +54,14 @@ class LongSessionsFigures:
     vertices: int
     keypoints: int
     merged: int
-    lc_s: tuple[float, ...]  # processor time of each run
-    slowness: tuple[float, ...]  # of the machine around each
-    ordinary_s: float  # least quotient of the two
+    times: Times
 
 
-def measure_long(seed: int, repeats: int = 2) -> LongSessionsFigures:
+def measure_long(seed: int) -> LongSessionsFigures:
     """Time lc (search and merge) as it runs in a console where it has run before."""
     vi_map, _ = sessions(0.05, 0.0, seed=seed, rate_hz=RATE_HZ, duration_s=LONG_S)
     close_loops(sessions(0.05, 0.0, seed=seed, rate_hz=2.0, duration_s=20.0)[0])  # compiles
-    times, factors = [], []
-    for _ in range(repeats):
-        before, begin = slowness(), time.process_time()
-        _, report = close_loops(vi_map)
-        times.append(time.process_time() - begin)
-        factors.append((before + slowness()) / 2)
-    ordinary = min(t / f for t, f in zip(times, factors, strict=True))
+    (_, report), times = timed(lambda: close_loops(vi_map), repeats=2)
     return LongSessionsFigures(
-        seed, len(vi_map.vertices), len(vi_map.keypoints), report.landmarks_merged,
-        tuple(times), tuple(factors), ordinary,
-    )  # fmt: skip
+        seed, len(vi_map.vertices), len(vi_map.keypoints), report.landmarks_merged, times
+    )

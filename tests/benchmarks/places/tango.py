@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,8 +18,8 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows
 from tests.benchmarks.places.brute_force import FramePairs, search
 from tests.benchmarks.places.joint_gap import JointGap, held_out_gap, merged_gap
+from tests.benchmarks.places.timing import Times, timed
 from tests.support.data import shared_data
-from tests.support.machine import slowness
 
 TANGO = "maplab_maps/tango_handheld"
 BETWEEN_S = (96.0, 118.0)
@@ -183,20 +182,12 @@ class WalkFigures:
     """lc on the handheld walk as loaded, warm."""
 
     closures: int
-    lc_s: tuple[float, ...]  # processor time of each run after the first
-    slowness: tuple[float, ...]  # of the machine around each
-    ordinary_s: float  # least quotient of the two
+    times: Times
 
 
-def measure_time(repeats: int = 3) -> Iterator[WalkFigures]:
+def measure_time() -> Iterator[WalkFigures]:
     """Time lc as a command."""
     vi_map = _load()
     close_loops(vi_map)
-    times, factors = [], []
-    for _ in range(repeats):
-        before, begin = slowness(), time.process_time()
-        _, report = close_loops(vi_map)
-        times.append(time.process_time() - begin)
-        factors.append((before + slowness()) / 2)
-    ordinary = min(t / f for t, f in zip(times, factors, strict=True))
-    yield WalkFigures(report.accepted, tuple(times), tuple(factors), ordinary)
+    (_, report), times = timed(lambda: close_loops(vi_map), repeats=3)
+    yield WalkFigures(report.accepted, times)
