@@ -3,7 +3,8 @@
 python docs/scripts/self_calibration_page.py --results=ar_room.jsonl --consistency=clean.jsonl,swaps.jsonl
 
 Files of consistency are labelled with what follows the first _ of their names.
-Beside NAME.jsonl, NAME_vio.jsonl of evaluate_calibrated_odometry.py is read where there is one.
+Beside NAME.jsonl, NAME_vio.jsonl of evaluate_calibrated_odometry.py and NAME_announced.jsonl of
+announce_self_calibration.py are read where there are any.
 """
 
 from __future__ import annotations
@@ -292,6 +293,48 @@ def comparison_table(results: Results) -> list[str]:
     return [*lines, ""]
 
 
+def announced_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Return how certain selections could be at best, without an estimate."""
+    if not rows:
+        return []
+    by_selection: dict[str, dict[int, dict[str, Any]]] = {}
+    for row in rows:
+        by_selection.setdefault(row["selection"], {})[row["set"]] = row
+    level = levels(rows[0]["names"])
+    total = {
+        name: {
+            k: float(np.sqrt(np.mean((np.array(r["sigma"]) / level) ** 2))) for k, r in own.items()
+        }
+        for name, own in by_selection.items()
+    }
+    scale = [k for k, n in enumerate(rows[0]["names"]) if kind_of(n) == "accelerometer scale"]
+    tilt_deg = np.median([row["tilt_deg"] for row in rows])
+    lines = [
+        "### What a selection can hold",
+        "",
+        "| segments | sets | announced deviations (thesis = 1) | over random | accelerometer scale |",
+        "|---|---|---|---|---|",
+    ]
+    for name, own in by_selection.items():
+        ratio = np.median([value / total["8: random"][k] for k, value in total[name].items()])
+        sigma = np.median(
+            [np.sqrt(np.mean(np.array(r["sigma"])[scale] ** 2)) for r in own.values()]
+        )
+        lines.append(
+            f"| {name} | {len(own)} | {np.median(list(total[name].values())):.2f} | {ratio:.2f} | "
+            f"{sigma:.4f} |"
+        )
+    return [
+        *lines,
+        "",
+        "Medians, from the Jacobians at the true states (`docs/scripts/announce_self_calibration.py`);",
+        "nothing is estimated. *Together*: taken one after the other so that all of them make the trace (in",
+        "units of the thesis' or of a segment's usual deviations), the determinant, or the variance of the",
+        f"accelerometer's scale least. Gravity turns by {tilt_deg:.0f} degrees (rms) as the IMU sees it.",
+        "",
+    ]
+
+
 def picture(results: Results) -> str:
     """Return an SVG: the error of every data set by method, on a logarithmic scale."""
     width, row_px, left, right = 720.0, 30.0, 210.0, 20.0
@@ -352,6 +395,7 @@ def of_scenario(path: Path) -> list[str]:
         "",
         *comparison_table(results),
         *parameter_table(results),
+        *announced_table(lines_of(path.with_name(f"{path.stem}_announced.jsonl"))),
     ]
 
 
