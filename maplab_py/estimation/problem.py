@@ -159,6 +159,16 @@ class Problem:
         projected = np.einsum("nij,njmk,mkl->niml", P, covariance, P)
         return np.asarray(projected.reshape(3 * len(nodes), -1))
 
+    def covariance_columns(self, nodes: I64, directions: I64) -> F64:
+        """Return the covariance (nodes, 3, k) of everything with directions (k,) of nodes (k,).
+
+        After `factorise` without damping; landmarks that were eliminated are not among the nodes.
+        """
+        sides = np.zeros((self.num_nodes, 3, len(nodes)))
+        sides[nodes, directions, np.arange(len(nodes))] = 1.0
+        columns = self._solver.solve(sides.reshape(3 * self.num_nodes, -1)).reshape(sides.shape)
+        return np.asarray(np.einsum("nij,njk->nik", self._projector, columns))
+
     def name_of_node(self, states: States, node: int) -> str:
         """Say in words which state a node belongs to."""
         if node < states.num_vertex_nodes:

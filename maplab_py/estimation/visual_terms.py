@@ -159,6 +159,11 @@ class VisualTerms:
         return 0.5 * (total + float(np.sum(off * off)))
 
     @property
+    def loss(self) -> Loss:
+        """Robust loss of reprojection errors."""
+        return Loss(self._loss)
+
+    @property
     def has_landmark_prior(self) -> bool:
         """Whether some landmark has a prior."""
         return bool(self._prior[:, 3].any())

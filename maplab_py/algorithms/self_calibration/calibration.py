@@ -28,6 +28,7 @@ from maplab_py.algorithms.self_calibration.scale import (
     without_partitions,
 )
 from maplab_py.algorithms.self_calibration.segments import parallax_rad, restricted
+from maplab_py.algorithms.self_calibration.track_deviations import sigma_by_tracks
 from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sensors, written_back
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -61,7 +62,8 @@ class Calibration:
     sensors: SensorSet
     parameters: Parameters
     before: ParameterBlocks
-    covariance: F64  # (k, k)
+    covariance: F64  # (k, k), formal
+    sigma_by_tracks: F64  # (k,), where the errors of a track may hang together
     spectrum: Spectrum
     problem: SegmentProblem
     states: States
@@ -118,6 +120,7 @@ def calibrate(
             restricted(vi_map, rest), options, names_of(problem, lost), segments, progress
         )
     covariance = posterior_covariance(problem, states)
+    by_tracks = sigma_by_tracks(problem, states)
     found = spectrum(covariance, problem.parameters)
     directions = found.unobservable(_UNDETERMINED)
     names = tuple(name_direction(one, problem.parameters) for one in directions.T)
@@ -130,6 +133,7 @@ def calibrate(
         problem.parameters,
         before,
         covariance,
+        by_tracks,
         found,
         problem,
         states,
@@ -257,6 +261,7 @@ def _report(
         observations=0 if rejection is None else int(np.count_nonzero(rejection.is_used)),
         inconsistent_landmarks=consistency.inconsistent,
         keypoint_noise_factor=consistency.noise_factor,
+        track_deviation_factor=float(np.median(calibration.sigma_by_tracks / _formal(calibration))),
         cost_before=sum(first.initial_costs.values()),
         cost_after=sum(summary.final_costs.values()),
         chi_square_per_freedom=chi_square_per_freedom(problem, states),
@@ -267,14 +272,19 @@ def _report(
     )
 
 
+def _formal(calibration: Calibration) -> F64:
+    return np.sqrt(np.maximum(np.diag(calibration.covariance), 1e-300))
+
+
 def _estimates(calibration: Calibration) -> tuple[ParameterEstimate, ...]:
     parameters = calibration.parameters
-    sigma = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
+    formal = _formal(calibration)
+    sigma = np.maximum(formal, calibration.sigma_by_tracks)
     before = starting_values(parameters, calibration.before)
     rows = []
     change = calibration.change
     for k, one in enumerate(parameters.each):
-        share = (sigma[k] / one.prior_sigma) ** 2
+        share = (formal[k] / one.prior_sigma) ** 2
         verdict = "well determined" if share < 0.01 else "weakly determined"
         if share > _UNKNOWN:
             verdict = "not excited, left at its prior"

@@ -29,6 +29,7 @@ def report_of(result: FilteredCalibration) -> SelfCalibrationReport:
         observations=result.observations,
         inconsistent_landmarks=result.tracks_rejected,
         keypoint_noise_factor=1.0,  # the filter believes what the map says
+        track_deviation_factor=1.0,
         cost_before=float("nan"),
         cost_after=float("nan"),
         chi_square_per_freedom=result.mean_square,

@@ -35,6 +35,7 @@ class SelfCalibrationReport(Report):
     observations: int
     inconsistent_landmarks: int  # left out: their tracks are not of one point
     keypoint_noise_factor: float  # noise of the keypoints over what the map says
+    track_deviation_factor: float  # deviations by tracks over those by single observations, median
     cost_before: float
     cost_after: float
     chi_square_per_freedom: float  # about 1 when the sigmas of the measurements are right
