@@ -16,6 +16,8 @@ from maplab_py.console.settings import Settings
 from maplab_py.console.suggest import did_you_mean
 from maplab_py.errors import FlagError, UserError
 
+_SHELL_SEPARATORS = ("&&", "||", "&", "|")
+
 
 @dataclasses.dataclass(frozen=True)
 class Call:
@@ -142,6 +144,8 @@ def _place(
     if rest and not command.variadic:
         flag = next((f for f in command.flags.values() if not f.type.is_bool), None)
         form = f" (flags are written --{flag.name}=value)" if flag else ""
+        if rest[0] in _SHELL_SEPARATORS:
+            form = " (commands are separated by ;)"
         raise FlagError(f"{command.name}: unexpected word '{rest[0]}'{form}")
     return placed, rest
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Literal
 
+from maplab_py.console.fitting import Panel, fitted
 from maplab_py.console.layout import Block, Pairs, Paragraph, Table, blocks_of
 from maplab_py.report import SCHEMA_VERSION, Report
 
@@ -104,7 +105,6 @@ def _render_rich(blocks: list[Block], stream: IO[str], *, forced: bool = False) 
 
 
 def _print_block(block: Block, console: RichConsole) -> None:
-    from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -113,15 +113,26 @@ def _print_block(block: Block, console: RichConsole) -> None:
         return
     if block.title:
         console.print(Text(block.title, style="bold"))
-    if isinstance(block, Pairs):
-        grid = RichTable.grid(padding=(0, 2))
-        for name, value in block.rows:
-            grid.add_row(Text(name, style="cyan"), Text(value))
-        console.print(grid)
+    if isinstance(block, Table):
+        for panel in fitted(block, console.width):
+            _print_panel(panel, console)
         return
+    grid = RichTable.grid(padding=(0, 2))
+    for name, value in block.rows:
+        grid.add_row(Text(name, style="cyan"), Text(value))
+    console.print(grid)
+
+
+def _print_panel(panel: Panel, console: RichConsole) -> None:
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    table = panel.table
     shown = RichTable(box=box.SIMPLE_HEAD, header_style="bold cyan", pad_edge=False)
-    for head, right in zip(block.heads, block.is_number, strict=True):
-        shown.add_column(Text(head), justify="right" if right else "left", overflow="fold")
-    for row in block.rows:
+    for head, right, width in zip(table.heads, table.is_number, panel.widths, strict=True):
+        justify: Literal["left", "right"] = "right" if right else "left"
+        shown.add_column(Text(head), justify=justify, overflow="fold", width=width)
+    for row in table.rows:
         shown.add_row(*(Text(cell) for cell in row))
     console.print(shown)

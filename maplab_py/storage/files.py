@@ -16,6 +16,8 @@ METADATA = "metadata"
 VI_MAP_METADATA = "vi_map_metadata"
 SENSORS = "sensors.yaml"
 RESOURCE_INFO = "resource_info"
+COPY_AGAIN = "copy the map again from where it was recorded or saved"
+"""What can be done about a damaged file."""
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
@@ -70,7 +72,9 @@ def read_message(path: Path, message: Message, max_bytes: int) -> int:
     try:
         message.ParseFromString(data)
     except DecodeError as error:
-        raise MapError(f"{path}: is damaged: not a message of the map format") from error
+        raise MapError(
+            f"{path}: is damaged: not a message of the map format; {COPY_AGAIN}"
+        ) from error
     return len(data)
 
 
@@ -92,9 +96,9 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
     try:
         data = unpacker.decompress(packed, max_bytes + 1)
     except zlib.error as error:
-        raise MapError(f"{path}: is damaged: wrong gzip data ({error})") from error
+        raise MapError(f"{path}: is damaged: wrong gzip data ({error}); {COPY_AGAIN}") from error
     if len(data) > max_bytes:
         raise MapError(too_large)
     if not unpacker.eof:
-        raise MapError(f"{path}: is truncated: the gzip data ends early")
+        raise MapError(f"{path}: is truncated: the gzip data ends early; {COPY_AGAIN}")
     return data

@@ -21,7 +21,7 @@ from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.files import read_message
+from maplab_py.storage.files import COPY_AGAIN, read_message
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -100,7 +100,7 @@ def read_summary_map(path: Path, *, max_size_megabytes: int = 2000) -> SummaryMa
         return summary
     summary = _with_extras(summary, message.extras, file)
     if message.extras.sha256 and message.extras.sha256 != _digest(summary):
-        raise MapError(f"{file}: is damaged: it does not have its checksum")
+        raise MapError(f"{file}: is damaged: it does not have its checksum; {COPY_AGAIN}")
     return summary
 
 

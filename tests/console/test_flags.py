@@ -66,6 +66,7 @@ def test_forms_of_flags(words: str, expected: dict[str, Any]) -> None:
         ("solve --nofix_gravity=true", "takes no value"),
         ("solve --folder=$MAPLAB_TEST_UNSET_VARIABLE/x", "environment variable"),
         ("solve a b", "unexpected word 'b'"),
+        ("solve a && solve b", "commands are separated by ;"),
         ("solve --v=x", "wants a whole number"),
         ("solv", "did you mean solve"),
     ],
