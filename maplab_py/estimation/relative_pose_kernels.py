@@ -292,9 +292,10 @@ def normal_equations(  # type: ignore[no-untyped-def]
         bend: Whether to add the second derivatives of logarithmic residuals (see `_bend`).
         slot: Rows (E, 3) of `blocks` for A with A, B with B, and the block below the diagonal;
             -1 = not wanted. The last is (B, A); where A comes after B it is -2 - row, for (A, B).
+            The first two are shared by the edges of a pose, the last is the edge's own.
         node_a: Node (E,) of A, -1 where A does not move.
         node_b: Node (E,) of B.
-        blocks: (N, 6, 6), written.
+        blocks: (N, 6, 6); those below the diagonal are written, lower triangles of the others added.
         gradient: (nodes, 6), J^T W e is added.
         diagonal: (nodes, 6), the diagonals of the Gauss-Newton blocks are added.
     """
@@ -309,7 +310,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
         A, B = T[from_vertex[edge]], T[to_vertex[edge]]
         a, b, below = slot[edge, 0], slot[edge, 1], slot[edge, 2]
         if trust[edge] == 0.0:
-            _clear(blocks, a, b, below)
+            _clear(blocks, below)
             continue
         _residual(A, B, measured[edge], is_log[edge], e, p, q_B_A, y, R, q_A_B, q)
         _derivatives(measured[edge], is_log[edge], e, p, q_B_A, y, D_a, D_b, parts)
@@ -322,10 +323,8 @@ def normal_equations(  # type: ignore[no-untyped-def]
         cost += trust[edge] * u
         w *= trust[edge]
         if a >= 0:
-            _product(J_a, J_a, w, blocks[a])
             _add(J_a, E, w, blocks[a], gradient[node_a[edge]], diagonal[node_a[edge]])
         if b >= 0:
-            _product(J_b, J_b, w, blocks[b])
             _add(J_b, E, w, blocks[b], gradient[node_b[edge]], diagonal[node_b[edge]])
         if below >= 0:
             _product(J_b, J_a, w, blocks[below])
@@ -338,16 +337,10 @@ def normal_equations(  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _clear(blocks, a, b, below):  # type: ignore[no-untyped-def]
-    """Set the blocks of an edge without weight to zero."""
-    for i in range(6):
-        for j in range(6):
-            if a >= 0:
-                blocks[a, i, j] = 0.0
-            if b >= 0:
-                blocks[b, i, j] = 0.0
-            if below != -1:
-                blocks[below if below >= 0 else -below - 2, i, j] = 0.0
+def _clear(blocks, below):  # type: ignore[no-untyped-def]
+    """Set the own block of an edge without weight to zero."""
+    if below != -1:
+        blocks[below if below >= 0 else -below - 2] = 0.0
 
 
 @compiled(inline="always")
@@ -477,11 +470,15 @@ def _add_bend(room, w, a, b, below, blocks):  # type: ignore[no-untyped-def]
 
 @compiled(inline="always")
 def _add(J, E, w, block, gradient, diagonal):  # type: ignore[no-untyped-def]
+    """Add w J^T J to the lower triangle of a block, its diagonal and w J^T E to the others."""
     for k in range(6):
-        diagonal[k] += block[k, k]
         e = w * E[k]
         for i in range(6):
-            gradient[i] += J[k, i] * e
+            x = J[k, i]
+            gradient[i] += x * e
+            diagonal[i] += w * x * x
+            for j in range(i + 1):
+                block[i, j] += w * x * J[k, j]
 
 
 @compiled(inline="always")

@@ -8,12 +8,13 @@ from maplab_py.geometry import se3, so3
 from maplab_py.vision.absolute_pose import HYPOTHESES, PoseProblems, solve_poses
 from maplab_py.vision.descriptors import hamming, pack_words
 from maplab_py.vision.index import INDEX_ENGINES, DescriptorSet, MatchRule, make_index
+from maplab_py.vision.point_covariance import covariance_by_rays, squared_sigmas
 from maplab_py.vision.projection import learn_projection
 from maplab_py.vision.track_union import unite_tracks
 
 
 def compile_search() -> None:
-    """Compile projection, indices, Hamming distances and the union of tracks."""
+    """Compile projection, indices, Hamming distances, and what merging landmarks needs."""
     tracks, length = 60, 5
     rng = np.random.default_rng(0)
     label = np.repeat(np.arange(tracks), length)
@@ -31,6 +32,10 @@ def compile_search() -> None:
     hamming(words, label, words, label)
     rows = np.arange(3)
     unite_tracks(rows[1:2], rows[:1], rows, rows[:2], 2)
+    ray, one, R = np.ones((1, 3)), np.ones(1), np.eye(3)[None]
+    covariance = covariance_by_rays(ray, one, one > 0.0, rows[:1], 1)
+    row, pose = rows[:1], np.eye(6)[None]
+    squared_sigmas(ray, ray, one, row, row, row, covariance, R, R, R, pose)
 
 
 def compile_poses() -> None:

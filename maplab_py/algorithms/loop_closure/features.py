@@ -69,7 +69,7 @@ def map_features(
     if size == 0 or by_size[size] == 0:
         raise EstimationError("the map has no descriptors: places cannot be recognised")
     keypoint = np.flatnonzero((sizes == size)[vi_map.keypoint_frame])
-    origin, ray, rad_per_px, seen = _rays(vi_map, keypoint)
+    origin, ray, rad_per_px, seen = keypoint_rays(vi_map, keypoint)
     keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
@@ -130,7 +130,7 @@ def findable_landmarks(vi_map: VIMap) -> Mask:
     return np.asarray(observed & (vi_map.landmarks.quality == LandmarkQuality.GOOD))
 
 
-def _rays(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, F64, Mask]:
+def keypoint_rays(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, F64, Mask]:
     """Return camera centres and rays in I, the angle of a pixel [rad], and which rays exist."""
     frame = vi_map.keypoint_frame[keypoints]
     mission = vi_map.vertices.mission[vi_map.frames.vertex[frame]]

@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.loop_closure.agreement import compare_landmarks
 from maplab_py.algorithms.loop_closure.closures import Closures
-from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import merge_landmarks
 from maplab_py.vision.track_union import unite_tracks
@@ -20,6 +19,7 @@ F64 = NDArray[np.float64]
 
 FEW_OBSERVATIONS = "too few verified observations agree"
 TOO_FAR = "too far apart once the closure is applied"
+UNLIKELY = "farther apart than their rays allow"
 SAME_IMAGE = "both seen in one image"
 GAP = "the closure corrects too much: relax first"
 UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
@@ -59,12 +59,20 @@ def merge_verified_landmarks(
     refuse(GAP, gap)
     open_ &= ~gap
     rows = np.flatnonzero(open_)
-    distance, depth = _distances(vi_map, closures, closure[rows], rows, source[rows])
-    allowed = np.maximum(options.max_merge_distance_m, options.max_merge_distance_ratio * depth)
-    far = np.zeros(len(source), dtype=np.bool_)
-    far[rows[distance > allowed]] = True
-    refuse(TOO_FAR, far)
-    rows = rows[distance <= allowed]
+    target = closures.landmark[rows]
+    found = compare_landmarks(
+        vi_map, closures, closure[rows], source[rows], target, options.ransac_pixel_sigma
+    )
+    allowed = np.maximum(
+        options.max_merge_distance_m, options.max_merge_distance_ratio * found.depth_m
+    )
+    near = found.gap_m <= allowed
+    likely = found.squared_sigmas <= options.max_merge_sigma**2
+    for reason, which in ((TOO_FAR, ~near), (UNLIKELY, near & ~likely)):
+        mask = np.zeros(len(source), dtype=np.bool_)
+        mask[rows[which]] = True
+        refuse(reason, mask)
+    rows = rows[near & likely]
 
     pair, first, second, votes, bits = _pairs(
         source[rows], closures.landmark[rows], closures.query_vertex[closure[rows]],
@@ -102,22 +110,6 @@ def _mergeable(vi_map: VIMap, closures: Closures) -> NDArray[np.bool_]:
     place = vi_map.vertices.mission[closures.place_vertex]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     return np.asarray((query == place) | (known[query] & known[place]))
-
-
-def _distances(
-    vi_map: VIMap, closures: Closures, closure: I64, rows: I64, source: I64
-) -> tuple[F64, F64]:
-    """Return how far apart (N,) the landmarks are once the query is where verification put it.
-
-    Also the distance (N,) of the database landmark from the query.
-    """
-    query = closures.query_vertex[closure]
-    p_I = se3.transform(se3.inverse(vi_map.T_G_I[query]), vi_map.p_G[source])
-    mission = vi_map.vertices.mission[closures.place_vertex[closure]].astype(np.int64)
-    T_M_I = closures.T_M_I[closure]
-    target_M = points_in_mission(vi_map, closures.landmark[rows], mission)
-    gap = np.linalg.norm(se3.transform(T_M_I, p_I) - target_M, axis=1)
-    return np.asarray(gap), np.asarray(np.linalg.norm(target_M - T_M_I[:, 4:], axis=1))
 
 
 def _pairs(

@@ -96,6 +96,11 @@ class LoopClosureOptions:
         help="The distance may also be this part of the landmark's distance from the query: depth "
         "is what landmarks err most in",
     )
+    max_merge_sigma: float = option(
+        4.0,
+        help="And at most so many standard deviations, by how the rays of both landmarks cross "
+        "(keypoints err by --lc_ransac_pixel_sigma) and by the closure's covariance",
+    )
     max_merge_gap_m: float = option(
         0.5,
         help="Landmarks are not merged over a closure that corrects more: relax first",

@@ -76,9 +76,8 @@ def optimize_graph(
         EstimationError: The poses are not determined, or not finite.
     """
     edges = _edges(graph)
-    chain = is_odometry(graph)
-    if options.robustness == "none":
-        chain = np.ones_like(chain)
+    is_plain = options.robustness == "none"
+    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else is_odometry(graph)
     is_free = np.ones(len(graph.id), dtype=np.bool_)
     is_free[_anchors(graph)] = False
     trajectory, loops = edges.take(np.flatnonzero(chain)), edges.take(np.flatnonzero(~chain))

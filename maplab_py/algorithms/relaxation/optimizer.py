@@ -17,6 +17,7 @@ from maplab_py.estimation import relative_pose_kernels as edge_kernels
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.estimation.linear.ordering import exact_minimum_degree
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.progress import Progress
 
 F64 = NDArray[np.float64]
@@ -65,26 +66,21 @@ class PoseGraphOptimizer:
         self._a = a = variable[self._edges.from_vertex]
         self._b = b = variable[self._edges.to_vertex]
         self._tilted = variable[tilt.vertex]
-        # each contribution is a block of its own, and the solver adds those of equal place; the
-        # last ones are those of single poses: tilt and damping
-        places = [(a, a), (b, b), (np.maximum(a, b), np.minimum(a, b))]
-        kept = [np.flatnonzero(col >= 0) for _, col in places]
+        # every edge has a block of its own below the diagonal, and every pose one on it
+        row, col = np.maximum(a, b), np.minimum(a, b)
+        kept = np.flatnonzero(col >= 0)
+        first = len(kept)
         self._slot = np.full((len(a), 3), -1, dtype=np.int64)
-        first = 0
-        for part, edges in enumerate(kept):
-            self._slot[edges, part] = first + np.arange(len(edges))
-            first += len(edges)
-        turned = np.flatnonzero((self._slot[:, 2] >= 0) & (a > b))
-        self._slot[turned, 2] = -2 - self._slot[turned, 2]
-        rows = [row[edges] for (row, _), edges in zip(places, kept, strict=True)]
-        cols = [col[edges] for (_, col), edges in zip(places, kept, strict=True)]
+        self._slot[kept, 2] = np.where(a[kept] > b[kept], -2 - np.arange(first), np.arange(first))
+        self._slot[:, 0] = np.where(a >= 0, first + a, -1)
+        self._slot[:, 1] = np.where(b >= 0, first + b, -1)
         nodes = np.arange(size)
         self._blocks = np.zeros((first + size, 6, 6))
         self._own = self._blocks[first:]
         self._diagonal = np.einsum("nii->ni", self._own)  # a view
         self._solver = BlockCholesky(
-            np.concatenate([*rows, nodes]),
-            np.concatenate([*cols, nodes]),
+            np.concatenate([row[kept], nodes]),
+            np.concatenate([col[kept], nodes]),
             size,
             6,
             ordering=exact_minimum_degree,
@@ -138,6 +134,7 @@ class PoseGraphOptimizer:
         own = J_a @ aa @ np.swapaxes(J_a, 1, 2) + J_b @ bb @ np.swapaxes(J_b, 1, 2)
         return np.asarray(own + cross + np.swapaxes(cross, 1, 2))
 
+    @single_blas_thread()
     def run(
         self,
         T_G_I: F64,

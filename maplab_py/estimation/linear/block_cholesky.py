@@ -11,6 +11,7 @@ from maplab_py.estimation.linear import multifrontal
 from maplab_py.estimation.linear.ordering import minimum_degree
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
+from maplab_py.estimation.linear.single_solve import solve_single
 from maplab_py.estimation.linear.symbolic import analyse
 from maplab_py.estimation.linear.threads import single_blas_thread
 
@@ -89,6 +90,9 @@ class BlockCholesky:
         return self._values
 
     def _solve(self, b: F64) -> F64:
+        if b.shape[1] == 1:
+            x = solve_single(self._symbolic.plan, self._factor, b[:, 0].copy())
+            return np.asarray(x[:, None])
         columns = np.ascontiguousarray(b.T)
         x = multifrontal.solve(self._symbolic.plan, self._factor, columns, self._blas)
         return np.ascontiguousarray(x.T)

@@ -1,0 +1,89 @@
+"""Solution of L L^T x = b for one right side: plain loops, as BLAS takes longer to be called.
+
+Panels of L are columns of a front, see `symbolic.FrontPlan`; each is read once on the way up the
+tree and once on the way down. Sums run in an order of their own, which is always the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.compilation import compiled
+from maplab_py.estimation.linear.symbolic import FrontPlan
+
+F64 = NDArray[np.float64]
+
+
+@compiled(fastmath={"reassoc", "contract"})
+def _dot(a: F64, b: F64) -> float:
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@compiled(fastmath={"contract"})
+def _subtract(a: F64, factor: float, result: F64) -> None:
+    for i in range(len(a)):
+        result[i] -= factor * a[i]
+
+
+@compiled()
+def solve_single(plan: FrontPlan, factor: F64, right_side: F64) -> F64:
+    """Return x (n * d,) of L L^T x = b for one right side (n * d,)."""
+    d, order = plan.node_size, plan.order
+    x = np.empty(len(right_side))
+    for place in range(len(order)):
+        for r in range(d):
+            x[place * d + r] = right_side[order[place] * d + r]
+    supernodes = len(plan.first_node) - 1
+    tallest = 0
+    for s in range(supernodes):
+        tallest = max(tallest, plan.below_start[s + 1] - plan.below_start[s])
+    gathered = np.empty(tallest * d)
+    for s in range(supernodes):
+        _up(plan, s, factor, x, gathered)
+    for s in range(supernodes - 1, -1, -1):
+        _down(plan, s, factor, x, gathered)
+    result = np.empty(len(x))
+    for place in range(len(order)):
+        for r in range(d):
+            result[order[place] * d + r] = x[place * d + r]
+    return result
+
+
+@compiled()
+def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
+    """One supernode of L y = b: x1 <- L11^-1 x1, then x2 -= L21 x1 in the rows below."""
+    d = plan.node_size
+    below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
+    first, w = plan.first_node[s] * d, (plan.first_node[s + 1] - plan.first_node[s]) * d
+    panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + len(below) * d)
+    own, rest = x[first : first + w], gathered[: len(below) * d]
+    rest[:] = 0.0
+    for j in range(w):
+        column = panel[j]
+        own[j] /= column[j]
+        _subtract(column[j + 1 : w], own[j], own[j + 1 :])
+        _subtract(column[w:], own[j], rest)
+    for i in range(len(below)):
+        for r in range(d):
+            x[below[i] * d + r] += rest[i * d + r]
+
+
+@compiled()
+def _down(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
+    """One supernode of L^T x = y: x1 <- L11^-T (x1 - L21^T x2)."""
+    d = plan.node_size
+    below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
+    first, w = plan.first_node[s] * d, (plan.first_node[s + 1] - plan.first_node[s]) * d
+    panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + len(below) * d)
+    own, rest = x[first : first + w], gathered[: len(below) * d]
+    for i in range(len(below)):
+        for r in range(d):
+            rest[i * d + r] = x[below[i] * d + r]
+    for j in range(w - 1, -1, -1):
+        column = panel[j]
+        known = _dot(column[j + 1 : w], own[j + 1 :]) + _dot(column[w:], rest)
+        own[j] = (own[j] - known) / column[j]
