@@ -110,6 +110,18 @@ class Console:
         """Wait until the last line is an empty prompt."""
         return self.wait_for(lambda _: self.last_line == prompt)
 
+    def wait_until_still(self, still_s: float = 0.5) -> str:
+        """Wait until nothing is drawn any more (the toolbar comes after the prompt); return it."""
+        text, since = self.text, time.monotonic()
+        end = since + 20.0
+        while time.monotonic() < end:
+            self._read(0.05)
+            if self.text != text:
+                text, since = self.text, time.monotonic()
+            elif time.monotonic() > since + still_s:
+                return text
+        raise AssertionError(f"the screen never rests; it shows:\n{self.text}")
+
     def processor_seconds(self) -> float:
         """Return the processor time that the program has used so far."""
         fields = Path(f"/proc/{self.child.pid}/stat").read_text().rpartition(")")[2].split()

@@ -57,7 +57,7 @@ def test_the_prompt_stays_clean_and_the_server_ends_with_it(console: Console) ->
     console.enter("clear_nothing")
     console.wait_for_text("unknown command 'clear_nothing'")
     console.wait_for_prompt("maplab <walk>:/$")
-    quiet = console.text
+    quiet = console.wait_until_still()
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10.0) as answer:
         assert b"<html" in answer.read()[:500].lower()
     _visit(port)
@@ -68,6 +68,7 @@ def test_the_prompt_stays_clean_and_the_server_ends_with_it(console: Console) ->
     time.sleep(0.5)
     console.type("ms")
     console.wait_for(lambda _: console.last_line.endswith("$ ms"))
+    console.wait_until_still()
     # what pages do has left no trace between the last output and the prompt
     prompt = "maplab <walk>:/$"
     assert console.text.rpartition(prompt)[0] == quiet.rpartition(prompt)[0]
