@@ -6,6 +6,8 @@ tree and once on the way down. Sums run in an order of their own, which is alway
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,14 +55,21 @@ def solve_single(plan: FrontPlan, factor: F64, right_side: F64) -> F64:
     return result
 
 
-@compiled()
-def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
-    """One supernode of L y = b: x1 <- L11^-1 x1, then x2 -= L21 x1 in the rows below."""
+@compiled(inline="always")
+def _parts(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> Any:
+    """Return node size, columns w, nodes below, panel (w, w + rows below), x1 and room for x2."""
     d = plan.node_size
     below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
     first, w = plan.first_node[s] * d, (plan.first_node[s + 1] - plan.first_node[s]) * d
-    panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + len(below) * d)
-    own, rest = x[first : first + w], gathered[: len(below) * d]
+    rows = len(below) * d
+    panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + rows)
+    return d, w, below, panel, x[first : first + w], gathered[:rows]
+
+
+@compiled()
+def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
+    """One supernode of L y = b: x1 <- L11^-1 x1, then x2 -= L21 x1 in the rows below."""
+    d, w, below, panel, own, rest = _parts(plan, s, factor, x, gathered)
     rest[:] = 0.0
     for j in range(w):
         column = panel[j]
@@ -75,11 +84,7 @@ def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
 @compiled()
 def _down(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
     """One supernode of L^T x = y: x1 <- L11^-T (x1 - L21^T x2)."""
-    d = plan.node_size
-    below = plan.below[plan.below_start[s] : plan.below_start[s + 1]]
-    first, w = plan.first_node[s] * d, (plan.first_node[s + 1] - plan.first_node[s]) * d
-    panel = factor[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + len(below) * d)
-    own, rest = x[first : first + w], gathered[: len(below) * d]
+    d, w, below, panel, own, rest = _parts(plan, s, factor, x, gathered)
     for i in range(len(below)):
         for r in range(d):
             rest[i * d + r] = x[below[i] * d + r]
