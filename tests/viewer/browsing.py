@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -75,6 +76,22 @@ class Page:
         """Return the checkbox beside a label."""
         row = f"xpath=//*[text()='{label}']/ancestor::*[.//input[@type='checkbox']][1]"
         return self.page.locator(row).locator("input[type=checkbox]").first
+
+    def click(self, target: Any, tries: int = 4) -> None:
+        """Click, and click again where the page gave no frame in which it could be done.
+
+        A page that renders in software and has nothing to draw now and then stops to report
+        frames, for which playwright waits; a moved pointer makes it draw.
+        """
+        slow = importlib.import_module("playwright.sync_api").TimeoutError
+        for number in range(1, tries + 1):
+            try:
+                target.click(timeout=30_000)
+                return
+            except slow:
+                if number == tries:
+                    raise
+                self.page.mouse.move(20.0 + number, HEIGHT - 20.0)
 
     def settle(self, milliseconds: int = 900) -> None:
         self.page.wait_for_timeout(milliseconds)

@@ -81,7 +81,7 @@ def test_many_pages_do_no_harm(browser: Any) -> None:
     viewer = Viewer(0)
     viewer.show(SUBJECT)
     pages = [Page(browser, viewer.url, (240, 160), frame_ms=1500) for _ in range(10)]
-    assert pages[0].wait_until(lambda: viewer.pages == 10, 60.0)
+    assert pages[0].wait_until(lambda: viewer.pages == 10)
     viewer.set_layer("imu_edges", True)
     for opened in pages[:9]:
         opened.page.close()
