@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -27,9 +28,14 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
 
     Where no folder can be written the function is compiled anew in every process.
 
+    Division by zero gives infinity or not-a-number as in numpy: to raise an error instead would put
+    a branch at each division and cost a tenth of the time to compile.
+
     Args:
         settings: Further settings of `numba.njit`, e.g. `parallel=True`.
     """
+
+    settings = {"error_model": "numpy", **settings}
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
@@ -38,6 +44,16 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
             return numba.njit(nogil=True, **settings)(function)  # type: ignore[no-any-return]
 
     return decorate
+
+
+def is_on_disk(kernel: Callable[..., Any]) -> bool:
+    """Tell whether the disk has machine code of a compiled function, for whatever arguments."""
+    folder: str | None = kernel.stats.cache_path  # type: ignore[attr-defined]
+    if not folder:
+        return False
+    function = kernel.py_func  # type: ignore[attr-defined]
+    module = function.__module__.rsplit(".", 1)[-1]
+    return any(Path(folder).glob(f"{module}.{function.__qualname__}-*.nbi"))
 
 
 prange: Any = numba.prange

@@ -16,7 +16,7 @@ import numpy as np
 from maplab_py.compilation import compiled
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _conjugate_times(a, b, out):  # type: ignore[no-untyped-def]
     """Quaternion product conj(a) b, [x y z w]."""
     x, y, z, w = -a[0], -a[1], -a[2], a[3]
@@ -26,7 +26,7 @@ def _conjugate_times(a, b, out):  # type: ignore[no-untyped-def]
     out[3] = w * b[3] - x * b[0] - y * b[1] - z * b[2]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _matrix(q, R):  # type: ignore[no-untyped-def]
     x, y, z, w = q[0], q[1], q[2], q[3]
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
@@ -34,7 +34,7 @@ def _matrix(q, R):  # type: ignore[no-untyped-def]
     R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _log(q, angle):  # type: ignore[no-untyped-def]
     sign = -1.0 if q[3] < 0.0 else 1.0
     n = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -44,7 +44,7 @@ def _log(q, angle):  # type: ignore[no-untyped-def]
         angle[i] = sign * factor * q[i]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _curvature(t):  # type: ignore[no-untyped-def]
     """Return b of J^-1 = I -+ K/2 + b K^2, and b'(|t|) / |t|."""
     square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
@@ -61,7 +61,7 @@ def _curvature(t):  # type: ignore[no-untyped-def]
     return b, slope / a
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _residual(A, B, measured, is_log, e, p, q_B_A, y, R, q_A_B, q):  # type: ignore[no-untyped-def]
     """Fill in the residual, p_A_B, the rotation that takes A to B, and R_m^T (p_A_B - p_m).
 
@@ -105,14 +105,14 @@ def relative_pose_errors(T, from_vertex, to_vertex, measured, W, is_log, out):  
             out[edge, i] = total
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _skew(v, K):  # type: ignore[no-untyped-def]
     K[0, 0], K[0, 1], K[0, 2] = 0.0, -v[2], v[1]
     K[1, 0], K[1, 1], K[1, 2] = v[2], 0.0, -v[0]
     K[2, 0], K[2, 1], K[2, 2] = -v[1], v[0], 0.0
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _derivatives(measured, is_log, e, p, q_B_A, y, J_a, J_b, work):  # type: ignore[no-untyped-def]
     """Fill in the derivatives (6, 6) of the residual by [v, w] of A and of B."""
     R_B_A, K, R_m, M, N, D = work
@@ -187,7 +187,7 @@ def relative_pose_jacobians(  # type: ignore[no-untyped-def]
         _whitened(W[edge], e, D_a, D_b, error[edge], J_a[edge], J_b[edge])
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _whitened(W, e, D_a, D_b, error, J_a, J_b):  # type: ignore[no-untyped-def]
     for i in range(6):
         total = 0.0
@@ -208,7 +208,7 @@ QUADRATIC, SWITCHABLE, SCALED, CAUCHY = 0, 1, 2, 3
 """Losses: see `algorithms.relaxation.losses`."""
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _loss(code, u, phi):  # type: ignore[no-untyped-def]
     """Return rho(u), rho'(u)."""
     if code == SWITCHABLE:
@@ -343,7 +343,7 @@ def _clear(blocks, below):  # type: ignore[no-untyped-def]
         blocks[below if below >= 0 else -below - 2] = 0.0
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _ad(x, out):  # type: ignore[no-untyped-def]
     """Fill in ad_x (6, 6) of a twist [v, w]: ad_x y = [w_x x v_y + v_x x w_y, w_x x w_y]."""
     for i in range(6):
@@ -359,7 +359,7 @@ def _ad(x, out):  # type: ignore[no-untyped-def]
     out[5, 3], out[5, 4] = -x[4], x[3]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _dual(f, out):  # type: ignore[no-untyped-def]
     """Fill in C (6, 6) with x^T C y = f^T ad_x y: antisymmetric, as ad_x y = -ad_y x."""
     for i in range(6):
@@ -372,7 +372,7 @@ def _dual(f, out):  # type: ignore[no-untyped-def]
         out[row + 2, col + 0], out[row + 2, col + 1] = b, -a
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _bend(W, E, e, J_a, J_b, room, dual):  # type: ignore[no-untyped-def]
     """Fill room[0], [1], [2] with what second derivatives add to the blocks AA, BB and BA.
 
@@ -433,7 +433,7 @@ def _bend(W, E, e, J_a, J_b, room, dual):  # type: ignore[no-untyped-def]
             AA[i, j] = total
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _solve_six(J_b, J_a, out, work):  # type: ignore[no-untyped-def]
     """Fill in -J_b^-1 J_a (6, 6) by elimination; J_b is near the identity, so without pivoting."""
     for i in range(6):
@@ -454,7 +454,7 @@ def _solve_six(J_b, J_a, out, work):  # type: ignore[no-untyped-def]
             out[i, j] /= work[i, i]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _add_bend(room, w, a, b, below, blocks):  # type: ignore[no-untyped-def]
     for i in range(6):
         for j in range(6):
@@ -468,7 +468,7 @@ def _add_bend(room, w, a, b, below, blocks):  # type: ignore[no-untyped-def]
                 blocks[-below - 2, j, i] += w * room[2, i, j]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _add(J, E, w, block, gradient, diagonal):  # type: ignore[no-untyped-def]
     """Add w J^T J to the lower triangle of a block, its diagonal and w J^T E to the others."""
     for k in range(6):
@@ -481,7 +481,7 @@ def _add(J, E, w, block, gradient, diagonal):  # type: ignore[no-untyped-def]
                 block[i, j] += w * x * J[k, j]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _product(A, B, w, out):  # type: ignore[no-untyped-def]
     """Fill in w A^T B."""
     for i in range(6):

@@ -154,16 +154,15 @@ def search_level(
     hypotheses: str = "gravity",
 ) -> LevelSolutions:
     """Find poses, see `solve_poses`, for those who turn their queries to W once and search often."""
-    from maplab_py.vision.pose_kernels import search_poses, search_poses_without_gravity
+    from maplab_py.vision.pose_kernels import search_poses
 
     count, matches = len(problems.key), len(problems.keypoint)
     R, t, H = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.empty((count, 6, 6))
     cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
     is_inlier = np.zeros(matches, dtype=np.bool_)
     inverse_tilt = 1.0 / tilt_sigma_rad if hypotheses == "gravity" else 0.0
-    search = search_poses if hypotheses == "gravity" else search_poses_without_gravity
-    search(
-        problems.start, _mixed_seeds(problems.key, seed),
+    search_poses(
+        None if hypotheses == "gravity" else True, problems.start, _mixed_seeds(problems.key, seed),
         (
             problems.origin_W, problems.ray_W, problems.point_M, problems.keypoint,
             1.0 / problems.tolerance,

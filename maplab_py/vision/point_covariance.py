@@ -94,7 +94,7 @@ def squared_sigmas(  # type: ignore[no-untyped-def]
     return result
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _quadratic(C, x):  # type: ignore[no-untyped-def]
     """Return x^T C^-1 x by Cramer's rule, C (3, 3) symmetric."""
     a = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]

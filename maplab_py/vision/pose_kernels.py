@@ -13,13 +13,12 @@ from maplab_py.compilation import compiled, prange
 
 _MIN_DEPTH_M = 0.05
 _CONFIDENCE = 0.999
-_MOST_ROOT_STEPS = 40
 _FIRST, _SECOND = (0, 0, 1), (1, 2, 2)  # points of the pairs 01, 02, 12
 _LOOSE = 3.0
 """Hypotheses are scored with as many times the tolerance: their tilt is only as good as given."""
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _next_random(state):  # type: ignore[no-untyped-def]
     """Advance a splitmix64 generator (Steele et al., OOPSLA 2014) and return its next word."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -86,7 +85,7 @@ def _pair_equations(o, f, X, scale, cosine, near, far, offset):  # type: ignore[
         offset[pair] = w @ w - D @ D
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _pair_error(pair, a, b, cosine, near, far, offset):  # type: ignore[no-untyped-def]
     lever = 2.0 * (near[pair] * a - far[pair] * b)
     return a * a + b * b - 2.0 * cosine[pair] * a * b + lever + offset[pair]
@@ -110,39 +109,6 @@ def _eliminant(d, cosine, near, far, offset):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _polynomial_roots(coefficient, root):  # type: ignore[no-untyped-def]
-    """Fill in all roots of a polynomial, lowest coefficient first (Aberth, Math. Comp. 1973)."""
-    degree = len(coefficient) - 1
-    bound = 0.0
-    for k in range(degree):
-        share = abs(coefficient[k] / coefficient[degree])
-        bound = max(bound, share ** (1.0 / (degree - k)))
-    for k in range(degree):
-        angle = 2.0 * np.pi * k / degree + 0.4
-        root[k] = bound * (np.cos(angle) + 1j * np.sin(angle))
-    for _ in range(_MOST_ROOT_STEPS):
-        largest = 0.0
-        for k in range(degree):
-            z = root[k]
-            value, slope = coefficient[degree] + 0.0j, 0.0j
-            for c in range(degree - 1, -1, -1):
-                slope = slope * z + value
-                value = value * z + coefficient[c]
-            if value == 0.0 or slope == 0.0:
-                continue
-            push = 0.0j
-            for other in range(degree):
-                if other != k and root[other] != z:
-                    push += 1.0 / (z - root[other])
-            newton = value / slope
-            step = newton / (1.0 - newton * push)
-            root[k] = z - step
-            largest = max(largest, abs(step) / (1.0 + abs(z)))
-        if largest < 1e-11:
-            break
-
-
-@compiled()
 def _polish_depths(d, cosine, near, far, offset):  # type: ignore[no-untyped-def]
     """Newton on the three equations, in place; return whether they hold afterwards."""
     e, J = np.empty(3), np.zeros((3, 3))
@@ -161,7 +127,7 @@ def _polish_depths(d, cosine, near, far, offset):  # type: ignore[no-untyped-def
     return np.abs(e).max() < 1e-8
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _triad(p, axes):  # type: ignore[no-untyped-def]
     """Fill in the orthonormal axes (columns) that three points span; return whether they do."""
     u, v = p[1] - p[0], p[2] - p[0]
@@ -212,12 +178,10 @@ def three_point(o, f, X, R, t):  # type: ignore[no-untyped-def]
         coefficient[c] = np.mean(values * np.conj(turns) ** c).real
     if abs(coefficient[degree]) <= 1e-13 * np.abs(coefficient).max():
         return 0
-    root = np.empty(degree, dtype=np.complex128)
-    _polynomial_roots(coefficient, root)
     depth = np.empty(3)
     count = 0
-    for k in range(degree):
-        z = np.sqrt(root[k]) if is_central else root[k]
+    for root in np.roots(coefficient[::-1].astype(np.complex128)):
+        z = np.sqrt(root) if is_central else root
         if z.real <= 0.0 or abs(z.imag) > 1e-2 * z.real:
             continue
         _other_depths(z.real, cosine, near, far, offset, depth)
@@ -251,14 +215,14 @@ def _other_depths(d, cosine, near, far, offset, depth):  # type: ignore[no-untyp
 
 
 @compiled()
-def _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, best_match):  # type: ignore[no-untyped-def]
+def _score(R, t, origin, ray, point, keypoint, inverse_sigma, best_match):  # type: ignore[no-untyped-def]
     """Return the MSAC cost of a pose and the number of inlying keypoints.
 
     Of a keypoint's candidate points only the best counts; `best_match` (one per match row) marks
     it where it is an inlier. Errors are in units of the threshold.
     """
     cost, inliers = 0.0, 0
-    i = begin
+    i, end = 0, len(keypoint)
     while i < end:
         best, best_row = 1.0, -1
         j = i
@@ -284,7 +248,7 @@ def _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, best_m
     return cost, inliers
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _across(ray, first, second):  # type: ignore[no-untyped-def]
     """Fill in two unit vectors across a unit ray (Duff et al., Building an Orthonormal Basis)."""
     sign = 1.0 if ray[2] >= 0.0 else -1.0
@@ -294,7 +258,7 @@ def _across(ray, first, second):  # type: ignore[no-untyped-def]
     second[0], second[1], second[2] = b, sign + ray[1] * ray[1] * a, -ray[1]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _add_row(row, e, H, g):  # type: ignore[no-untyped-def]
     """Add a row of the Jacobian to the upper triangle of H and to g."""
     for i in range(6):
@@ -304,7 +268,7 @@ def _add_row(row, e, H, g):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g):  # type: ignore[no-untyped-def]
+def _accumulate(R, t, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g):  # type: ignore[no-untyped-def]
     """Fill in the normal equations of the bearing errors in [dp (M), dtheta (W)].
 
     The error is the unit vector d to the point along two directions b across the ray; with
@@ -314,7 +278,7 @@ def _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inver
     g[:] = 0.0
     row, q, d, c = np.empty(6), np.empty(3), np.empty(3), np.empty(3)
     directions = np.empty((2, 3))
-    for j in range(begin, end):
+    for j in range(len(used)):
         if not used[j]:
             continue
         x, y, z = point[j, 0] - t[0], point[j, 1] - t[1], point[j, 2] - t[2]
@@ -350,60 +314,97 @@ def _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inver
 @compiled()
 def _retract(R, t, step):  # type: ignore[no-untyped-def]
     """Apply [dp, dtheta] in place: t <- t + dp, R <- R exp(dtheta)."""
-    t += step[:3]
     x, y, z = step[3], step[4], step[5]
     angle = np.sqrt(x * x + y * y + z * z)
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
     b = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    R[:] = R @ (np.eye(3) + a * K + b * (K @ K))
+    c = 1.0 - b * angle * angle
+    for i in range(3):
+        t[i] += step[i]
+        u, v, w = R[i, 0], R[i, 1], R[i, 2]
+        along = b * (u * x + v * y + w * z)
+        R[i, 0] = c * u + along * x + a * (v * z - w * y)
+        R[i, 1] = c * v + along * y + a * (w * x - u * z)
+        R[i, 2] = c * w + along * z + a * (u * y - v * x)
 
 
 @compiled()
-def _refine(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, iterations, H):  # type: ignore[no-untyped-def]
+def _solve(H, g, L, step):  # type: ignore[no-untyped-def]
+    """Fill in step = -H^-1 g (6,) by Cholesky's factor of H scaled to a diagonal of one plus 1e-9.
+
+    L (6, 6) is room to work in. Returns False where H has a zero on its diagonal.
+    """
+    for i in range(6):
+        if H[i, i] <= 0.0:
+            return False
+        for j in range(i + 1):
+            total = H[i, j] / np.sqrt(H[i, i] * H[j, j])
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = total / L[j, j] if i != j else np.sqrt(max(total, 0.0) + 1e-9)
+    for i in range(6):
+        total = -g[i] / np.sqrt(H[i, i])
+        for k in range(i):
+            total -= L[i, k] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(5, -1, -1):
+        total = step[i]
+        for k in range(i + 1, 6):
+            total -= L[k, i] * step[k]
+        step[i] = total / L[i, i]
+    for i in range(6):
+        step[i] /= np.sqrt(H[i, i])
+    return True
+
+
+@compiled()
+def _refine(R, t, origin, ray, point, inverse_sigma, used, inverse_tilt, iterations, H):  # type: ignore[no-untyped-def]
     """Gauss-Newton on the used matches, in place; return False when it is not determined."""
-    g = np.empty(6)
+    g, L, step = np.empty(6), np.empty((6, 6)), np.empty(6)
     for _ in range(iterations):
-        _accumulate(R, t, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g)
-        scale = np.sqrt(np.diag(H))
-        if scale.min() <= 0.0:
+        _accumulate(R, t, origin, ray, point, inverse_sigma, used, inverse_tilt, H, g)
+        if not _solve(H, g, L, step):
             return False
-        scaled = H / np.outer(scale, scale)
+        largest = 0.0
         for i in range(6):
-            scaled[i, i] += 1e-9
-        step = -np.linalg.solve(scaled, g / scale) / scale
-        if not np.all(np.isfinite(step)) or np.abs(step[3:]).max() > 0.5:
-            return False
+            if not abs(step[i]) < (0.5 if i >= 3 else np.inf):
+                return False
+            largest = max(largest, abs(step[i]))
         _retract(R, t, step)
-        if np.abs(step).max() < 1e-9:
+        if largest < 1e-9:
             break
     return True
 
 
 @compiled()
+def _copy_pose(R, t, R_to, t_to):  # type: ignore[no-untyped-def]
+    for i in range(3):
+        t_to[i] = t[i]
+        for j in range(3):
+            R_to[i, j] = R[i, j]
+
+
+@compiled()
 def _polish(  # type: ignore[no-untyped-def]
-    R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, used, inverse_tilt, rounds
+    R, t, origin, ray, point, keypoint, inverse_sigma, used, inverse_tilt, rounds
 ):
     """Alternate refinement and choice of inliers while the cost falls; return cost and inliers."""
-    cost, inliers = _score(R, t, begin, end, origin, ray, point, keypoint, inverse_sigma, used)
-    H = np.empty((6, 6))
-    trial = np.zeros_like(used)
+    cost, inliers = _score(R, t, origin, ray, point, keypoint, inverse_sigma, used)
+    H, R_new, t_new = np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
+    trial = np.zeros(len(used), dtype=np.bool_)
     for _ in range(rounds):
         if inliers < 3:
             break
-        R_new, t_new = R.copy(), t.copy()
-        if not _refine(
-            R_new, t_new, begin, end, origin, ray, point, inverse_sigma, used, inverse_tilt, 3, H
-        ):
+        _copy_pose(R, t, R_new, t_new)
+        if not _refine(R_new, t_new, origin, ray, point, inverse_sigma, used, inverse_tilt, 3, H):
             break
-        new_cost, new_inliers = _score(
-            R_new, t_new, begin, end, origin, ray, point, keypoint, inverse_sigma, trial
-        )
-        if new_cost >= cost:
+        rest = _score(R_new, t_new, origin, ray, point, keypoint, inverse_sigma, trial)
+        if rest[0] >= cost:
             break
-        cost, inliers = new_cost, new_inliers
-        R[:], t[:] = R_new, t_new
-        used[begin:end] = trial[begin:end]
+        cost, inliers = rest
+        _copy_pose(R_new, t_new, R, t)
+        for j in range(len(used)):
+            used[j] = trial[j]
     return cost, inliers
 
 
@@ -412,8 +413,8 @@ def _draw(state, sample, three, k, o, f, X, R, t):  # type: ignore[no-untyped-de
     """Fill in the poses of a random sample; `three` None leaves the three-point solver uncompiled."""
     for i in range(len(sample)):
         sample[i] = np.int64(_next_random(state) % np.uint64(len(k)))
-        for other in sample[:i]:
-            if k[other] == k[sample[i]]:
+        for j in range(i):
+            if k[sample[j]] == k[sample[i]]:
                 return 0
     if three is not None:
         return three_point(o[sample], f[sample], X[sample], R, t)
@@ -422,22 +423,31 @@ def _draw(state, sample, three, k, o, f, X, R, t):  # type: ignore[no-untyped-de
     count = _two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, t)
     for s in range(count):
         cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
-        R[s] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        R[s, 0, 0], R[s, 0, 1], R[s, 0, 2] = cos, -sin, 0.0
+        R[s, 1, 0], R[s, 1, 1], R[s, 1, 2] = sin, cos, 0.0
+        R[s, 2, 0], R[s, 2, 1], R[s, 2, 2] = 0.0, 0.0, 1.0
     return count
 
 
 @compiled()
-def _search_pose(  # type: ignore[no-untyped-def]
-    seed, o, f, X, k, w, max_iterations, inverse_tilt, three, best_R, best_t, H, best_used
-):
-    """Search one pose, fill in R, t, H and inliers; return cost, inlying keypoints and samples."""
+def _search_pose(i, three, start, seeds, data, settings, R_all, t_all, H_all, found, is_inlier):  # type: ignore[no-untyped-def]
+    """Search one pose; fill in R, t, H and inliers, and what it cost, inlying keypoints, samples."""
+    a, b = start[i], start[i + 1]
+    o, f, X, k, w = data[0][a:b], data[1][a:b], data[2][a:b], data[3][a:b], data[4][a:b]
+    max_iterations, inverse_tilt = settings
+    best_R, best_t, H, best_used = R_all[i], t_all[i], H_all[i], is_inlier[a:b]
     count = len(k)
-    keypoints = min(count, 1) + np.count_nonzero(k[1:] != k[:-1])
-    state = np.array([seed], dtype=np.uint64)
+    keypoints = min(count, 1)
+    w_loose = np.empty(count)
+    for j in range(count):
+        w_loose[j] = w[j] / _LOOSE
+        if j > 0 and k[j] != k[j - 1]:
+            keypoints += 1
+    state = np.empty(1, dtype=np.uint64)
+    state[0] = seeds[i]
     used = np.zeros(count, dtype=np.bool_)
     best_cost, best_inliers = float(keypoints), 0
     best_loose = best_cost
-    w_loose = w / _LOOSE
     R_guess, t_guess = np.empty((8, 3, 3)), np.empty((8, 3))
     R, t = np.empty((3, 3)), np.empty(3)
     needed, done = max_iterations, 0
@@ -445,19 +455,20 @@ def _search_pose(  # type: ignore[no-untyped-def]
     while done < needed and keypoints >= 3:
         done += 1
         for s in range(_draw(state, sample, three, k, o, f, X, R_guess, t_guess)):
-            R[:], t[:] = R_guess[s], t_guess[s]
-            cost, inliers = _score(R, t, 0, count, o, f, X, k, w_loose, used)
+            _copy_pose(R_guess[s], t_guess[s], R, t)
+            cost, inliers = _score(R, t, o, f, X, k, w_loose, used)
             if cost >= best_loose or inliers < 3:
                 continue
             best_loose = cost
-            if not _refine(R, t, 0, count, o, f, X, w_loose, used, inverse_tilt, 3, H):
+            if not _refine(R, t, o, f, X, w_loose, used, inverse_tilt, 3, H):
                 continue
-            cost, inliers = _polish(R, t, 0, count, o, f, X, k, w, used, inverse_tilt, 2)
+            cost, inliers = _polish(R, t, o, f, X, k, w, used, inverse_tilt, 2)
             if cost >= best_cost:
                 continue
             best_cost, best_inliers = cost, inliers
-            best_R[:], best_t[:] = R, t
-            best_used[:] = used
+            _copy_pose(R, t, best_R, best_t)
+            for j in range(count):
+                best_used[j] = used[j]
             miss = 1.0 - (inliers / count) ** len(sample)
             if miss < 1e-9:
                 needed = done
@@ -467,32 +478,20 @@ def _search_pose(  # type: ignore[no-untyped-def]
     H[:] = 0.0
     if best_inliers >= 3:
         best_cost, best_inliers = _polish(
-            best_R, best_t, 0, count, o, f, X, k, w, best_used, inverse_tilt, 10
+            best_R, best_t, o, f, X, k, w, best_used, inverse_tilt, 10
         )
         g = np.empty(6)
-        _accumulate(best_R, best_t, 0, count, o, f, X, w, best_used, inverse_tilt, H, g)
-    return best_cost, best_inliers, done
-
-
-@compiled()
-def _search_problem(i, three, start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
-    a, b = start[i], start[i + 1]
-    o, f, X, k, w = data
-    found[0][i], found[1][i], found[2][i] = _search_pose(
-        seeds[i], o[a:b], f[a:b], X[a:b], k[a:b], w[a:b], settings[0], settings[1], three,
-        R[i], t[i], H[i], is_inlier[a:b],
-    )  # fmt: skip
+        _accumulate(best_R, best_t, o, f, X, w, best_used, inverse_tilt, H, g)
+    found[0][i], found[1][i], found[2][i] = best_cost, best_inliers, done
 
 
 @compiled(parallel=True)
-def search_poses(start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
-    """Search every problem's pose from two matches, sorted by problem and keypoint, and gravity."""
-    for i in prange(len(start) - 1):
-        _search_problem(i, None, start, seeds, data, settings, R, t, H, found, is_inlier)
+def search_poses(three, start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
+    """Search the pose of every problem, matches sorted by problem and keypoint.
 
-
-@compiled(parallel=True)
-def search_poses_without_gravity(start, seeds, data, settings, R, t, H, found, is_inlier):  # type: ignore[no-untyped-def]
-    """Search the pose of every problem from three matches, see `search_poses`."""
-    for i in prange(len(start) - 1):
-        _search_problem(i, True, start, seeds, data, settings, R, t, H, found, is_inlier)
+    `three` None: from two matches and gravity. True: from three matches.
+    """
+    for problem in prange(len(start) - 1):
+        _search_pose(
+            np.int64(problem), three, start, seeds, data, settings, R, t, H, found, is_inlier
+        )

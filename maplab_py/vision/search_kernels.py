@@ -11,7 +11,7 @@ import numpy as np
 from maplab_py.compilation import compiled, prange
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _popcount(x):  # type: ignore[no-untyped-def]
     """Return the number of set bits of a 64-bit word (SWAR, which LLVM turns into popcnt)."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -20,7 +20,7 @@ def _popcount(x):  # type: ignore[no-untyped-def]
     return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _different_bits(a, i, b, j):  # type: ignore[no-untyped-def]
     # indices, as taking rows out would count references: that costs more than the comparison
     bits = np.uint64(0)
@@ -53,7 +53,7 @@ def _insert(row, distance, labels, candidate, label, value):  # type: ignore[no-
     row[place], distance[place], labels[place] = candidate, value, label
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _allowed(q_label, q_session, q_time, d_label, d_session, d_time, min_time, others_only):  # type: ignore[no-untyped-def]
     if d_label == q_label and q_label >= 0:
         return False
@@ -103,7 +103,7 @@ def _nearest_first(distance, order):  # type: ignore[no-untyped-def]
         order[place] = word
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type: ignore[no-untyped-def]
     """Return the rank of the next word of a in the multi-sequence walk, -1 at its end.
 
@@ -118,7 +118,7 @@ def _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach):  # type
     return best
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _squared_distance(a, i, b, j, limit):  # type: ignore[no-untyped-def]
     """Return the squared distance, or only a part of it where that reaches the limit already."""
     total = np.float32(0.0)

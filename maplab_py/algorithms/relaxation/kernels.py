@@ -50,14 +50,14 @@ def moved(T, vertices, twist):  # type: ignore[no-untyped-def]
     return result
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _cross(a, b, out):  # type: ignore[no-untyped-def]
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _tilt(q, measured, e, J):  # type: ignore[no-untyped-def]
     """Fill in (R_m d)_xy (2,) with d = Log(R_m^T R), and its derivative (2, 3) by w of R exp(w)."""
     x, y, z, w = -measured[0], -measured[1], -measured[2], measured[3]

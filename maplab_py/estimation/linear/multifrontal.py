@@ -227,7 +227,8 @@ def _clear_triangle(matrix: F64) -> None:
 @compiled()
 def _copy_triangle(matrix: F64, result: F64) -> None:
     for col in range(len(matrix)):
-        result[col, col:] = matrix[col, col:]
+        for row in range(col, len(matrix)):
+            result[col, row] = matrix[col, row]
 
 
 @compiled()
@@ -387,7 +388,9 @@ def invert_panels(plan: FrontPlan, factor: F64, stack: F64, blas: Blas) -> F64:
         panel = factor[plan.panel_start[s] :]
         z = _invert_front(blas, panel, w, n, z22)
         own_panel = inverse[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(w, w + n)
-        own_panel[:] = z[:w]
+        for i in range(w):
+            for j in range(w + n):
+                own_panel[i, j] = z[i, j]
         for child in children[child_start[s] : child_start[s + 1]]:
             place = plan.below_in_parent[plan.below_start[child] : plan.below_start[child + 1]]
             rows = len(place) * d
@@ -414,10 +417,15 @@ def _invert_front(blas: Blas, panel: F64, w: int, n: int, z22: F64) -> F64:
         _multiply(blas, (n, w, w), PLAIN, panel[w:], w + n, unit, w, ONE, ZERO, y, n)
         _multiply(blas, (n, w, n), PLAIN, z22.reshape(-1), n, y, n, MINUS_ONE, ZERO, z21, n)
         _multiply(blas, (w, w, n), TRANSPOSED, y, n, z21, n, MINUS_ONE, ONE, z11.reshape(-1), w)
-        z[:w, w:] = z21.reshape(w, n)
-        z[w:, :w] = z21.reshape(w, n).T
-        z[w:, w:] = z22
-    z[:w, :w] = 0.5 * (z11 + z11.T)
+        for i in range(w):
+            for j in range(n):
+                z[i, w + j] = z[w + j, i] = z21[i * n + j]
+        for i in range(n):
+            for j in range(n):
+                z[w + i, w + j] = z22[i, j]
+    for i in range(w):
+        for j in range(w):
+            z[i, j] = 0.5 * (z11[i, j] + z11[j, i])
     return z
 
 

@@ -80,7 +80,7 @@ def _eliminate(rows, cols, num_nodes):  # type: ignore[no-untyped-def]
     return order
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _count_word(x):  # type: ignore[no-untyped-def]
     """Return how many bits of a word are set."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -89,7 +89,7 @@ def _count_word(x):  # type: ignore[no-untyped-def]
     return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _count(row):  # type: ignore[no-untyped-def]
     total = 0
     for word in row:

@@ -55,7 +55,7 @@ def solve_single(plan: FrontPlan, factor: F64, right_side: F64) -> F64:
     return result
 
 
-@compiled(inline="always")
+@compiled(forceinline=True)
 def _parts(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> Any:
     """Return node size, columns w, nodes below, panel (w, w + rows below), x1 and room for x2."""
     d = plan.node_size

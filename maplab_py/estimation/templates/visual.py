@@ -48,7 +48,7 @@ def add_pose(out, n, k, Y, square, grad, diag):
             square[k, c, e] += a * out[3 + 2 * e] + b * out[4 + 2 * e]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def step_landmark(h, f, g, d):
     """Solve H d = -g with the factor f of the damped H; return the decrease that d promises."""
     z0 = g[0] * f[0]

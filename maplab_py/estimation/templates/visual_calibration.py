@@ -19,7 +19,7 @@ from the states instead of from the neighbouring image).
 # ruff: noqa: F821
 # mypy: ignore-errors
 # --- kernels ---
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def add_time_offset(out, uv_motion, time_offset, o, c):
     """Shift the residual by the time offset and write its column."""
     out[0] += uv_motion[o, 0] * time_offset[c, 0]
@@ -77,7 +77,7 @@ def subtract_cameras(
                     square[c, d, w, x] -= y0 * V[t, 0, x] + y1 * V[t, 1, x] + y2 * V[t, 2, x]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def slot_of(camera, cameras, count):
     """Return the place of a camera among those of the landmark, or `count` for a new one."""
     for s in range(count):

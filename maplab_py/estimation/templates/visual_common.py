@@ -12,7 +12,7 @@ LARGEST_DAMPED = 1e32
 NONE, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, DCS = 0, 1, 2, 3, 4, 5
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def robust(kind, s, c2):
     """Return rho(s) and its derivative for the squared residual s and squared scale c2."""
     if kind == HUBER:
@@ -38,7 +38,7 @@ def robust(kind, s, c2):
     return s, 1.0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def weighted(out, inverse_sigma, loss_kind, scale2):
     """Whiten residual and Jacobian in `out` and apply the robust weight; return rho."""
     s = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma * inverse_sigma
@@ -51,13 +51,13 @@ def weighted(out, inverse_sigma, loss_kind, scale2):
     return rho
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def damped(h, damping):
     """Return a diagonal entry of H after Levenberg-Marquardt damping, clamped as Ceres does."""
     return h + damping * min(max(h, SMALLEST_DAMPED), LARGEST_DAMPED)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def factor_3x3(h, damping, f):
     """Cholesky of the damped 3 x 3 matrix h = [00 10 11 20 21 22] into f (inverse diagonal)."""
     a0, a1, a2 = damped(h[0], damping), damped(h[2], damping), damped(h[5], damping)
@@ -69,7 +69,7 @@ def factor_3x3(h, damping, f):
     f[5] = 1.0 / math.sqrt(max(a2 - f[3] * f[3] - f[4] * f[4], 1e-14 * a2))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def add_landmark_sums(out, h, g):
     """Add Q'Q of one observation to h (6 entries, lower) and Q'r to g."""
     a0, b0, a1, b1, a2, b2 = out[15], out[16], out[17], out[18], out[19], out[20]
@@ -84,7 +84,7 @@ def add_landmark_sums(out, h, g):
     g[2] += a2 * out[0] + b2 * out[1]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def begin_landmark(points, prior, landmark, h, g):
     """Set h and g to the landmark's prior [place, weight], zero without one; return its rho."""
     h[:] = 0.0
