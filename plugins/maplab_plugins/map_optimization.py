@@ -59,7 +59,7 @@ def optimize_visual(
 @command("warmup", example="warmup", needs_map=False, acts_outside=True)
 def warmup(context: CommandContext) -> WarmupReport:
     """Compile every numeric kernel now, so that no later command waits for it."""
-    from maplab_py.algorithms.vi_optimization.warmup import compile_kernels
+    from maplab_py.algorithms.warmup import compile_kernels
 
     kernels, seconds, folder = compile_kernels(context.progress)
     return WarmupReport(kernels, seconds, folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shlex
 import tempfile
@@ -12,12 +13,17 @@ from typing import TYPE_CHECKING
 from maplab_py.plugin import CommandContext, EstimationError, Report, UserError, command
 
 if TYPE_CHECKING:
+    from maplab_py.algorithms.warmup import CompilationAhead
     from maplab_py.simulation.evaluation import MapErrors
+    from maplab_py.simulation.scenario import Scenario
 
 TRUTH_FILE = "truth.npz"
 
 _DEMO_SCENARIO = "three_sessions"
 _DEMO_KEY = "demo"
+_AHEAD = ("descriptor search", "absolute pose", "relaxation")
+_NEEDS = {"anchor_all_missions": "absolute pose", "relax": "relaxation"}
+"""What is compiled while the sessions are optimised one by one, and which command waits for it."""
 _MAX_ATE_RATIO = 0.25
 _MAX_OFFSET_M = 0.05
 _MAX_YAW_DEG = 0.3
@@ -206,14 +212,29 @@ def demo(
         seed: Seed of the simulation.
         overwrite: Replace a map that is there already.
     """
-    from maplab_py.simulation.evaluation import evaluate_map as evaluate
+    from maplab_py.algorithms.warmup import CompilationAhead
     from maplab_py.simulation.scenario_file import load_scenario
-    from maplab_py.simulation.simulate import simulate as simulate_maps
-    from maplab_py.storage.native import save_map
 
     _refuse_used_folder(map_folder, overwrite=overwrite)
     context.maps.check_new_key(_DEMO_KEY)
     scenario = load_scenario(_DEMO_SCENARIO).with_seed(_checked_seed(seed))
+    with contextlib.closing(CompilationAhead(_AHEAD)) as ahead:
+        return _demonstrate(context, scenario, map_folder, ahead, overwrite=overwrite)
+
+
+def _demonstrate(
+    context: CommandContext,
+    scenario: Scenario,
+    map_folder: Path,
+    ahead: CompilationAhead,
+    *,
+    overwrite: bool,
+) -> DemoReport:
+    """Run the workflow, each command as soon as its kernels are compiled."""
+    from maplab_py.simulation.evaluation import evaluate_map as evaluate
+    from maplab_py.simulation.simulate import simulate as simulate_maps
+    from maplab_py.storage.native import save_map
+
     start = time.perf_counter()
     with context.terminal.progress("simulate") as progress:
         data = simulate_maps(scenario, progress=progress)
@@ -227,7 +248,8 @@ def demo(
         steps.append(_run(context, f"{load} --target_map_key={_DEMO_KEY}"))
     before = evaluate(context.session.vi_map, data.truth)
     first = before.missions[0].mission
-    steps += [_run(context, line) for line in _workflow(first, map_folder, overwrite=overwrite)]
+    workflow = _workflow(first, map_folder, overwrite=overwrite)
+    steps += [_run(context, line, ahead) for line in workflow]
     after = evaluate(context.session.vi_map, data.truth)
     return _demo_report(tuple(steps), before, after, map_folder)
 
@@ -246,8 +268,8 @@ def _workflow(first_mission: str, map_folder: Path, *, overwrite: bool) -> tuple
     )
 
 
-def _run(context: CommandContext, line: str) -> DemoStep:
-    """Run one line of the workflow as if it had been typed.
+def _run(context: CommandContext, line: str, ahead: CompilationAhead | None = None) -> DemoStep:
+    """Run one line of the workflow as if it had been typed; waits for its kernels.
 
     Raises:
         EstimationError: The command ran but reports a failure.
@@ -255,6 +277,8 @@ def _run(context: CommandContext, line: str) -> DemoStep:
     context.progress.line(f"> {line}")
     call = context.session.parse(shlex.split(line))
     start = time.perf_counter()
+    if ahead is not None and call.command.name in _NEEDS:
+        ahead.wait(_NEEDS[call.command.name], context.progress)
     report = context.session.execute(call)
     if report.failure:
         raise EstimationError(f"{call.command.name}: {report.failure}")

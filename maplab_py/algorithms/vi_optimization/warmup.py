@@ -1,12 +1,10 @@
-"""Compile the kernels of optimiser and place recognition by running each once on tiny problems."""
+"""Compile the kernels of the optimiser by running each once on a tiny problem."""
 
 from __future__ import annotations
 
 import itertools
-import multiprocessing
-import os
-import time
-from concurrent.futures import ProcessPoolExecutor, wait
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from maplab_py.estimation.codegen.kernels import (
     residual_kernel,
     visual_kernels,
 )
-from maplab_py.estimation.codegen.modules import cache_folder
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
@@ -24,10 +21,8 @@ from maplab_py.estimation.states import States
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.visual_terms import Cameras, Observations, VisualTerms
 from maplab_py.geometry import se3
-from maplab_py.progress import Progress
 from maplab_py.sensors import Distortion, Imu, Projection
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
-from maplab_py.vision.warmup import compile_poses, compile_search
 
 _FACTORS = {  # name: its source, inputs, residual size, Jacobian columns
     "inertial": (sources.inertial, 100, 9, 24),
@@ -40,57 +35,24 @@ _FACTORS = {  # name: its source, inputs, residual size, Jacobian columns
 }
 
 
-_LINEAR, _INTEGRATION = "block Cholesky", "preintegration"
-_REPROJECTION, _CALIBRATION = "reprojection", "camera calibration"
-_RECOGNITION = {"descriptor search": compile_search, "absolute pose": compile_poses}
-
-
-def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
-    """Compile all kernels; return their names, the time it took [s], and the cache folder.
-
-    Several processes compile at a time; what they make is shared through the cache folder.
-    """
-    began = time.perf_counter()
-    jobs = [*_FACTORS, _LINEAR, _INTEGRATION, *_RECOGNITION]
+def optimizer_jobs() -> dict[str, Callable[[], None]]:
+    """Return by name what compiles one kernel each."""
+    jobs: dict[str, Callable[[], None]] = {name: partial(_run_factor, name) for name in _FACTORS}
+    jobs["block Cholesky"] = _run_linear
+    jobs["preintegration"] = _run_integration
     for projection, distortion in itertools.product(Projection, Distortion):
         model = f"{projection.name} {distortion.name}"
-        jobs += [f"{_REPROJECTION} {model}", f"{_CALIBRATION} {model}"]
-    workers = min(len(jobs), os.cpu_count() or 1)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        pending = {pool.submit(_compile, job) for job in reversed(jobs)}
-        try:
-            while pending:
-                progress.step(len(jobs) - len(pending), len(jobs), "compile kernels")
-                done, pending = wait(pending, timeout=0.2)
-                for future in done:
-                    future.result()
-        finally:
-            for future in pending:
-                future.cancel()
-    progress.step(len(jobs), len(jobs), "compile kernels")
-    return [job.lower() for job in jobs], time.perf_counter() - began, str(cache_folder())
+        run = partial(_run_visual, projection, distortion)
+        jobs[f"reprojection {model}"] = partial(run, calibrating=False)
+        jobs[f"camera calibration {model}"] = partial(run, calibrating=True)
+    return jobs
 
 
-def _compile(job: str) -> None:
-    """Compile one kernel, in a process of its own."""
-    if job in _FACTORS:
-        source, inputs, size, columns = _FACTORS[job]
-        kernel = residual_kernel(job, source)
-        kernel.evaluate(
-            np.ones((1, inputs)), np.eye(size)[None], np.empty((1, size)),
-            np.empty((1, size, columns)),
-        )  # fmt: skip
-    elif job in _RECOGNITION:
-        _RECOGNITION[job]()
-    elif job == _LINEAR:
-        _run_linear()
-    elif job == _INTEGRATION:
-        _run_integration()
-    else:
-        kind, projection, distortion = job.rsplit(" ", 2)
-        is_calibrating = kind == _CALIBRATION
-        _run_visual(Projection[projection], Distortion[distortion], calibrating=is_calibrating)
+def _run_factor(name: str) -> None:
+    source, inputs, size, columns = _FACTORS[name]
+    residual_kernel(name, source).evaluate(
+        np.ones((1, inputs)), np.eye(size)[None], np.empty((1, size)), np.empty((1, size, columns))
+    )
 
 
 def _run_visual(

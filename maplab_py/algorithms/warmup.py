@@ -1,0 +1,118 @@
+"""Compile kernels before anybody waits for them: all at once, or while other work is done."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
+from typing import IO
+
+from maplab_py.algorithms.relaxation.warmup import compile_relaxation
+from maplab_py.algorithms.vi_optimization.warmup import optimizer_jobs
+from maplab_py.compilation import is_on_disk
+from maplab_py.estimation.codegen.modules import cache_folder
+from maplab_py.estimation.relative_pose_kernels import normal_equations
+from maplab_py.progress import Progress
+from maplab_py.vision.pose_kernels import search_poses
+from maplab_py.vision.search_kernels import search_cells
+from maplab_py.vision.warmup import compile_poses, compile_search
+
+SEARCH, POSES, RELAXATION = "descriptor search", "absolute pose", "relaxation"
+_SAMPLES = {SEARCH: search_cells, POSES: search_poses, RELAXATION: normal_equations}
+
+
+def _jobs() -> dict[str, Callable[[], None]]:
+    others = {SEARCH: compile_search, POSES: compile_poses, RELAXATION: compile_relaxation}
+    return {**optimizer_jobs(), **others}
+
+
+def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
+    """Compile all kernels; return their names, the time it took [s], and the cache folder.
+
+    Several processes compile at a time; what they make is shared through the cache folder.
+    """
+    began = time.perf_counter()
+    jobs = list(_jobs())
+    workers = min(len(jobs), os.cpu_count() or 1)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        pending = {pool.submit(_compile, job) for job in reversed(jobs)}
+        try:
+            while pending:
+                progress.step(len(jobs) - len(pending), len(jobs), "compile kernels")
+                done, pending = wait(pending, timeout=0.2)
+                for future in done:
+                    future.result()
+        finally:
+            for future in pending:
+                future.cancel()
+    progress.step(len(jobs), len(jobs), "compile kernels")
+    return [job.lower() for job in jobs], time.perf_counter() - began, str(cache_folder())
+
+
+def _compile(job: str) -> None:
+    """Compile one kernel, in a process of its own."""
+    _jobs()[job]()
+
+
+class CompilationAhead:
+    """A process that compiles kernels, one job after the other, for work that is still to come.
+
+    It is a process and not a thread because numba compiles one function at a time. Should it fail,
+    whoever needs the kernels compiles them as if it had never been.
+    """
+
+    def __init__(self, jobs: Sequence[str]) -> None:
+        """Start; jobs whose kernels are on the disk are left out, and all on a single core."""
+        wanted = [job for job in jobs if not is_on_disk(_SAMPLES[job])]
+        self._done = {job: threading.Event() for job in wanted}
+        self._process: subprocess.Popen[str] | None = None
+        if not wanted or (os.cpu_count() or 1) < 2:
+            self._release()
+            return
+        code = f"from {__name__} import compile_and_tell; compile_and_tell({wanted!r})"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        self._reader = threading.Thread(target=self._read, args=(self._process.stdout,))
+        self._reader.start()
+
+    def wait(self, job: str, progress: Progress) -> None:
+        """Wait until a job is done or the process has ended; raises Cancelled as `progress` does."""
+        done = self._done.get(job)
+        while done is not None and not done.wait(0.1):
+            progress.check()
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        if self._process is not None:
+            self._process.kill()
+            self._reader.join()
+            self._process.communicate()
+
+    def _read(self, names: IO[str]) -> None:
+        for line in names:
+            if line.strip() in self._done:
+                self._done[line.strip()].set()
+        self._release()
+
+    def _release(self) -> None:
+        for event in self._done.values():
+            event.set()
+
+
+def compile_and_tell(jobs: Sequence[str]) -> None:
+    """Compile the kernels of some jobs; print the name of each when it is done."""
+    for job in jobs:
+        _compile(job)
+        sys.stdout.write(f"{job}\n")
+        sys.stdout.flush()

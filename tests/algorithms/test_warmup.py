@@ -1,0 +1,95 @@
+"""Kernels that are compiled before anybody waits for them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import pytest
+
+from maplab_py.algorithms import warmup
+from maplab_py.algorithms.relaxation import kernels
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax
+from maplab_py.algorithms.relaxation.warmup import compile_relaxation
+from maplab_py.algorithms.warmup import CompilationAhead
+from maplab_py.compilation import compiled, is_on_disk
+from maplab_py.errors import Cancelled
+from maplab_py.estimation import relative_pose_kernels
+from maplab_py.estimation.linear import multifrontal
+from maplab_py.progress import SILENT, SilentProgress
+from tests.algorithms.relaxation.loops import simulate
+
+
+def test_a_relaxation_compiles_nothing_after_the_warmup():
+    compile_relaxation()
+    used = (
+        kernels.moved,
+        kernels.add_tilt,
+        kernels.connected_parts,
+        relative_pose_kernels.normal_equations,
+        relative_pose_kernels.robust_cost,
+        relative_pose_kernels.relative_pose_jacobians,
+        multifrontal.factorise,
+        multifrontal.invert_panels,
+    )
+    before = [list(kernel.signatures) for kernel in used]
+    assert all(before)
+    loop = simulate(0)
+    relax(loop.vi_map, RelaxationOptions(), loop_closures=loop.closures)
+    assert [list(kernel.signatures) for kernel in used] == before
+
+
+def test_the_disk_knows_what_was_compiled():
+    compile_relaxation()
+    assert is_on_disk(kernels.moved)
+
+    @compiled()
+    def never_called(x):  # type: ignore[no-untyped-def]
+        return x
+
+    assert not is_on_disk(never_called)
+
+
+def test_jobs_are_done_by_another_process(monkeypatch, capfd):
+    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with contextlib.closing(CompilationAhead((warmup.RELAXATION,))) as ahead:
+        process = ahead._process
+        assert process is not None
+        ahead.wait(warmup.RELAXATION, SILENT)
+        assert process.wait(60.0) == 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_process_that_dies_holds_nobody_up(monkeypatch):
+    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with contextlib.closing(CompilationAhead((warmup.SEARCH, warmup.POSES))) as ahead:
+        assert ahead._process is not None
+        ahead._process.kill()
+        ahead.wait(warmup.POSES, SILENT)
+
+
+def test_waiting_can_be_cancelled_and_ends_the_process(monkeypatch):
+    class Impatient(SilentProgress):
+        def check(self) -> None:
+            raise Cancelled("enough")
+
+    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    ahead = CompilationAhead((warmup.RELAXATION,))
+    process = ahead._process
+    assert process is not None
+    with pytest.raises(Cancelled), contextlib.closing(ahead):
+        ahead.wait(warmup.RELAXATION, Impatient())
+    assert process.returncode is not None
+
+
+@pytest.mark.parametrize(("cores", "stored"), [(1, False), (2, True)])
+def test_no_process_for_a_single_core_or_what_is_on_the_disk(monkeypatch, cores, stored):
+    monkeypatch.setattr(warmup, "is_on_disk", lambda _: stored)
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    with contextlib.closing(CompilationAhead((warmup.SEARCH,))) as ahead:
+        assert ahead._process is None
+        ahead.wait(warmup.SEARCH, SILENT)
