@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from functools import partial
 from typing import IO
 
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
@@ -18,17 +19,20 @@ from maplab_py.compilation import is_on_disk
 from maplab_py.estimation.codegen.modules import cache_folder
 from maplab_py.estimation.relative_pose_kernels import normal_equations
 from maplab_py.progress import Progress
+from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.pose_kernels import search_poses
 from maplab_py.vision.search_kernels import search_cells
 from maplab_py.vision.warmup import compile_poses, compile_search
 
-SEARCH, POSES, RELAXATION = "descriptor search", "absolute pose", "relaxation"
+SEARCH, POSES, RELAXATION = "descriptor search", "absolute pose by gravity", "relaxation"
 _SAMPLES = {SEARCH: search_cells, POSES: search_poses, RELAXATION: normal_equations}
 
 
 def _jobs() -> dict[str, Callable[[], None]]:
-    others = {SEARCH: compile_search, POSES: compile_poses, RELAXATION: compile_relaxation}
-    return {**optimizer_jobs(), **others}
+    jobs = {**optimizer_jobs(), SEARCH: compile_search, RELAXATION: compile_relaxation}
+    for hypotheses in HYPOTHESES:
+        jobs[f"absolute pose by {hypotheses}"] = partial(compile_poses, hypotheses)
+    return jobs
 
 
 def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:

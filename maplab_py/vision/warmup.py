@@ -38,8 +38,8 @@ def compile_search() -> None:
     squared_sigmas(ray, ray, one, row, row, row, covariance, R, R, R, pose)
 
 
-def compile_poses() -> None:
-    """Compile the search for absolute poses."""
+def compile_poses(hypotheses: str = HYPOTHESES[0]) -> None:
+    """Compile the search for absolute poses by one kind of hypotheses."""
     points = 8
     point = np.random.default_rng(0).uniform(1.0, 5.0, (points, 3))
     problems = PoseProblems(
@@ -52,5 +52,4 @@ def compile_poses() -> None:
         keypoint=np.arange(points),
         tolerance=np.full(points, 0.01),
     )
-    for hypotheses in HYPOTHESES:
-        solve_poses(problems, hypotheses=hypotheses, max_iterations=2)
+    solve_poses(problems, hypotheses=hypotheses, max_iterations=2)
