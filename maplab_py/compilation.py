@@ -46,14 +46,14 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
     return decorate
 
 
-def is_on_disk(kernel: Callable[..., Any]) -> bool:
-    """Tell whether the disk has machine code of a compiled function, for whatever arguments."""
-    folder: str | None = kernel.stats.cache_path  # type: ignore[attr-defined]
-    if not folder:
+def is_missing_on_disk(kernel: Callable[..., Any]) -> bool:
+    """Tell whether machine code of a compiled function could be kept on the disk, but is not there."""
+    stats = getattr(kernel, "stats", None)  # not there where compilation is switched off
+    if stats is None or not stats.cache_path:
         return False
     function = kernel.py_func  # type: ignore[attr-defined]
     module = function.__module__.rsplit(".", 1)[-1]
-    return any(Path(folder).glob(f"{module}.{function.__qualname__}-*.nbi"))
+    return not any(Path(stats.cache_path).glob(f"{module}.{function.__qualname__}-*.nbi"))
 
 
 prange: Any = numba.prange

@@ -15,7 +15,7 @@ from typing import IO
 
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
 from maplab_py.algorithms.vi_optimization.warmup import optimizer_jobs
-from maplab_py.compilation import is_on_disk
+from maplab_py.compilation import is_missing_on_disk
 from maplab_py.estimation.codegen.modules import cache_folder
 from maplab_py.estimation.relative_pose_kernels import normal_equations
 from maplab_py.progress import Progress
@@ -73,7 +73,7 @@ class CompilationAhead:
 
     def __init__(self, jobs: Sequence[str]) -> None:
         """Start; jobs whose kernels are on the disk are left out, and all on a single core."""
-        wanted = [job for job in jobs if not is_on_disk(_SAMPLES[job])]
+        wanted = [job for job in jobs if is_missing_on_disk(_SAMPLES[job])]
         self._done = {job: threading.Event() for job in wanted}
         self._process: subprocess.Popen[str] | None = None
         if not wanted or (os.cpu_count() or 1) < 2:
@@ -93,7 +93,10 @@ class CompilationAhead:
     def wait(self, job: str, progress: Progress) -> None:
         """Wait until a job is done or the process has ended; raises Cancelled as `progress` does."""
         done = self._done.get(job)
-        while done is not None and not done.wait(0.1):
+        if done is None or done.is_set():
+            return
+        progress.line(f"compiling kernels '{job}' (once per machine) ...")
+        while not done.wait(0.1):
             progress.check()
 
     def close(self) -> None:

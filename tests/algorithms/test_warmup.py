@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 
+import numba
 import pytest
 
 from maplab_py.algorithms import warmup
@@ -13,7 +14,7 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
 from maplab_py.algorithms.warmup import CompilationAhead
-from maplab_py.compilation import compiled, is_on_disk
+from maplab_py.compilation import compiled, is_missing_on_disk
 from maplab_py.errors import Cancelled
 from maplab_py.estimation import relative_pose_kernels
 from maplab_py.estimation.linear import multifrontal
@@ -42,17 +43,19 @@ def test_a_relaxation_compiles_nothing_after_the_warmup():
 
 def test_the_disk_knows_what_was_compiled():
     compile_relaxation()
-    assert is_on_disk(kernels.moved)
+    assert not is_missing_on_disk(kernels.moved)
 
     @compiled()
     def never_called(x):  # type: ignore[no-untyped-def]
         return x
 
-    assert not is_on_disk(never_called)
+    assert is_missing_on_disk(never_called)
+    assert not is_missing_on_disk(numba.njit(lambda x: x))  # is not to be kept
+    assert not is_missing_on_disk(never_called.py_func)  # NUMBA_DISABLE_JIT
 
 
 def test_jobs_are_done_by_another_process(monkeypatch, capfd):
-    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     with contextlib.closing(CompilationAhead((warmup.RELAXATION,))) as ahead:
         process = ahead._process
@@ -63,7 +66,7 @@ def test_jobs_are_done_by_another_process(monkeypatch, capfd):
 
 
 def test_a_process_that_dies_holds_nobody_up(monkeypatch):
-    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     with contextlib.closing(CompilationAhead((warmup.SEARCH, warmup.POSES))) as ahead:
         assert ahead._process is not None
@@ -76,7 +79,7 @@ def test_waiting_can_be_cancelled_and_ends_the_process(monkeypatch):
         def check(self) -> None:
             raise Cancelled("enough")
 
-    monkeypatch.setattr(warmup, "is_on_disk", lambda _: False)
+    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     ahead = CompilationAhead((warmup.RELAXATION,))
     process = ahead._process
@@ -88,7 +91,7 @@ def test_waiting_can_be_cancelled_and_ends_the_process(monkeypatch):
 
 @pytest.mark.parametrize(("cores", "stored"), [(1, False), (2, True)])
 def test_no_process_for_a_single_core_or_what_is_on_the_disk(monkeypatch, cores, stored):
-    monkeypatch.setattr(warmup, "is_on_disk", lambda _: stored)
+    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: not stored)
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     with contextlib.closing(CompilationAhead((warmup.SEARCH,))) as ahead:
         assert ahead._process is None
