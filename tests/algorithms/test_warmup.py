@@ -68,7 +68,7 @@ def test_jobs_are_done_by_another_process(monkeypatch, capfd):
 def test_a_process_that_dies_holds_nobody_up(monkeypatch):
     monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with contextlib.closing(CompilationAhead((warmup.SEARCH, warmup.POSES))) as ahead:
+    with contextlib.closing(CompilationAhead((warmup.RELAXATION, warmup.POSES))) as ahead:
         assert ahead._process is not None
         ahead._process.kill()
         ahead.wait(warmup.POSES, SILENT)
@@ -93,6 +93,6 @@ def test_waiting_can_be_cancelled_and_ends_the_process(monkeypatch):
 def test_no_process_for_a_single_core_or_what_is_on_the_disk(monkeypatch, cores, stored):
     monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: not stored)
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
-    with contextlib.closing(CompilationAhead((warmup.SEARCH,))) as ahead:
+    with contextlib.closing(CompilationAhead((warmup.POSES,))) as ahead:
         assert ahead._process is None
-        ahead.wait(warmup.SEARCH, SILENT)
+        ahead.wait(warmup.POSES, SILENT)
