@@ -16,6 +16,7 @@ from maplab_py.viewer.display.picture import HEADLESS_FLAGS, find_browser
 from maplab_py.viewer.display.viewer import Viewer
 
 WIDTH, HEIGHT = 1000, 700
+HEADER, PANEL = 160, 340
 _LAZY = """
 const draw = window.requestAnimationFrame;
 window.requestAnimationFrame = (f) => setTimeout(() => draw(f), %d);
@@ -57,6 +58,8 @@ class Page:
         self.page.add_init_script(_LAZY % frame_ms)
         self.requests: list[str] = []
         self.errors: list[str] = []
+        self._nudges = 0
+        self._last_nudge = time.monotonic()
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.on("websocket", lambda socket: self.requests.append(socket.url))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
@@ -70,7 +73,22 @@ class Page:
             if condition():
                 return True
             self.page.wait_for_timeout(50)
+            self.nudge_now_and_then()
         return bool(condition())
+
+    def nudge_now_and_then(self) -> None:
+        if time.monotonic() > self._last_nudge + 5.0:
+            self.nudge()
+
+    def nudge(self) -> None:
+        """Move the pointer where nothing is: the page then draws, which it else may put off.
+
+        A page that renders in software and has nothing to draw now and then stops to report
+        frames for many seconds.
+        """
+        self._last_nudge = time.monotonic()
+        self._nudges += 1
+        self.page.mouse.move(20.0 + self._nudges % 8, HEIGHT - 20.0)
 
     def checkbox(self, label: str) -> Any:
         """Return the checkbox beside a label."""
@@ -78,11 +96,7 @@ class Page:
         return self.page.locator(row).locator("input[type=checkbox]").first
 
     def click(self, target: Any, tries: int = 4) -> None:
-        """Click, and click again where the page gave no frame in which it could be done.
-
-        A page that renders in software and has nothing to draw now and then stops to report
-        frames, for which playwright waits; a moved pointer makes it draw.
-        """
+        """Click, and click again where the page gave no frame, for which playwright waits."""
         slow = importlib.import_module("playwright.sync_api").TimeoutError
         for number in range(1, tries + 1):
             try:
@@ -91,7 +105,7 @@ class Page:
             except slow:
                 if number == tries:
                     raise
-                self.page.mouse.move(20.0 + number, HEIGHT - 20.0)
+                self.nudge()
 
     def settle(self, milliseconds: int = 900) -> None:
         self.page.wait_for_timeout(milliseconds)
@@ -102,6 +116,7 @@ class Page:
         same, last = 0, self.picture()
         while same < 2:
             assert time.monotonic() < end, "the page does not come to rest"
+            self.nudge_now_and_then()
             self.page.evaluate(_TWO_FRAMES)
             self.settle(250)
             now = self.picture()
@@ -114,7 +129,7 @@ class Page:
         data = np.frombuffer(self.page.screenshot(), dtype=np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR)
         assert image is not None
-        return image[160:, : WIDTH - 340, ::-1]
+        return image[HEADER:, : WIDTH - PANEL, ::-1]
 
     def outside_requests(self, own: str) -> list[str]:
         """Return what went anywhere else than to our own address."""
@@ -142,6 +157,18 @@ def colour_count(picture: np.ndarray, colour: np.ndarray, tolerance: int = 30) -
     """Return how many pixels have about this colour."""
     distance = np.abs(picture.astype(int) - np.asarray(colour, dtype=int)).max(axis=2)
     return int(np.count_nonzero(distance <= tolerance))
+
+
+def is_drawn_at(page: Page, viewer: Viewer, p: np.ndarray, colour: np.ndarray) -> list[bool]:
+    """Tell for points (N, 3) of the scene whether a line of this colour is to be seen at them."""
+    picture = page.picture()
+    drawn = []
+    for point in p:
+        x, y = (round(value) for value in place_on_page(viewer, point))
+        y -= HEADER
+        patch = picture[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4]
+        drawn.append(colour_count(patch, colour, 60) >= 8)
+    return drawn
 
 
 def is_blank(picture: np.ndarray) -> bool:
