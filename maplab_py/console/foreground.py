@@ -155,3 +155,21 @@ def interruptible() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def terminal_lent() -> Iterator[None]:
+    """Leave Ctrl-C to a program that has the terminal inside, as a pager or a shell command.
+
+    The key reaches both; were we to end as well, both would read what is typed next. A handler
+    that does nothing is not inherited by the program, other than the order to ignore the signal.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not (is_main and sys.stdin.isatty()):
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -7,8 +7,11 @@ import shutil
 import subprocess
 import sys
 
+from maplab_py.console.foreground import terminal_lent
+
 PAGER_VARIABLE = "MAPLAB_PAGER"
-_DEFAULT = "less -FRX"
+_DEFAULT = "less -FRXK"
+"""Short text is only printed, colours are kept, the text stays, Ctrl-C leaves."""
 
 
 def pager_command() -> str:
@@ -27,8 +30,6 @@ def page(text: str) -> bool:
     if not pager or text.count("\n") < shutil.get_terminal_size().lines:
         return False
     sys.stdout.flush()
-    try:
+    with terminal_lent():
         subprocess.run(pager, shell=True, input=text, text=True, check=False)
-    except KeyboardInterrupt:
-        return True
     return True

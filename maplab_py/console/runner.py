@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
@@ -11,7 +12,7 @@ from contextlib import contextmanager
 
 from maplab_py.console.aliases import expanded
 from maplab_py.console.call import Call
-from maplab_py.console.foreground import run_in_foreground
+from maplab_py.console.foreground import run_in_foreground, terminal_lent
 from maplab_py.console.jobs import Job
 from maplab_py.console.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.log import log_path
@@ -22,6 +23,8 @@ from maplab_py.errors import MaplabError, UserError
 
 LEAVE = ("q", "quit", "exit")
 _MAX_ALIAS_DEPTH = 8
+_INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
+"""How a shell command ends by Ctrl-C: by the signal, or by a shell that says so."""
 
 logger = logging.getLogger(__name__)
 
@@ -180,13 +183,17 @@ class Runner:
         self.terminal.note(text)
 
     def _run_shell(self, line: str) -> Status:
-        """Give a line to the shell; Ctrl-C reaches it as it reaches us."""
+        """Give a line to the shell, and Ctrl-C with it."""
         if not line:
             return self.report_error("", UserError("nothing behind '!' (write !ls)"))
         self.terminal.echo_to_transcript("> !" + line)
         try:
-            code = subprocess.run(line, shell=True, check=False, env=self._environment).returncode
+            with terminal_lent():
+                child = subprocess.run(line, shell=True, check=False, env=self._environment)
         except KeyboardInterrupt:
+            return Status.CANCELLED
+        code = child.returncode
+        if code in _INTERRUPTED:
             return Status.CANCELLED
         if code:
             self.terminal.error(f"!{line}: exit status {code}")
@@ -202,9 +209,12 @@ class Runner:
         if not line:
             yield
             return
-        with subprocess.Popen(
-            line, shell=True, stdin=subprocess.PIPE, text=True, env=self._environment
-        ) as child:
+        with (
+            terminal_lent(),
+            subprocess.Popen(
+                line, shell=True, stdin=subprocess.PIPE, text=True, env=self._environment
+            ) as child,
+        ):
             assert child.stdin is not None
             try:
                 with self.terminal.redirected(child.stdin):

@@ -33,6 +33,8 @@ def listed_files(folder: Path) -> list[Path]:
         MapError: It is missing, cannot be read, or lists a path outside the folder.
     """
     path = folder / VI_MAP_FOLDER / VI_MAP_METADATA
+    if not folder.exists():
+        raise MapError(f"{folder}: there is no such folder")
     if not path.is_file():
         raise MapError(f"{folder} is not a map: it has no {VI_MAP_FOLDER}/{VI_MAP_METADATA}")
     metadata = pb.VIMapMetadata()

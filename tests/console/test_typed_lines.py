@@ -205,4 +205,4 @@ def test_the_pager_gets_what_is_longer_than_the_screen(
     monkeypatch.setenv("MAPLAB_PAGER", "cat")
     assert not pager.page("x\n" * 1000)
     monkeypatch.delenv("MAPLAB_PAGER")
-    assert pager.pager_command() in ("less -FRX", "")
+    assert pager.pager_command() in ("less -FRXK", "")

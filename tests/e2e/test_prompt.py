@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -170,6 +172,58 @@ def test_long_output_goes_through_the_pager(tmp_path: Path) -> None:
     console.type("q")
     console.wait_for_prompt()
     console.child.close(force=True)
+
+
+@pytest.mark.skipif(shutil.which("less") is None, reason="less is not installed")
+def test_ctrl_c_leaves_the_pager_and_the_prompt_has_the_keys(tmp_path: Path) -> None:
+    console = Console(tmp_path, MAPLAB_PAGER="less -FRXK")  # as it is without the variable
+    console.wait_for_prompt()
+    console.enter("help")
+    console.wait_for(lambda _: console.last_line == ":")
+    console.type(CTRL_C)
+    console.wait_for(lambda _: console.last_line.endswith("maplab <>:/$"))
+    console.enter("create_new_map a")
+    console.wait_for_prompt("maplab <a>:/$")
+    console.child.close(force=True)
+
+
+STAYS = "trap 'echo once more' INT; until read a < /dev/tty; do true; done; echo got $a"
+"""A shell command that Ctrl-C does not end: it wants a line."""
+
+
+def test_ctrl_c_at_a_pager_that_stays_ends_nothing_else(tmp_path: Path) -> None:
+    console = Console(tmp_path, MAPLAB_PAGER=f"tail -n 1; {STAYS}")
+    console.wait_for_prompt()
+    console.enter("help")
+    time.sleep(1.0)
+    console.type(CTRL_C)
+    console.wait_for_text("once more")
+    console.enter("a line for the pager")
+    console.wait_for_text("got a line for the pager")
+    console.wait_for_prompt()
+    assert "unknown command" not in console.text
+    console.child.close(force=True)
+
+
+@pytest.mark.parametrize("line", ["!sleep 30", "!sleep 30; true"])
+def test_ctrl_c_ends_a_shell_command(console: Console, line: str) -> None:
+    console.enter(line)
+    time.sleep(1.0)
+    console.type(CTRL_C)
+    console.wait_for(lambda _: console.last_line.endswith("maplab <>:/$"))
+    console.enter("create_new_map a")
+    console.wait_for_prompt("maplab <a>:/$")
+
+
+def test_a_shell_command_that_survives_ctrl_c_keeps_the_keys(console: Console) -> None:
+    console.enter("!" + STAYS)
+    time.sleep(1.0)
+    console.type(CTRL_C)
+    console.wait_for_text("once more")
+    console.enter("a line for the shell")
+    console.wait_for_text("got a line for the shell")
+    console.wait_for_prompt()
+    assert "unknown command" not in console.text
 
 
 def test_a_command_that_says_nothing_for_a_second_shows_that_it_lives(console: Console) -> None:

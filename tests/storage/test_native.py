@@ -198,6 +198,16 @@ def test_damaged_maps_are_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
+def test_a_folder_that_is_none_is_told_from_one_without_a_map(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"nowhere: there is no such folder"):
+        load_map(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    for name in ("empty", "file"):
+        with pytest.raises(MapError, match=rf"{name} is not a map: it has no vi_map/"):
+            load_map(tmp_path / name)
+
+
 def test_repair_keeps_what_both_sides_say(tmp_path: Path) -> None:
     folder = damaged_copy(tmp_path, _disagreement)
     vi_map, report = load_map(folder, repair=True)
