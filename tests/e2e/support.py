@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -83,6 +84,13 @@ class Console:
             lines.pop()
         return lines[-1] if lines else ""
 
+    def close(self) -> None:
+        """End the program, however long a busy machine takes for it."""
+        if self.child.isalive():
+            self.child.kill(signal.SIGKILL)
+            self.child.wait()
+        self.child.close()
+
     def type(self, text: str) -> None:
         """Type at a person's pace."""
         for character in text:
@@ -93,7 +101,7 @@ class Console:
         """Type a line and press Enter."""
         self.type(line + "\r")
 
-    def wait_for(self, condition: Callable[[str], bool], seconds: float = 20.0) -> str:
+    def wait_for(self, condition: Callable[[str], bool], seconds: float = 60.0) -> str:
         """Wait until the screen fulfils a condition, and return its text."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -130,8 +138,7 @@ class Console:
     def status(self) -> int:
         """Wait for the end and return the exit status."""
         self.child.expect(pexpect.EOF)
-        self.child.close()
-        return int(self.child.exitstatus)
+        return int(self.child.wait())
 
     def _read(self, seconds: float) -> None:
         try:

@@ -21,7 +21,7 @@ def console(tmp_path: Path) -> Iterator[Console]:
     console = Console(tmp_path)
     console.wait_for_prompt()
     yield console
-    console.child.close(force=True)
+    console.close()
 
 
 def test_typing_runs_commands_and_prints_their_time(console: Console) -> None:
@@ -96,7 +96,7 @@ def test_history_is_kept_between_sessions(console: Console, tmp_path: Path) -> N
     again.wait_for_prompt()
     again.type(CTRL_R + "remem")
     again.wait_for_text("create_new_map remembered")
-    again.child.close(force=True)
+    again.close()
 
 
 def test_a_broken_user_configuration_only_warns(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_a_broken_user_configuration_only_warns(tmp_path: Path) -> None:
     console = Console(tmp_path)
     console.wait_for_text("warning:")
     console.wait_for_prompt()
-    console.child.close(force=True)
+    console.close()
 
 
 def test_no_color_is_respected(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_no_color_is_respected(tmp_path: Path) -> None:
     console.wait_for_text("help: 0.")
     cells = [cell for row in console.screen.buffer.values() for cell in row.values()]
     assert {cell.fg for cell in cells} == {"default"}
-    console.child.close(force=True)
+    console.close()
 
 
 def test_the_prompt_comes_soon(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_the_prompt_comes_soon(tmp_path: Path) -> None:
         console = Console(tmp_path)
         console.wait_for_prompt()
         seconds.append(console.processor_seconds())
-        console.child.close(force=True)
+        console.close()
     assert min(seconds) <= 0.8 * slowness()
 
 
@@ -171,7 +171,7 @@ def test_long_output_goes_through_the_pager(tmp_path: Path) -> None:
     console.wait_for_text("--More--")
     console.type("q")
     console.wait_for_prompt()
-    console.child.close(force=True)
+    console.close()
 
 
 @pytest.mark.skipif(shutil.which("less") is None, reason="less is not installed")
@@ -184,7 +184,7 @@ def test_ctrl_c_leaves_the_pager_and_the_prompt_has_the_keys(tmp_path: Path) -> 
     console.wait_for(lambda _: console.last_line.endswith("maplab <>:/$"))
     console.enter("create_new_map a")
     console.wait_for_prompt("maplab <a>:/$")
-    console.child.close(force=True)
+    console.close()
 
 
 STAYS = "trap 'echo once more' INT; until read a < /dev/tty; do true; done; echo got $a"
@@ -202,7 +202,7 @@ def test_ctrl_c_at_a_pager_that_stays_ends_nothing_else(tmp_path: Path) -> None:
     console.wait_for_text("got a line for the pager")
     console.wait_for_prompt()
     assert "unknown command" not in console.text
-    console.child.close(force=True)
+    console.close()
 
 
 @pytest.mark.parametrize("line", ["!sleep 30", "!sleep 30; true"])

@@ -25,7 +25,7 @@ def console(tmp_path: Path) -> Iterator[Console]:
     console = Console(tmp_path)
     console.wait_for_prompt()
     yield console
-    console.child.close(force=True)
+    console.close()
 
 
 def _is_served(port: int) -> bool:
