@@ -17,6 +17,14 @@ from maplab_py.viewer.display.viewer import Viewer
 
 WIDTH, HEIGHT = 1000, 700
 HEADER, PANEL = 160, 340
+IN_BROWSER = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.flaky(reruns=1, reruns_delay=10),
+]
+"""Marks of tests in a browser. Chromium that draws in software stands still for up to half a minute
+now and then; a test that fails is tried once more, and the summary says so."""
+
 _LAZY = """
 const draw = window.requestAnimationFrame;
 window.requestAnimationFrame = (f) => setTimeout(() => draw(f), %d);
@@ -66,7 +74,7 @@ class Page:
         self.page.goto(url)
         self.page.wait_for_selector("canvas", state="attached")
 
-    def wait_until(self, condition: Any, seconds: float = 120.0) -> bool:
+    def wait_until(self, condition: Any, seconds: float = 240.0) -> bool:
         """Wait until a condition of ours holds, while the page lives on."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:

@@ -14,6 +14,7 @@ from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 from maplab_py.viewer.scene import Entity
 from tests.viewer.browsing import (
+    IN_BROWSER,
     Page,
     chromium,
     colour_count,
@@ -23,7 +24,7 @@ from tests.viewer.browsing import (
 )
 from tests.vimap.builders import walk_map
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow]
+pytestmark = IN_BROWSER
 
 MAP = walk_map(vertices=14, landmarks=300, seed=3)
 

@@ -20,10 +20,10 @@ from maplab_py.viewer.display.picture import find_browser
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.options import VisualizationOptions
 from tests.support.machine import slowness
-from tests.viewer.browsing import Page, chromium, colour_count, is_blank
+from tests.viewer.browsing import IN_BROWSER, Page, chromium, colour_count, is_blank
 from tests.vimap.builders import walk_map
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow]
+pytestmark = IN_BROWSER
 
 MAP = walk_map(vertices=14, landmarks=300, seed=3)
 SUBJECT = Subject(MAP, "walk", VisualizationOptions(scale=2.0))
