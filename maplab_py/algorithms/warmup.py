@@ -21,15 +21,17 @@ from maplab_py.estimation.relative_pose_kernels import normal_equations
 from maplab_py.progress import Progress
 from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.pose_kernels import search_poses
+from maplab_py.vision.search_kernels import search_cells
 from maplab_py.vision.warmup import compile_poses, compile_search
 
 POSES, RELAXATION = f"absolute pose by {HYPOTHESES[0]}", "relaxation"
-_SAMPLES = {POSES: search_poses, RELAXATION: normal_equations}
+SEARCH = "descriptor search"
+_SAMPLES = {POSES: search_poses, SEARCH: search_cells, RELAXATION: normal_equations}
 """Jobs that can be done ahead, each with a kernel that tells by being on the disk that it is done."""
 
 
 def _jobs() -> dict[str, Callable[[], None]]:
-    jobs = {**optimizer_jobs(), "descriptor search": compile_search, RELAXATION: compile_relaxation}
+    jobs = {**optimizer_jobs(), SEARCH: compile_search, RELAXATION: compile_relaxation}
     for hypotheses in HYPOTHESES:
         jobs[f"absolute pose by {hypotheses}"] = partial(compile_poses, hypotheses)
     return jobs

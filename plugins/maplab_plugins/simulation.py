@@ -7,6 +7,7 @@ import dataclasses
 import shlex
 import tempfile
 import time
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,10 @@ TRUTH_FILE = "truth.npz"
 
 _DEMO_SCENARIO = "three_sessions"
 _DEMO_KEY = "demo"
-_NEEDS = {"anchor_all_missions": "absolute pose by gravity", "relax": "relaxation"}
+_NEEDS = {
+    "anchor_all_missions": ("absolute pose by gravity", "descriptor search"),
+    "relax": ("relaxation",),
+}
 """What another process compiles meanwhile, in this order, and which command waits for it.
 
 The rest is compiled where it is used: both processes then have about as much to do.
@@ -220,7 +224,7 @@ def demo(
     _refuse_used_folder(map_folder, overwrite=overwrite)
     context.maps.check_new_key(_DEMO_KEY)
     scenario = load_scenario(_DEMO_SCENARIO).with_seed(_checked_seed(seed))
-    with contextlib.closing(CompilationAhead(tuple(_NEEDS.values()))) as ahead:
+    with contextlib.closing(CompilationAhead(tuple(chain.from_iterable(_NEEDS.values())))) as ahead:
         return _demonstrate(context, scenario, map_folder, ahead, overwrite=overwrite)
 
 
@@ -279,8 +283,9 @@ def _run(context: CommandContext, line: str, ahead: CompilationAhead | None = No
     context.progress.line(f"> {line}")
     call = context.session.parse(shlex.split(line))
     start = time.perf_counter()
-    if ahead is not None and call.command.name in _NEEDS:
-        ahead.wait(_NEEDS[call.command.name], context.progress)
+    if ahead is not None:
+        for job in _NEEDS.get(call.command.name, ()):
+            ahead.wait(job, context.progress)
     report = context.session.execute(call)
     if report.failure:
         raise EstimationError(f"{call.command.name}: {report.failure}")

@@ -6,11 +6,14 @@ import contextlib
 import os
 
 import numba
+import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from maplab_py.algorithms import warmup
 from maplab_py.algorithms.relaxation import kernels
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.pose_graph import RelativePoses
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
 from maplab_py.algorithms.warmup import CompilationAhead
@@ -18,6 +21,7 @@ from maplab_py.compilation import compiled, is_missing_on_disk
 from maplab_py.errors import Cancelled
 from maplab_py.estimation import relative_pose_kernels
 from maplab_py.estimation.linear import multifrontal
+from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, SilentProgress
 from tests.algorithms.relaxation.loops import simulate
 
@@ -39,6 +43,16 @@ def test_a_relaxation_compiles_nothing_after_the_warmup():
     loop = simulate(0)
     relax(loop.vi_map, RelaxationOptions(), loop_closures=loop.closures)
     assert [list(kernel.signatures) for kernel in used] == before
+
+
+def test_edges_that_cannot_be_written_to_compile_nothing_again():
+    measured = np.tile(se3.identity(), (1, 1))
+    rows, weight, poses = np.zeros(1, dtype=np.int64), np.eye(6)[None], se3.identity(1)
+    errors = RelativePoses(rows, rows, measured.copy(), weight).errors(poses)
+    before = list(relative_pose_kernels.relative_pose_errors.signatures)
+    measured.flags.writeable = False
+    assert_array_equal(RelativePoses(rows, rows, measured, weight).errors(poses), errors)
+    assert list(relative_pose_kernels.relative_pose_errors.signatures) == before
 
 
 def test_the_disk_knows_what_was_compiled():

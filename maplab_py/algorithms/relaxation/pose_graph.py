@@ -40,7 +40,12 @@ class RelativePoses:
     )
 
     def __post_init__(self) -> None:
-        """Take the split residual for all edges when nothing is said."""
+        """Take the split residual for all edges when nothing is said.
+
+        Arrays of a map, which nobody may write to, are copied: kernels would be compiled once more.
+        """
+        if not self.T_A_B.flags.writeable:
+            object.__setattr__(self, "T_A_B", np.array(self.T_A_B))
         if len(self.is_log) == 0:
             object.__setattr__(self, "is_log", np.zeros(len(self.from_vertex), dtype=np.bool_))
 
