@@ -233,12 +233,13 @@ def prune_segments(
         segments_per_group: Keep so many per group; 0 = as many as it has.
         missions: Remove the segments of missions whose ids begin so, separated by commas.
         outdated: Remove segments whose measurements contradict the calibration.
-        calibration: Test against this sensors.yaml or map folder; empty = the database's own.
+        calibration: Test against this sensors.yaml or map folder; empty = against the calibration
+            that all segments make together.
         probability: Of calling a segment good that is.
         dry_run: Only report; the database stays as it is.
     """
     from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
-    from maplab_py.algorithms.self_calibration.outdated import fits
+    from maplab_py.algorithms.self_calibration.outdated import fits, fits_together
 
     before = load_database(database)
     result, tested = before, []
@@ -249,10 +250,11 @@ def prune_segments(
             raise UserError(f"--missions: the database has no segment of {missions}")
         result = result.without_missions(gone)
     if outdated:
-        sensors = before.vi_map.sensors if calibration is None else _sensors_of(calibration)
-        tested = fits(
-            result, sensors, checked(options), probability=probability, progress=context.progress
-        )
+        if calibration is None:
+            tested = fits_together(result, checked(options), probability, context.progress)
+        else:
+            now = _sensors_of(calibration)
+            tested = fits(result, now, checked(options), probability, context.progress)
         bad = {one.first_vertex for one in tested if one.is_outdated}
         result = result.without({r.key for r in result.records if r.first_vertex in bad})
     if segments_per_group:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,31 @@ def test_the_batch_returns_from_a_disturbed_calibration() -> None:
     assert found["camera distortion w"] == pytest.approx(0.9316, abs=1e-3)
     assert report.unobservable == ()
     assert report.chi_square_per_freedom == pytest.approx(1.0, abs=0.1)
+
+
+def test_segments_of_the_calibrated_device_are_not_outdated(tmp_path: Path) -> None:
+    session = Session(load_registry())
+    session.run("load", map_folder=shared_data("maplab_maps/tango_handheld"))
+    for command in ("relax", "lc", "optvi"):
+        session.run(command)
+    database = tmp_path / "tango.segments"
+    session.run("self_calibrate", database=database)
+    entry = session.maps.selected
+    outdated = {}
+    for name, vi_map in (("found", entry.vi_map), ("knocked", disturbed(entry.vi_map))):
+        session.maps.update(entry.with_value(vi_map, name))
+        session.run("save", map_folder=tmp_path / name)
+        report: Any = session.run(
+            "prune_segments",
+            database=database,
+            outdated=True,
+            calibration=tmp_path / name,
+            dry_run=True,
+        )
+        outdated[name] = [one.outdated for one in report.tested]
+    assert len(outdated["found"]) >= 8
+    assert not any(outdated["found"])
+    assert all(outdated["knocked"])
 
 
 def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:

@@ -60,14 +60,16 @@ class Scene:
     gravity_mps2: float = 9.81
     intrinsics: ImuIntrinsics | None = None
     seed: int = 1
+    device_seed: int | None = None  # None: every seed has a device of its own
 
     def make(self) -> VIMap:
         """Return the map: true states, measurements as asked for."""
         rng = np.random.default_rng(self.seed)
+        drawn = rng if self.device_seed is None else np.random.default_rng(self.device_seed)
         imu = Imu(
-            _new_id(rng), gravity_magnitude_mps2=self.gravity_mps2, intrinsics=self.intrinsics
+            _new_id(drawn), gravity_magnitude_mps2=self.gravity_mps2, intrinsics=self.intrinsics
         )
-        rig = _rig(self.models, rng)
+        rig = _rig(self.models, drawn)
         sensors = SensorSet(
             {imu.id: imu, rig.id: rig},
             {i: Extrinsics(imu.id, se3.identity()) for i in (imu.id, rig.id)},

@@ -28,7 +28,7 @@ from maplab_py.algorithms.self_calibration.scale import (
     without_partitions,
 )
 from maplab_py.algorithms.self_calibration.segments import parallax_rad, restricted
-from maplab_py.algorithms.self_calibration.track_deviations import sigma_by_tracks
+from maplab_py.algorithms.self_calibration.track_deviations import covariance_by_tracks
 from maplab_py.algorithms.vi_optimization.writing_back import with_estimated_sensors, written_back
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -112,7 +112,7 @@ def calibrate(
         prior_at=before,
         progress=progress,
     )
-    states, summary, consistency = _settled(problem, options, progress)
+    states, summary, consistency = settled(problem, options, progress)
     lost = partitions_without_scale(problem, states, rough)
     rest = without_partitions(problem, lost)
     if len(lost) and len(rest):
@@ -120,7 +120,7 @@ def calibrate(
             restricted(vi_map, rest), options, names_of(problem, lost), segments, progress
         )
     covariance = posterior_covariance(problem, states)
-    by_tracks = sigma_by_tracks(problem, states)
+    by_tracks = np.sqrt(np.diag(covariance_by_tracks(problem, states)))
     found = spectrum(covariance, problem.parameters)
     directions = found.unobservable(_UNDETERMINED)
     names = tuple(name_direction(one, problem.parameters) for one in directions.T)
@@ -161,7 +161,7 @@ def _without_lost(
     return result, dataclasses.replace(report, without_scale=(*lost, *report.without_scale))
 
 
-def _settled(
+def settled(
     problem: SegmentProblem, options: SelfCalibrationOptions, progress: Progress
 ) -> tuple[States, SolverSummary, Consistency]:
     """Minimise robustly, leave out what does not fit, and minimise plainly."""

@@ -7,17 +7,29 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.self_calibration.calibration import chi_square_per_freedom, solve
+from maplab_py.algorithms.self_calibration.calibration import (
+    calibrate,
+    chi_square_per_freedom,
+    settled,
+)
 from maplab_py.algorithms.self_calibration.curvature import with_curvature
 from maplab_py.algorithms.self_calibration.database import SegmentDatabase, with_calibration
 from maplab_py.algorithms.self_calibration.information import posterior_covariance
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.parameters import Parameters
 from maplab_py.algorithms.self_calibration.problem import pose
+from maplab_py.algorithms.self_calibration.track_deviations import (
+    covariance_by_tracks,
+    larger_covariance,
+)
+from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
 
 F64 = NDArray[np.float64]
+
+_DETERMINED = 0.5
+"""Share of the prior's variance that is left in a direction, at most, for the data to have a say."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,27 +44,51 @@ class SegmentFit:
     is_outdated: bool
 
 
+def fits_together(
+    database: SegmentDatabase,
+    options: SelfCalibrationOptions,
+    probability: float = 0.999,
+    progress: Progress = SILENT,
+) -> list[SegmentFit]:
+    """Test every segment against the calibration that all of them make together.
+
+    Raises:
+        EstimationError: Half of them contradict it, so that nobody can tell which of them are outdated.
+    """
+    if len(database) == 0:
+        return []
+    lenient = dataclasses.replace(options, keep_unobservable_at_prior=True)
+    result, _ = calibrate(database.vi_map, lenient, segments=len(database), progress=progress)
+    tested = fits(database, result.sensors, options, probability, progress)
+    against = sum(one.is_outdated for one in tested)
+    if 2 * against >= len(tested):
+        raise EstimationError(
+            f"{against} of {len(tested)} segments contradict what all say together, so the device may have "
+            "changed between sessions: name the calibration that holds now by --calibration"
+        )
+    return tested
+
+
 def fits(
     database: SegmentDatabase,
     sensors: SensorSet,
     options: SelfCalibrationOptions,
-    *,
     probability: float = 0.999,
-    calibration_covariance: F64 | None = None,
     progress: Progress = SILENT,
 ) -> list[SegmentFit]:
     """Test every segment's measurements against a calibration.
 
-    Each segment is calibrated by itself, beginning at the given calibration; under the hypothesis
-    that it still holds, the change is a chi-square distance in the covariance of the estimate.
-    Directions that the segment says nothing about are held by the prior and add nothing.
+    Each segment is calibrated by itself, beginning at the given calibration, with outliers treated as
+    when all are calibrated together. Under the hypothesis that it still holds, the change is a
+    chi-square distance in the covariance of the estimate: the formal one, or that by tracks where
+    it is larger (decision 130). Directions that the segment says nothing about are held by the
+    prior and add nothing.
 
     Args:
         database: Segments.
         sensors: The calibration to test.
         options: What was estimated.
         probability: Of calling a good segment good.
-        calibration_covariance: (k, k) of the calibration itself; None = it is exact.
         progress: Shown while segments are tested.
     """
     from scipy.stats import chi2
@@ -63,14 +99,14 @@ def fits(
         own = database.map_of(record)
         own = own.replace(sensors=with_calibration(own.sensors, sensors))
         problem = pose(with_curvature(own) if options.imu_curvature else own, options)
-        states, _ = solve(problem, options, progress=SILENT)
+        states, _, _ = settled(problem, options, SILENT)
         change = problem.parameters.difference(states.blocks, problem.posed.states.blocks)
         covariance = posterior_covariance(problem, states)
         fit = chi_square_per_freedom(problem, states)
-        scaled = covariance * max(fit, 1.0)
-        if calibration_covariance is not None:
-            scaled = scaled + calibration_covariance
-        distance, freedom = _distance(change, scaled, problem.parameters)
+        actual = larger_covariance(
+            covariance * max(fit, 1.0), covariance_by_tracks(problem, states)
+        )
+        distance, freedom = _distance(change, covariance, actual, problem.parameters)
         limit = float(chi2.ppf(probability, max(freedom, 1)))
         result.append(
             SegmentFit(
@@ -85,14 +121,23 @@ def fits(
     return result
 
 
-def _distance(change: F64, covariance: F64, parameters: Parameters) -> tuple[float, int]:
-    """Return the squared distance along the directions that the data determine, and their number."""
+def _distance(change: F64, formal: F64, actual: F64, parameters: Parameters) -> tuple[float, int]:
+    """Return the squared distance along the directions that the data determine, and their number.
+
+    Args:
+        change: (k,) of the segment's estimate from the calibration.
+        formal: Covariance (k, k) by which the prior weighs the data.
+        actual: Covariance (k, k) of the data's errors.
+        parameters: What was estimated, with the deviations of the prior.
+    """
     scale = parameters.prior_sigma
-    share, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
-    along = directions.T @ (change / scale)
-    determined = share <= 0.5
+    share, directions = np.linalg.eigh(formal / np.outer(scale, scale))
+    determined = share <= _DETERMINED
     if not determined.any():
         return 0.0, 0
+    basis = directions[:, determined]
     # the prior shrinks an estimate towards the calibration; its variance shrinks likewise
-    spread = share[determined] * (1.0 - np.minimum(share[determined], 0.5))
-    return float(np.sum(along[determined] ** 2 / spread)), int(determined.sum())
+    root = np.sqrt(1.0 - share[determined])
+    spread = root[:, None] * (basis.T @ (actual / np.outer(scale, scale)) @ basis) * root
+    along = basis.T @ (change / scale)
+    return float(along @ np.linalg.solve(spread, along)), int(determined.sum())

@@ -25,14 +25,14 @@ _STEP = 1e-3
 _LANDMARK_DAMPING = 1e-9
 
 
-def sigma_by_tracks(problem: SegmentProblem, states: States) -> F64:
-    """Return the deviations (k,) of the calibration when whole tracks are what is independent.
+def covariance_by_tracks(problem: SegmentProblem, states: States) -> F64:
+    """Return the covariance (k, k) of the calibration when whole tracks are what is independent.
 
-    The covariance is C (sum of g g^T + H) C, with C that of the formal deviations, g the gradients of
-    single landmarks' costs, and H the information of all that is not a landmark, which is taken at
-    its word (K.-Y. Liang and S. L. Zeger, Longitudinal data analysis using generalized linear
-    models, Biometrika 1986). Where landmarks are at their optimum their elimination does not
-    change g, so products of C and g are derivatives of a landmark's cost along columns of C.
+    It is C (sum of g g^T + H) C, with C the formal covariance, g the gradients of single landmarks'
+    costs, and H the information of all that is not a landmark, which is taken at its word
+    (K.-Y. Liang and S. L. Zeger, Longitudinal data analysis using generalized linear models,
+    Biometrika 1986). Where landmarks are at their optimum their elimination does not change g, so
+    products of C and g are derivatives of a landmark's cost along columns of C.
 
     Args:
         problem: Factorised at the states, as `posterior_covariance` leaves it.
@@ -40,23 +40,41 @@ def sigma_by_tracks(problem: SegmentProblem, states: States) -> F64:
     """
     inner = problem.posed.problem
     columns = inner.covariance_columns(*problem.parameters.nodes(states))
-    variance = np.zeros(columns.shape[-1])
+    size = columns.shape[-1]
+    covariance = np.zeros((size, size))
     for term in inner.factors:
         _, jacobian = term.evaluate(states)
         moved = columns[term.nodes].reshape(*jacobian.shape[::2], -1)
-        variance += np.sum((jacobian @ moved) ** 2, axis=(0, 1))
+        change = (jacobian @ moved).reshape(-1, size)
+        covariance += change.T @ change
     if inner.visual is None:
-        return np.sqrt(variance)
+        return covariance
     still = np.zeros((inner.num_nodes, 3))
     p_G, _, _ = inner.visual.take_step(states, still, states, _LANDMARK_DAMPING)
     settled = dataclasses.replace(states, p_G=p_G)
     node, direction = problem.parameters.nodes(states)
     formal = np.sqrt(columns[node, direction, np.arange(len(node))])
+    change = np.empty((len(settled.p_G), size))
     for k, sigma in enumerate(formal):
         step = columns[:, :, k] * (_STEP / max(sigma, 1e-300))
-        change = _costs(inner.visual, settled, step) - _costs(inner.visual, settled, -step)
-        variance[k] += np.sum((change * (sigma / (2.0 * _STEP))) ** 2)
-    return np.sqrt(variance)
+        difference = _costs(inner.visual, settled, step) - _costs(inner.visual, settled, -step)
+        change[:, k] = difference * (sigma / (2.0 * _STEP))
+    covariance += change.T @ change
+    return covariance
+
+
+def larger_covariance(first: F64, second: F64) -> F64:
+    """Return the covariance (k, k) that is as large as both in every direction, and no larger.
+
+    Args:
+        first: (k, k), positive definite.
+        second: (k, k), of the same quantities.
+    """
+    L = np.linalg.cholesky(first)
+    inverse = np.linalg.inv(L)
+    share, turn = np.linalg.eigh(inverse @ second @ inverse.T)
+    root = L @ turn
+    return np.asarray((root * np.maximum(share, 1.0)) @ root.T)
 
 
 def _costs(visual: VisualTerms, states: States, step: F64) -> F64:

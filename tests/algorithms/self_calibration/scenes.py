@@ -47,12 +47,17 @@ EXACT = dataclasses.replace(
 
 @cache
 def scene_map(
-    vertices: int = 31, noise: float = 0.0, seed: int = 1, distortion: Distortion = Distortion.FOV
+    vertices: int = 31,
+    noise: float = 0.0,
+    seed: int = 1,
+    distortion: Distortion = Distortion.FOV,
+    device_seed: int | None = None,
 ) -> VIMap:
     scene = Scene(
         vertices=vertices,
         noise=noise,
         seed=seed,
+        device_seed=device_seed,
         models=((Projection.PINHOLE, distortion),),
         intrinsics=INTRINSICS,
     )

@@ -13,11 +13,17 @@ import pytest
 from maplab_py.algorithms.self_calibration.collection import collect
 from maplab_py.algorithms.self_calibration.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
-from maplab_py.algorithms.self_calibration.outdated import fits
-from maplab_py.errors import UserError
-from maplab_py.sensors import CameraRig
+from maplab_py.algorithms.self_calibration.outdated import fits, fits_together
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.vimap import VIMap
-from tests.algorithms.self_calibration.scenes import OPTIONS, assert_only_gaps, device, scene_map
+from tests.algorithms.self_calibration.scenes import (
+    OPTIONS,
+    assert_only_gaps,
+    device,
+    scene_map,
+    uncalibrated,
+)
 
 
 @cache
@@ -78,12 +84,11 @@ def test_damaged_foreign_and_newer_files_are_refused(tmp_path: Path) -> None:
 
 def second_session() -> VIMap:
     """Another walk with the same device."""
-    other = scene_map(vertices=61, noise=1.0, seed=2)
-    first = scene_map(vertices=61, noise=1.0)
-    sensor_id = first.missions.sensor_id
-    return other.replace(
-        sensors=first.sensors, missions=other.missions.replace(sensor_id=sensor_id)
-    )
+    other = scene_map(vertices=61, noise=1.0, seed=2, device_seed=1)
+    for one, same in zip(device(other), device(collected().vi_map), strict=True):
+        assert one.id == same.id
+    np.testing.assert_array_equal(device(other)[1].T_B_C, device(collected().vi_map)[1].T_B_C)
+    return other
 
 
 def test_sessions_compete_and_the_size_stays() -> None:
@@ -120,20 +125,51 @@ def test_pruning_keeps_the_best() -> None:
         assert one.ranked(table)[0].key == database.ranked(table)[0].key
 
 
+def seen_by(vi_map: VIMap, sensors: SensorSet) -> VIMap:
+    """Return the map as a camera of other focal length and centre would have recorded it."""
+    (f, c), (other_f, other_c) = (
+        np.split(device(vi_map.replace(sensors=one))[1].cameras[0].intrinsics, 2)
+        for one in (vi_map.sensors, sensors)
+    )
+    uv_px = (vi_map.keypoints.uv_px - c) / f * other_f + other_c
+    return vi_map.replace(keypoints=vi_map.keypoints.replace(uv_px=uv_px))
+
+
+def knocked(sensors: SensorSet) -> SensorSet:
+    """Focal length and centre of a camera that was dropped."""
+    rig = next(one for one in sensors.sensors.values() if isinstance(one, CameraRig))
+    camera = rig.cameras[0]
+    other = dataclasses.replace(
+        camera, intrinsics=camera.intrinsics + np.array([12.0, 12.0, 20.0, -15.0])
+    )
+    changed = {**sensors.sensors, rig.id: CameraRig(rig.id, (other,), rig.T_B_C)}
+    return dataclasses.replace(sensors, sensors=changed)
+
+
 @pytest.mark.slow
 def test_segments_of_a_device_that_changed_are_found() -> None:
     database = collected()
-    assert not any(one.is_outdated for one in fits(database, database.vi_map.sensors, OPTIONS))
-    _, rig = device(database.vi_map)
-    camera = rig.cameras[0]
-    knocked = dataclasses.replace(
-        camera, intrinsics=camera.intrinsics + np.array([12.0, 12.0, 20.0, -15.0])
-    )
-    changed = dataclasses.replace(
-        database.vi_map.sensors,
-        sensors={
-            **database.vi_map.sensors.sensors,
-            rig.id: CameraRig(rig.id, (knocked,), rig.T_B_C),
-        },
-    )
-    assert all(one.is_outdated for one in fits(database, changed, OPTIONS))
+    sensors = database.vi_map.sensors
+    assert not any(one.is_outdated for one in fits(database, sensors, OPTIONS))
+    assert all(one.is_outdated for one in fits(database, knocked(sensors), OPTIONS))
+
+
+@pytest.mark.slow
+def test_a_calibration_that_was_wrong_from_the_start_makes_no_segment_outdated() -> None:
+    database, _ = collect(uncalibrated(scene_map(vertices=61, noise=1.0)), OPTIONS)
+    assert all(one.is_outdated for one in fits(database, database.vi_map.sensors, OPTIONS))
+    assert not any(one.is_outdated for one in fits_together(database, OPTIONS))
+
+
+@pytest.mark.slow
+def test_segments_from_before_and_after_a_knock_are_told_apart() -> None:
+    many = dataclasses.replace(OPTIONS, segments_per_group=20)
+    first, _ = collect(scene_map(vertices=61, noise=1.0), many)
+    held, now = first.vi_map.sensors, knocked(first.vi_map.sensors)
+    database, _ = collect(seen_by(second_session(), now), many, first)
+    is_first = [one.mission in {r.mission for r in first.records} for one in database.records]
+    assert 0 < sum(is_first) < len(is_first)
+    assert [one.is_outdated for one in fits(database, held, many)] == [not one for one in is_first]
+    assert [one.is_outdated for one in fits(database, now, many)] == is_first
+    with pytest.raises(EstimationError, match=r"changed between sessions.*--calibration"):
+        fits_together(database, many)

@@ -9,6 +9,7 @@ import pytest
 
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.problem import pose
+from maplab_py.algorithms.self_calibration.track_deviations import larger_covariance
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map, uncalibrated
 
@@ -60,3 +61,17 @@ def test_errors_of_drifting_tracks_are_as_large_as_announced() -> None:
     assert np.median(ratio) >= 1.15
     # 11 parameters, correlated, 6 seeds
     assert 0.8 <= np.sqrt(np.mean(np.square(normalised))) <= 1.2
+
+
+def test_the_larger_covariance_is_as_large_as_both() -> None:
+    first, second = np.diag([1.0, 4.0, 9.0]), np.diag([2.0, 1.0, 9.0])
+    np.testing.assert_allclose(larger_covariance(first, second), np.diag([2.0, 4.0, 9.0]))
+    rng = np.random.default_rng(0)
+    A, B = rng.normal(size=(2, 5, 8))
+    first, second = A @ A.T, B @ B.T
+    larger = larger_covariance(first, second)
+    for one in (first, second):
+        rest = np.linalg.eigvalsh(larger - one)
+        assert rest.min() >= -1e-12 * rest.max()
+        assert np.sum(np.abs(rest) <= 1e-12 * rest.max()) >= 1  # somewhere no larger
+    np.testing.assert_allclose(larger, larger_covariance(second, first))
