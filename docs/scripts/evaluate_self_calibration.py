@@ -81,6 +81,21 @@ def data_set(scenario: Scenario, number: int) -> SimulatedData:
     return simulate(dataclasses.replace(scenario, seeds=seeds, sessions=(session,)))
 
 
+def with_noise(
+    scenario: Scenario, swaps: float | None, keypoint_sigma_px: float | None, imu_noise: float
+) -> Scenario:
+    """Return the scenario with other noise; None = as it says, IMU noise as a multiple."""
+    changes = {"identity_swap_share": swaps, "keypoint_sigma_px": keypoint_sigma_px}
+    given = {name: value for name, value in changes.items() if value is not None}
+    names = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
+    scaled = {name: imu_noise * getattr(scenario.imu, name) for name in names}
+    return dataclasses.replace(
+        scenario,
+        measurement=dataclasses.replace(scenario.measurement, **given),
+        imu=dataclasses.replace(scenario.imu, **scaled),
+    )
+
+
 def evaluation_session(scenario: Scenario) -> SimulatedData:
     """Record the session on which calibrations are judged: 0.5 m/s and 40 deg/s, as the thesis'."""
     lively = {"wall_distance_m": 2.2, "shake_m": 0.05, "shake_rad": 0.15, "shake_hz": 0.7}
@@ -182,7 +197,7 @@ class DataSet:
 
 
 def measure(
-    scenario_name: str,
+    scenario: Scenario,
     sets: range,
     per_group: int,
     methods: list[str],
@@ -190,7 +205,6 @@ def measure(
     out: Path,
 ) -> None:
     """Calibrate every data set with every method; append a line each."""
-    scenario = load_scenario(scenario_name)
     done = {(row["set"], row["method"]) for row in lines_of(out)}
     judge = evaluation_session(scenario)
     first = DataSet.of(scenario, sets[0]) if (-1, "truth") not in done else None
@@ -290,13 +304,9 @@ SHORT = (
 """A motion that excites everything, short enough for 50 seeds."""
 
 
-def consistency(scenario_name: str, seeds: range, swaps: float, out: Path) -> None:
+def consistency(scenario: Scenario, seeds: range, out: Path) -> None:
     """Compare errors with announced deviations over many short batches; append a line each."""
-    scenario = load_scenario(scenario_name)
-    measurement = dataclasses.replace(scenario.measurement, identity_swap_share=swaps)
-    scenario = dataclasses.replace(
-        scenario, measurement=measurement, sessions=(SessionOptions(phases=SHORT),)
-    )
+    scenario = dataclasses.replace(scenario, sessions=(SessionOptions(phases=SHORT),))
     done = {row["set"] for row in lines_of(out)}
     for seed in seeds:
         if seed in done:
@@ -307,7 +317,7 @@ def consistency(scenario_name: str, seeds: range, swaps: float, out: Path) -> No
         error = result.parameters.difference(result.states.blocks, truth)
         row = {
             "set": seed,
-            "swaps": swaps,
+            "swaps": scenario.measurement.identity_swap_share,
             "names": list(result.parameters.names),
             "error": error.tolist(),
             "sigma": np.sqrt(np.diag(result.covariance)).tolist(),
@@ -339,7 +349,9 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", type=int, default=15)
     parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--swaps", type=float, default=0.0)
+    parser.add_argument("--swaps", type=float, help="share; 0 for consistency, else the scenario's")
+    parser.add_argument("--keypoint_sigma_px", type=float)
+    parser.add_argument("--imu_noise", type=float, default=1.0, help="times the scenario's")
     parser.add_argument("--segments_per_group", type=int, default=OPTIONS.segments_per_group)
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument(
@@ -347,15 +359,20 @@ def main() -> int:
     )
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    if arguments.what == "consistency":
+    is_consistency = arguments.what == "consistency"
+    swaps = 0.0 if is_consistency and arguments.swaps is None else arguments.swaps
+    scenario = with_noise(
+        load_scenario(arguments.scenario), swaps, arguments.keypoint_sigma_px, arguments.imu_noise
+    )
+    if is_consistency:
         seeds = range(arguments.first, arguments.first + arguments.seeds)
-        consistency(arguments.scenario, seeds, arguments.swaps, arguments.out)
+        consistency(scenario, seeds, arguments.out)
     else:
         sets = range(arguments.first, arguments.first + arguments.sets)
         methods = arguments.methods.split(",")
         judged = arguments.judged.split(",")
         per_group = arguments.segments_per_group
-        measure(arguments.scenario, sets, per_group, methods, judged, arguments.out)
+        measure(scenario, sets, per_group, methods, judged, arguments.out)
     return 0
 
 

@@ -241,6 +241,8 @@ def prune_segments(
     from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
     from maplab_py.algorithms.self_calibration.outdated import fits, fits_together
 
+    if not 0.0 < probability < 1.0:
+        raise UserError(f"--probability={probability:g}: wants a number between 0 and 1")
     before = load_database(database)
     result, tested = before, []
     prefixes = tuple(filter(None, (part.strip() for part in missions.split(","))))

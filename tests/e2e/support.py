@@ -135,6 +135,14 @@ class Console:
         fields = Path(f"/proc/{self.child.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
+    def children(self) -> list[str]:
+        """Return the command lines of the program's children."""
+        numbers = " ".join(
+            path.read_text() for path in Path(f"/proc/{self.child.pid}/task").glob("*/children")
+        )
+        commands = (Path(f"/proc/{number}/cmdline") for number in numbers.split())
+        return [path.read_text().replace("\0", " ") for path in commands if path.exists()]
+
     def status(self) -> int:
         """Wait for the end and return the exit status."""
         self.child.expect(pexpect.EOF)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -187,7 +186,9 @@ def test_ctrl_c_leaves_the_pager_and_the_prompt_has_the_keys(tmp_path: Path) -> 
     console.close()
 
 
-STAYS = "trap 'echo once more' INT; until read a < /dev/tty; do true; done; echo got $a"
+STAYS = (
+    "trap 'echo once more' INT; echo 'it' runs; until read a < /dev/tty; do true; done; echo got $a"
+)
 """A shell command that Ctrl-C does not end: it wants a line."""
 
 
@@ -195,7 +196,7 @@ def test_ctrl_c_at_a_pager_that_stays_ends_nothing_else(tmp_path: Path) -> None:
     console = Console(tmp_path, MAPLAB_PAGER=f"tail -n 1; {STAYS}")
     console.wait_for_prompt()
     console.enter("help")
-    time.sleep(1.0)
+    console.wait_for_text("\nit runs")
     console.type(CTRL_C)
     console.wait_for_text("once more")
     console.enter("a line for the pager")
@@ -208,7 +209,7 @@ def test_ctrl_c_at_a_pager_that_stays_ends_nothing_else(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", ["!sleep 30", "!sleep 30; true"])
 def test_ctrl_c_ends_a_shell_command(console: Console, line: str) -> None:
     console.enter(line)
-    time.sleep(1.0)
+    console.wait_for(lambda _: any("sleep 30" in child for child in console.children()))
     console.type(CTRL_C)
     console.wait_for(lambda _: console.last_line.endswith("maplab <>:/$"))
     console.enter("create_new_map a")
@@ -217,7 +218,7 @@ def test_ctrl_c_ends_a_shell_command(console: Console, line: str) -> None:
 
 def test_a_shell_command_that_survives_ctrl_c_keeps_the_keys(console: Console) -> None:
     console.enter("!" + STAYS)
-    time.sleep(1.0)
+    console.wait_for_text("\nit runs")
     console.type(CTRL_C)
     console.wait_for_text("once more")
     console.enter("a line for the shell")

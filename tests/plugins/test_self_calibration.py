@@ -84,6 +84,9 @@ def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None
     assert len(session.vi_map.vertices) > 10
     with pytest.raises(UserError, match="no segment"):
         session.run("prune_segments", database=database, missions="abc", **FLAGS)
+    for probability in (-1.0, 0.0, 1.0, 2.0, float("nan")):
+        with pytest.raises(UserError, match=r"--probability=.*: wants a number between 0 and 1"):
+            session.run("prune_segments", database=database, probability=probability)
 
 
 def test_information_is_drawn_and_written(session: Session, tmp_path: Path) -> None:

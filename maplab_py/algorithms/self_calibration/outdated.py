@@ -13,7 +13,7 @@ from maplab_py.algorithms.self_calibration.calibration import (
     settled,
 )
 from maplab_py.algorithms.self_calibration.curvature import with_curvature
-from maplab_py.algorithms.self_calibration.database import SegmentDatabase, with_calibration
+from maplab_py.algorithms.self_calibration.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.information import posterior_covariance
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.parameters import Parameters
@@ -22,6 +22,7 @@ from maplab_py.algorithms.self_calibration.track_deviations import (
     covariance_by_tracks,
     larger_covariance,
 )
+from maplab_py.algorithms.self_calibration.workflow import applied
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
@@ -86,18 +87,20 @@ def fits(
 
     Args:
         database: Segments.
-        sensors: The calibration to test.
+        sensors: The calibration to test; of other ids, when it has one IMU and one rig.
         options: What was estimated.
         probability: Of calling a good segment good.
         progress: Shown while segments are tested.
+
+    Raises:
+        UserError: The calibration is of other cameras, or it is not clear of which.
     """
     from scipy.stats import chi2
 
     result = []
     for number, record in enumerate(database.records):
         progress.step(number, len(database), "test segments")
-        own = database.map_of(record)
-        own = own.replace(sensors=with_calibration(own.sensors, sensors))
+        own = applied(database.map_of(record), sensors)
         problem = pose(with_curvature(own) if options.imu_curvature else own, options)
         states, _, _ = settled(problem, options, SILENT)
         change = problem.parameters.difference(states.blocks, problem.posed.states.blocks)

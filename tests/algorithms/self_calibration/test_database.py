@@ -15,7 +15,7 @@ from maplab_py.algorithms.self_calibration.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
 from maplab_py.algorithms.self_calibration.outdated import fits, fits_together
 from maplab_py.errors import EstimationError, UserError
-from maplab_py.sensors import CameraRig, SensorSet
+from maplab_py.sensors import CameraRig, Distortion, SensorSet
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import (
     OPTIONS,
@@ -146,12 +146,34 @@ def knocked(sensors: SensorSet) -> SensorSet:
     return dataclasses.replace(sensors, sensors=changed)
 
 
+def renamed(sensors: SensorSet) -> SensorSet:
+    """Return the same device under other ids, as another recording may have it."""
+    other = {key: key[::-1] for key in sensors.sensors}
+    return SensorSet(
+        {
+            other[key]: dataclasses.replace(one, id=other[key])
+            for key, one in sensors.sensors.items()
+        },
+        {
+            other[key]: dataclasses.replace(one, base_sensor_id=other[one.base_sensor_id])
+            for key, one in sensors.extrinsics.items()
+        },
+    )
+
+
+def test_a_calibration_of_other_cameras_is_not_passed_over() -> None:
+    other = scene_map(vertices=61, seed=3, distortion=Distortion.RADTAN).sensors
+    with pytest.raises(UserError, match="of other cameras"):
+        fits(collected(), other, OPTIONS)
+
+
 @pytest.mark.slow
 def test_segments_of_a_device_that_changed_are_found() -> None:
     database = collected()
     sensors = database.vi_map.sensors
     assert not any(one.is_outdated for one in fits(database, sensors, OPTIONS))
     assert all(one.is_outdated for one in fits(database, knocked(sensors), OPTIONS))
+    assert all(one.is_outdated for one in fits(database, renamed(knocked(sensors)), OPTIONS))
 
 
 @pytest.mark.slow
