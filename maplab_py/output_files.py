@@ -1,19 +1,22 @@
-"""Files that commands write: complete or not at all, and never in place of others unasked.
+"""Output files of commands: written completely or not at all, and replaced only on request.
 
-Inside `planning()` nothing reaches the disk: everything is checked and made as ever, and what would
-have been written is noted instead. That is how commands that write files are tried (--dry_run).
+Inside `planning()` nothing is written: everything is checked and computed as usual, and the files
+are recorded instead. --dry_run uses this. Inside `staging()` files are written under temporary
+names and published together: a command that fails or is cancelled leaves no files.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import tempfile
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 
+from maplab_py.atomic import PendingFile, replaced_file
+from maplab_py.atomic.targets import reason, resolved
+from maplab_py.cancellation import cleaned_up
 from maplab_py.errors import UserError
 
 
@@ -26,7 +29,7 @@ class PlannedFile:
     replaces: bool
 
     def __str__(self) -> str:
-        """Say what would happen, in a few words."""
+        """Describe the planned action."""
         verb = "replace" if self.replaces else "write"
         return f"would {verb} {self.path} ({self.size_bytes:,} bytes)"
 
@@ -36,7 +39,7 @@ _planned: ContextVar[list[PlannedFile] | None] = ContextVar("planned", default=N
 
 @contextmanager
 def planning() -> Iterator[list[PlannedFile]]:
-    """Note files instead of writing them, in this thread; gives the list of what was noted."""
+    """Record files instead of writing them, in this thread; yields the list of planned files."""
     noted: list[PlannedFile] = []
     token = _planned.set(noted)
     try:
@@ -45,15 +48,98 @@ def planning() -> Iterator[list[PlannedFile]]:
         _planned.reset(token)
 
 
+class StagedFiles:
+    """Complete files under temporary names that are published together."""
+
+    def __init__(self) -> None:
+        """Start without files."""
+        self.files: list[PendingFile] = []
+
+    def add(self, path: Path, chunks: Iterable[bytes]) -> None:
+        """Write a file under a temporary name; one that fails leaves nothing to be published.
+
+        Raises:
+            UserError: It cannot be written.
+            Cancelled: The running command has been cancelled.
+        """
+        target = resolved(path)
+        for earlier in [pending for pending in self.files if pending.target == target]:
+            self.files.remove(earlier)
+            earlier.discard()
+        try:
+            pending = PendingFile(path)
+            self.files.append(pending)
+            try:
+                pending.write(chunks)
+            except BaseException:
+                self.files.remove(pending)
+                pending.discard()
+                raise
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({reason(error)})") from error
+
+    def publish(self) -> None:
+        """Rename all files to their final names.
+
+        Raises:
+            UserError: One of them cannot be renamed; earlier ones have been published.
+        """
+        while self.files:
+            self.files[0].publish()
+            self.files.pop(0).discard()
+
+    def remove(self) -> None:
+        """Delete the unpublished files and the folders that were created for them."""
+        for pending in reversed(self.files):
+            pending.remove()
+
+    def discard(self) -> None:
+        """Delete the unpublished files and release their locks."""
+        for pending in reversed(self.files):
+            pending.discard()
+        self.files.clear()
+
+
+_staged: ContextVar[StagedFiles | None] = ContextVar("staged", default=None)
+
+
+@contextmanager
+def staging(*, enabled: bool = True) -> Iterator[StagedFiles]:
+    """Keep the files that this thread writes under temporary names until `publish` is called.
+
+    Unpublished files are deleted at the end of the block, or when the running command is abandoned.
+
+    Args:
+        enabled: If False, each file is published immediately.
+    """
+    staged = StagedFiles()
+    token = _staged.set(staged if enabled else None)
+    try:
+        with cleaned_up(staged.remove):
+            yield staged
+    finally:
+        staged.discard()
+        _staged.reset(token)
+
+
 def check_writable(path: Path, *, overwrite: bool) -> None:
     """Refuse a file that exists, before any work is done.
 
     Raises:
-        UserError: The file exists and `overwrite` is not set, or it is a folder.
+        UserError: The file exists and `overwrite` is not set, or it is a folder, a device, a socket
+            or a pipe.
     """
-    if path.is_dir():
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    if stat.S_ISDIR(mode):
         raise UserError(f"{path} is a folder: name a file")
-    if path.exists() and not overwrite:
+    if not stat.S_ISREG(mode):
+        raise UserError(f"{path} is neither a file nor a folder: name a file")
+    if not overwrite:
         raise UserError(f"{path} exists already: give --overwrite to replace it")
 
 
@@ -63,7 +149,9 @@ def write_text(path: Path, chunks: Iterable[str], *, overwrite: bool = False) ->
 
 
 def write_bytes(path: Path, chunks: Iterable[bytes], *, overwrite: bool = False) -> None:
-    """Write a file at once: it is either there completely or not at all. Folders are made.
+    """Write a file at once: completely or not at all. Folders are created.
+
+    A symbolic link stays; the file that it names is written.
 
     Raises:
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
@@ -74,25 +162,9 @@ def write_bytes(path: Path, chunks: Iterable[bytes], *, overwrite: bool = False)
         size_bytes = sum(len(chunk) for chunk in chunks)
         noted.append(PlannedFile(path, size_bytes, path.exists()))
         return
-    temporary = ""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(handle, "wb") as stream:
-            stream.writelines(chunks)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-        temporary = ""
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current
+    staged = _staged.get()
+    if staged is not None:
+        staged.add(path, chunks)
+        return
+    with replaced_file(path) as stream:
+        stream.writelines(chunks)

@@ -9,23 +9,42 @@ named in the entry-point group ``maplab_py.plugins`` of its distribution. See
 docs/writing_plugins.md, also for what of this is promised to stay.
 """
 
-from maplab_py.console.command import command
-from maplab_py.console.context import CommandContext
-from maplab_py.console.importing import importer
-from maplab_py.console.maps import key_of_folder
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from maplab_py.console.commands.command import command
+from maplab_py.console.session.context import CommandContext
+from maplab_py.console.session.importing import importer
+from maplab_py.console.session.maps import key_of_folder
+from maplab_py.console.session.missions import ALL_MISSIONS, MissionChoice
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
-from maplab_py.estimation.extension import ResidualRows, residual
 from maplab_py.options import option
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import Progress
 from maplab_py.report import Message, Report
-from maplab_py.viewer.extension import LayerLines, LayerPoints, viewer_layer
-from maplab_py.vimap import VIMap
 
-API_VERSION = (1, 2)
+if TYPE_CHECKING:
+    from maplab_py.estimation.terms.extension import ResidualRows, residual
+    from maplab_py.viewer.extension import LayerLines, LayerPoints, viewer_layer
+    from maplab_py.vimap import VIMap
+
+_IMPORTED_ON_USE = {
+    "VIMap": "maplab_py.vimap",
+    "ResidualRows": "maplab_py.estimation.terms.extension",
+    "residual": "maplab_py.estimation.terms.extension",
+    "LayerLines": "maplab_py.viewer.extension",
+    "LayerPoints": "maplab_py.viewer.extension",
+    "viewer_layer": "maplab_py.viewer.extension",
+}
+"""Modules that commands without such a need, and `help`, do not wait for."""
+
+API_VERSION = (1, 4)
 """Version of what this file exports: (breaking changes, additions)."""
 
 __all__ = [
+    "ALL_MISSIONS",
     "API_VERSION",
     "Cancelled",
     "CommandContext",
@@ -35,6 +54,7 @@ __all__ = [
     "LayerPoints",
     "MapError",
     "Message",
+    "MissionChoice",
     "Progress",
     "Report",
     "ResidualRows",
@@ -50,3 +70,10 @@ __all__ = [
     "write_bytes",
     "write_text",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what few plugins need when it is asked for."""
+    if name in _IMPORTED_ON_USE:
+        return getattr(importlib.import_module(_IMPORTED_ON_USE[name]), name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -1,4 +1,4 @@
-"""How a long computation tells how far it is and learns that it shall stop."""
+"""Progress of long computations, and their cancellation."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Reports: what an algorithm found, as small dataclasses of numbers that a user would ask for."""
+"""Reports: results of an algorithm as small dataclasses of numbers that a user would ask for."""
 
 from __future__ import annotations
 
 import dataclasses
 import html
+import json
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
@@ -19,7 +20,7 @@ SCHEMA_VERSION = 1
 class Report:
     """Base of every report. Subclasses are frozen dataclasses; fields are the facts.
 
-    A report that describes a failure (an inconsistent map, nothing found) overrides `failure`:
+    A report that describes a failure (an inconsistent map, an empty result) overrides `failure`:
     the console then prints the report and the command's status is 1.
     """
 
@@ -28,18 +29,38 @@ class Report:
         """One line that says why the command failed although it ran; empty when it succeeded."""
         return ""
 
+    @property
+    def advice(self) -> str:
+        """One line on what to do next, empty where nothing is known; the prompt shows it."""
+        return ""
+
     def as_text(self) -> str | None:
         """Return the report as people shall read it; None lets the console lay out the fields."""
         return None
 
-    def as_json(self) -> dict[str, Any]:
+    def display(self) -> Any:
+        """Return the dataclass that the console lays out: the report, or one with less detail."""
+        return self
+
+    def as_dict(self) -> dict[str, Any]:
         """Return the report's fields as plain JSON types."""
         return {f.name: to_json(getattr(self, f.name)) for f in dataclasses.fields(self)}
 
+    def as_json(self, indent: int | None = None) -> str:
+        """Return the report's fields as JSON text.
+
+        Args:
+            indent: Spaces of each level; None = one line.
+        """
+        return json.dumps(self.as_dict(), indent=indent, ensure_ascii=False)
+
     def _repr_html_(self) -> str:
         """Return the report as tables, for notebooks."""
+        shown = self.display()
         text = self.as_text()
-        return f"<pre>{html.escape(text)}</pre>" if text is not None else to_html(self.as_json())
+        if text is None and isinstance(shown, Report):
+            text = shown.as_text()
+        return f"<pre>{html.escape(text)}</pre>" if text is not None else to_html(to_json(shown))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +74,15 @@ class Message(Report):
         return self.text
 
 
+def counted(count: int, singular: str, plural: str = "") -> str:
+    """Return a number with its noun: 1 map, 2 maps, 3 vertices."""
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"
+
+
 def to_json(value: Any) -> Any:
     """Convert dataclasses, numpy values, paths and enums to plain JSON types."""
     if isinstance(value, Report):
-        return value.as_json()
+        return value.as_dict()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):

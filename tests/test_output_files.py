@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.output_files import check_writable, planning, write_bytes, write_text
+from maplab_py.output_files import check_writable, planning, staging, write_bytes, write_text
 
 
 def test_text_is_written_as_it_is_given(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_failure_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
         write_text(path, chunks(), overwrite=True)
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
-    with pytest.raises(UserError, match=r"cannot write .*(File exists|Not a directory)"):
+    with pytest.raises(UserError, match=r"cannot be written \((File exists|Not a directory)\)"):
         write_text(path / "below", ["x"])
 
 
@@ -70,3 +70,19 @@ def test_planned_files_are_checked_and_noted(tmp_path: Path) -> None:
     assert not new.parent.exists()
     write_text(new, ["now"])
     assert new.read_text() == "now"
+
+
+def test_a_staged_file_that_fails_is_not_published_with_the_others(tmp_path: Path) -> None:
+    def chunks() -> Iterator[str]:
+        yield "half"
+        raise UserError("half a file")
+
+    with staging() as staged:
+        write_text(tmp_path / "first", ["1"])
+        with pytest.raises(UserError, match="half a file"):
+            write_text(tmp_path / "new" / "second", chunks())
+        write_text(tmp_path / "first", ["2"])
+        assert [path.name for path in tmp_path.iterdir()] == [".first.saving"]
+        staged.publish()
+    assert [path.name for path in tmp_path.iterdir()] == ["first"]
+    assert (tmp_path / "first").read_text() == "2"

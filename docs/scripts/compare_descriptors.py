@@ -41,6 +41,8 @@ def distances(maps: list[VIMap], points: list[I64] | None = None) -> dict[str, I
     found: dict[str, list[I64]] = {"same": [], "different": []}
     for number, vi_map in enumerate(maps):
         rows = vi_map.observations
+        if not (vi_map.binary_descriptor_size[rows] > 0).all():
+            raise SystemExit("the map has observations without a binary descriptor")
         landmark = vi_map.keypoints.landmark[rows].astype(np.int64)
         point = landmark if points is None else points[number][landmark]
         descriptor = vi_map.keypoints.descriptor[rows]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
 from maplab_py.simulation.scenario_file import load_scenario

@@ -1,4 +1,4 @@
-"""Write docs/commands from the registry: an index, and one page per plugin; list the decisions.
+"""Write docs/commands from the registry, and the indexes of decisions and studies.
 
 python docs/scripts/generate_command_pages.py
 """
@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.console.command import Command
-from maplab_py.console.flags import Flag
-from maplab_py.console.registry import Plugin, Registry, load_registry
+from maplab_py.console.commands.command import Command
+from maplab_py.console.commands.flags import Flag
+from maplab_py.console.commands.registry import Plugin, Registry, load_registry
 
 FOLDER = Path(__file__).resolve().parents[1] / "commands"
 DECISIONS = FOLDER.with_name("decisions")
+STUDIES = FOLDER.with_name("studies")
 _NOTE = "<!-- made by docs/scripts/generate_command_pages.py; do not edit -->\n"
 
 
@@ -32,6 +33,20 @@ def decisions() -> str:
     for path in sorted(DECISIONS.glob("0*.md")):
         title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
         lines.append(f"- [{title}]({path.name})")
+    return "\n".join(lines) + "\n"
+
+
+def studies() -> str:
+    """Return the list of studies, each with the question that it answers."""
+    lines = [_NOTE, "# Studies\n"]
+    lines += ["Experiments behind the decisions: question, answer, limits, figures.\n"]
+    for path in sorted(STUDIES.glob("*.md")):
+        if path.name == "index.md":
+            continue
+        text = path.read_text(encoding="utf-8")
+        title = text.splitlines()[0].lstrip("# ")
+        question = text.split("**Question.** ", 1)[1].split("\n\n", 1)[0]
+        lines.append(f"- [{title}]({path.name}): {' '.join(question.split())}")
     return "\n".join(lines) + "\n"
 
 
@@ -94,6 +109,7 @@ def main() -> None:
     for name, text in texts.items():
         (FOLDER / name).write_text(text, encoding="utf-8")
     (DECISIONS / "index.md").write_text(decisions(), encoding="utf-8")
+    (STUDIES / "index.md").write_text(studies(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.console.registry import Registry, load_registry
+from maplab_py.console.commands.registry import Registry, load_registry
 
 DOCS = Path(__file__).resolve().parents[1]
 PAGE = DOCS / "migration.md"

@@ -1,4 +1,4 @@
-"""Rebuild Fig. 5.6 of the thesis: how small a map may become before localisation suffers.
+"""Rebuild Fig. 5.6 of Schneider 2019: how small a map may become before localisation suffers.
 
 python docs/scripts/map_maintenance.py [--work=FOLDER] [--optimised]
 
@@ -38,7 +38,7 @@ from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import choose, coverage_problem
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map, rounded
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate

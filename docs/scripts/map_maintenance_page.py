@@ -187,7 +187,7 @@ def _smallest(points: list[Point], whole: Point) -> list[str]:
         f"- The smallest map that keeps {100 * _WANTED_SHARE:.0f} % of the recall is {how}pruned by "
         f"{100 * best.pruned:.0f} %: maplab's file is {_ratio(whole, best, maplab=True):.0f} times "
         f"smaller, ours {_ratio(whole, best):.0f} times, and it keeps "
-        f"{100 * best.recall / whole.recall:.0f} % of the recall (the thesis: 13 times, 85 %)."
+        f"{100 * best.recall / whole.recall:.0f} % of the recall (Schneider 2019: 13 times, 85 %)."
     ]
 
 

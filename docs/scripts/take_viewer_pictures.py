@@ -17,7 +17,7 @@ import numpy as np
 from maplab_plugins.visualization.following import Following
 from playwright.sync_api import sync_playwright
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.viewer.display.picture import HEADLESS_FLAGS, find_browser
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.picking import Pick

@@ -4,65 +4,98 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from functools import partial
+from multiprocessing.process import BaseProcess
 from typing import IO
 
+from maplab_py.algorithms.dense.warmup import compile_dense
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
-from maplab_py.algorithms.vi_optimization.warmup import optimizer_jobs
+from maplab_py.cancellation import cleaned_up
 from maplab_py.compilation import is_missing_on_disk
+from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.codegen.modules import cache_folder
-from maplab_py.estimation.relative_pose_kernels import normal_equations
+from maplab_py.estimation.symbolic.sources import PoseError
+from maplab_py.estimation.warmup import optimizer_jobs
+from maplab_py.estimation.window.warmup import window_jobs
+from maplab_py.interop.colmap.point_scan_kernel import compile_kernels as compile_colmap_points
 from maplab_py.progress import Progress
+from maplab_py.storage.warmup import compile_scan
 from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.pose_kernels import search_poses
 from maplab_py.vision.search_kernels import search_cells
-from maplab_py.vision.warmup import compile_poses, compile_search
+from maplab_py.vision.warmup import SEARCH, pose_job, vision_jobs
 
-POSES, RELAXATION = f"absolute pose by {HYPOTHESES[0]}", "relaxation"
-SEARCH = "descriptor search"
-_SAMPLES = {POSES: search_poses, SEARCH: search_cells, RELAXATION: normal_equations}
-"""Jobs that can be done ahead, each with a kernel that tells by being on the disk that it is done."""
+POSES, RELAXATION = pose_job(HYPOTHESES[0]), "relaxation"
+
+
+def _sample(job: str) -> Callable[..., object]:
+    """Return a kernel of a job that can be done ahead: once it is on the disk the job is done."""
+    if job == RELAXATION:
+        kernel: Callable[..., object] = pose_graph_kernels(PoseError.SPLIT).normal_equations
+        return kernel
+    return {POSES: search_poses, SEARCH: search_cells}[job]
 
 
 def _jobs() -> dict[str, Callable[[], None]]:
-    jobs = {**optimizer_jobs(), SEARCH: compile_search, RELAXATION: compile_relaxation}
-    for hypotheses in HYPOTHESES:
-        jobs[f"absolute pose by {hypotheses}"] = partial(compile_poses, hypotheses)
-    return jobs
+    others = {
+        RELAXATION: compile_relaxation,
+        "message scan": compile_scan,
+        "dense maps": compile_dense,
+        "COLMAP points": compile_colmap_points,
+    }
+    return {**optimizer_jobs(), **window_jobs(), **vision_jobs(), **others}
 
 
-def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
+def compile_kernels(
+    progress: Progress, additional: Mapping[str, Callable[[], None]] | None = None
+) -> tuple[list[str], float, str]:
     """Compile all kernels; return their names, the time it took [s], and the cache folder.
 
     Several processes compile at a time; what they make is shared through the cache folder.
+
+    Args:
+        progress: Is told about every job.
+        additional: Functions of modules that compile the kernels of layers above this one, by name.
     """
     began = time.perf_counter()
-    jobs = list(_jobs())
+    above = additional or {}
+    jobs = [*_jobs(), *above]
     workers = min(len(jobs), os.cpu_count() or 1)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        pending = {pool.submit(_compile, job) for job in reversed(jobs)}
-        try:
-            while pending:
-                progress.step(len(jobs) - len(pending), len(jobs), "compile kernels")
-                done, pending = wait(pending, timeout=0.2)
-                for future in done:
-                    future.result()
-        finally:
-            for future in pending:
-                future.cancel()
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_ignore_ctrl_c)
+    with cleaned_up(lambda: _end(pool, others)):
+        pending = {pool.submit(above.get(job, partial(_compile, job))) for job in reversed(jobs)}
+        while pending:
+            progress.step(len(jobs) - len(pending), len(jobs), "compile kernels")
+            done, pending = wait(pending, timeout=0.2)
+            for future in done:
+                future.result()
     progress.step(len(jobs), len(jobs), "compile kernels")
     return [job.lower() for job in jobs], time.perf_counter() - began, str(cache_folder())
 
 
+def _end(pool: ProcessPoolExecutor, others: set[BaseProcess]) -> None:
+    """End the processes of a pool, whatever they do."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in set(multiprocessing.active_children()) - others:
+        process.kill()
+
+
+def _ignore_ctrl_c() -> None:
+    """Leave Ctrl-C, which the terminal sends to all processes, to the console."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _compile(job: str) -> None:
-    """Compile one kernel, in a process of its own."""
+    """Compile one kernel in a separate process."""
     _jobs()[job]()
 
 
@@ -75,7 +108,7 @@ class CompilationAhead:
 
     def __init__(self, jobs: Sequence[str]) -> None:
         """Start; jobs whose kernels are on the disk are left out, and all on a single core."""
-        wanted = [job for job in jobs if is_missing_on_disk(_SAMPLES[job])]
+        wanted = [job for job in jobs if is_missing_on_disk(_sample(job))]
         self._done = {job: threading.Event() for job in wanted}
         self._process: subprocess.Popen[str] | None = None
         if not wanted or (os.cpu_count() or 1) < 2:

@@ -12,12 +12,9 @@ from collections.abc import Iterable, Iterator
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 class Manifold(Enum):

@@ -7,11 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.estimation.blocks import ParameterBlock, ParameterBlocks
 from maplab_py.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 NODES_PER_VERTEX = 5
 """Nodes of three numbers each: position, orientation, velocity, gyroscope and accelerometer bias.
@@ -53,6 +51,13 @@ class States:
     def num_nodes(self) -> int:
         """Nodes of vertices and blocks."""
         return self.num_vertex_nodes + self.blocks.num_nodes
+
+    @property
+    def node_positions(self) -> F64:
+        """Position in G (nodes, 3) of each node's vertex; those of blocks have none, not-a-number."""
+        result = np.full((self.num_nodes, 3), np.nan)
+        result[: self.num_vertex_nodes] = np.repeat(self.T_G_I[:, 4:], NODES_PER_VERTEX, axis=0)
+        return result
 
     def nodes(self, block: str) -> I64:
         """Return the nodes (N, nodes each) of a block."""

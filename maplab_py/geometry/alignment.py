@@ -1,14 +1,13 @@
-"""The rigid, similarity or yaw-and-position motion that best lays one point set on another."""
+"""Least-squares alignment of point sets: rigid, similarity, or yaw and position."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3, yaw
-
-F64 = NDArray[np.float64]
 
 _RANK_TOLERANCE = 1e-12
 """Second singular value of the cross covariance, relative to the first, below which points are on a line."""
@@ -17,8 +16,7 @@ _RANK_TOLERANCE = 1e-12
 def umeyama(p_A: ArrayLike, p_B: ArrayLike, *, with_scale: bool = False) -> tuple[F64, float]:
     """Return (T_A_B (7,), scale) that minimise sum |p_A - (scale R_A_B p_B + p_A_B)|^2.
 
-    Source: Umeyama, Least-squares estimation of transformation parameters between two point
-    patterns, TPAMI 1991, eq. (34)-(42).
+    Source: Umeyama 1991, eq. (34)-(42).
 
     Args:
         p_A: Points (N, 3) in A.
@@ -44,19 +42,26 @@ def umeyama(p_A: ArrayLike, p_B: ArrayLike, *, with_scale: bool = False) -> tupl
     return se3.make(q_A_B, mean_a - scale * R_A_B @ mean_b), scale
 
 
-def align_yaw_position(p_A: ArrayLike, p_B: ArrayLike) -> F64:
-    """Return T_A_B (7,), a yaw about z and a position, that minimises sum |p_A - T_A_B p_B|^2.
+def align_yaw_position(p_A: ArrayLike, p_B: ArrayLike, weight: ArrayLike | None = None) -> F64:
+    """Return T_A_B (7,), a yaw about z and a position, that minimises sum w |p_A - T_A_B p_B|^2.
+
+    Args:
+        p_A: Points (N, 3) in A.
+        p_B: The same points (N, 3) in B.
+        weight: Weights (N,), not negative and not all zero; None = equal ones.
 
     Raises:
         EstimationError: Fewer than two points, not finite, or no horizontal extent.
     """
     a, b = _checked_points(p_A, p_B, minimum=2)
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    w = np.ones(len(a)) if weight is None else np.asarray(weight, dtype=np.float64)
+    mean_a, mean_b = (np.sum(w[:, None] * points, axis=0) / np.sum(w) for points in (a, b))
     u, v = (a - mean_a)[:, :2], (b - mean_b)[:, :2]
-    # sum |u - R v|^2 is least where the angle of sum conj(v) u is undone
-    cosine = float(np.sum(u * v))
-    sine = float(np.sum(v[:, 0] * u[:, 1] - v[:, 1] * u[:, 0]))
-    extent = float(np.linalg.norm(u) * np.linalg.norm(v))
+    # sum w |u - R v|^2 is least where the angle of sum w conj(v) u is undone
+    cosine = float(np.sum(w[:, None] * u * v))
+    sine = float(np.sum(w * (v[:, 0] * u[:, 1] - v[:, 1] * u[:, 0])))
+    root = np.sqrt(w)[:, None]
+    extent = float(np.linalg.norm(root * u) * np.linalg.norm(root * v))
     if extent == 0.0 or np.hypot(cosine, sine) <= _RANK_TOLERANCE * extent:
         raise EstimationError(
             f"cannot align {len(a)} points: they have no horizontal extent in common, so the yaw "

@@ -1,15 +1,13 @@
-"""Poses and vectors between time stamps."""
+"""Interpolation of poses and vectors between time stamps."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maplab_py.array_types import F64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import so3
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def slerp(q_A_B: ArrayLike, q_A_C: ArrayLike, fraction: ArrayLike) -> F64:

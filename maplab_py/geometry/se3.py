@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maplab_py.array_types import F64
 from maplab_py.geometry import so3
-
-F64 = NDArray[np.float64]
 
 
 def identity(*batch: int) -> F64:
@@ -96,14 +95,3 @@ def log(T_A_B: ArrayLike) -> F64:
     phi = so3.log(T[..., :4])
     rho = (so3.right_jacobian_inverse(-phi) @ T[..., 4:, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
-
-
-def adjoint(T_A_B: ArrayLike) -> F64:
-    """Return Ad (..., 6, 6) with T exp(d) = exp(Ad d) T for tangents [rho, phi]."""
-    T = np.asarray(T_A_B, dtype=np.float64)
-    R = so3.to_matrix(T[..., :4])
-    Ad = np.zeros((*T.shape[:-1], 6, 6))
-    Ad[..., :3, :3] = R
-    Ad[..., :3, 3:] = so3.skew(T[..., 4:]) @ R
-    Ad[..., 3:, 3:] = R
-    return Ad

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
+from maplab_py.array_types import F64
 
 _SMALL_ANGLE_RAD = 1e-4
 """Below this angle the Taylor series (error < 1e-17 relative) replace the closed forms."""
@@ -123,16 +123,16 @@ def from_matrix(R_A_B: ArrayLike) -> F64:
         R[..., 1, 0] - R[..., 0, 1],
     )
     # 4 q q^T, row by row: each row is the quaternion times 4 times one of its components
-    outer = np.stack(
-        [
-            np.stack([1 + m00 - m11 - m22, sum01, sum02, d21], axis=-1),
-            np.stack([sum01, 1 - m00 + m11 - m22, sum12, d02], axis=-1),
-            np.stack([sum02, sum12, 1 - m00 - m11 + m22, d10], axis=-1),
-            np.stack([d21, d02, d10, 1 + m00 + m11 + m22], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(np.stack([outer[..., i, i] for i in range(4)], axis=-1), axis=-1)
+    outer = np.empty((*R.shape[:-2], 4, 4))
+    outer[..., 0, 0], outer[..., 1, 1] = 1 + m00 - m11 - m22, 1 - m00 + m11 - m22
+    outer[..., 2, 2], outer[..., 3, 3] = 1 - m00 - m11 + m22, 1 + m00 + m11 + m22
+    outer[..., 0, 1] = outer[..., 1, 0] = sum01
+    outer[..., 0, 2] = outer[..., 2, 0] = sum02
+    outer[..., 1, 2] = outer[..., 2, 1] = sum12
+    outer[..., 0, 3] = outer[..., 3, 0] = d21
+    outer[..., 1, 3] = outer[..., 3, 1] = d02
+    outer[..., 2, 3] = outer[..., 3, 2] = d10
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     q = normalize(np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :])
     return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
 
@@ -140,7 +140,7 @@ def from_matrix(R_A_B: ArrayLike) -> F64:
 def right_jacobian(phi: ArrayLike) -> F64:
     """Return J_r (..., 3, 3) with exp(phi + d) = exp(phi) exp(J_r d) to first order.
 
-    Source: Forster et al., On-Manifold Preintegration, TRO 2017, eq. (8).
+    Source: Forster 2017, eq. (8).
     """
     phi = np.asarray(phi, dtype=np.float64)
     K = skew(phi)

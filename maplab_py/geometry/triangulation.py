@@ -1,4 +1,4 @@
-"""Points from rays: linear triangulation of many points at once, and the angle between their rays.
+"""Linear triangulation of many points at once, and the angles between their rays.
 
 Rays of one point are consecutive rows; `start` (L + 1) holds the offsets, as everywhere.
 """
@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-F64 = NDArray[np.float64]
+from maplab_py.array_types import F64
 
 _MIN_RELATIVE_EIGENVALUE = 1e-12
 """Two rays 2e-6 rad apart have this ratio of the smallest eigenvalue to the number of rays."""
 _PAIRS_AT_ONCE = 1 << 21
-"""Ray pairs that are compared in one go: bounds the memory to some 50 MB."""
+"""Number of ray pairs per batch; bounds the memory to about 50 MB."""
 
 
 def triangulate(

@@ -7,9 +7,9 @@ An element is a row [px py pz yaw] of T_A_B with both frames' z axes along gravi
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
+from maplab_py.array_types import F64
 
 _SMALL_ANGLE_RAD = 1e-4
 """Below this angle the Taylor series (error < 1e-17 relative) replace the closed forms."""

@@ -1,1 +1,1 @@
-"""Other people's file formats: trajectories, IMU recordings and tables, in and out."""
+"""Readers and writers of external formats: trajectories, IMU recordings, tables, meshes."""

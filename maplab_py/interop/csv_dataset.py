@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.interop.text_table import format_rows
 from maplab_py.options import option
 from maplab_py.output_files import check_writable, write_text
@@ -24,8 +25,6 @@ from maplab_py.report import Report
 from maplab_py.vimap import VIMap, ids
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import LandmarkQuality
-
-I64 = NDArray[np.int64]
 
 _VERTICES = (
     "vertex index, timestamp [ns], position x [m], position y [m], position z [m], quaternion x, "
@@ -51,14 +50,16 @@ _NUMBER = ", %.17g"
 
 @dataclasses.dataclass(frozen=True)
 class CsvExportOptions:
-    """Which tables to write."""
+    """Tables to write."""
 
     flag_prefix: ClassVar[str] = "csv_export_"
 
     vertices: bool = option(True, help="Write vertices.csv")
     imu_data: bool = option(True, help="Write imu.csv")
     tracks_and_keypoints: bool = option(True, help="Write tracks.csv")
-    descriptors: bool = option(True, help="Write descriptors.csv")
+    descriptors: bool = option(
+        True, help="Write descriptors.csv (binary descriptors; else empty rows)"
+    )
     landmarks: bool = option(True, help="Write landmarks.csv")
     observations: bool = option(True, help="Write observations.csv")
     absolute_time: bool = option(
@@ -75,7 +76,7 @@ class CsvExportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class CsvExportReport(Report):
-    """What was written."""
+    """Written files and numbers of rows."""
 
     folder: Path
     missions: int
@@ -112,11 +113,11 @@ def export_csv_dataset(
 
     Args:
         vi_map: Map.
-        folder: Where to; made when it does not exist.
-        options: Which tables.
+        folder: Output folder; created if it does not exist.
+        options: Tables to write.
         missions: Mission rows; None = all.
         overwrite: Replace files that exist.
-        progress: Told of each file.
+        progress: Reports progress by file.
 
     Raises:
         UserError: A file exists and `overwrite` is not set (nothing is written then), or a file
@@ -235,15 +236,18 @@ def _tracks(vi_map: VIMap, part: _Part) -> Iterator[str]:
 
 
 def _descriptors(vi_map: VIMap, part: _Part) -> Iterator[str]:
-    """Yield descriptors as fixed-width text; rows are as many as in tracks.csv, without a header."""
+    """Yield descriptors as fixed-width text; rows are as many as in tracks.csv, without a header.
+
+    The row of a keypoint without a binary descriptor is empty.
+    """
     digits = "".join(f"{byte:3d}," for byte in range(256)).encode()
     text_of_byte = np.frombuffer(digits, dtype=np.uint8).reshape(256, 4)
-    frames = vi_map.keypoint_frame[part.keypoints]
-    cuts = np.flatnonzero(np.diff(vi_map.frames.descriptor_size[frames])) + 1
+    sizes = vi_map.binary_descriptor_size
+    cuts = np.flatnonzero(np.diff(sizes[part.keypoints])) + 1
     for run in np.split(part.keypoints, cuts):
         if len(run) == 0:
             continue
-        size = int(vi_map.frames.descriptor_size[vi_map.keypoint_frame[run[0]]])
+        size = int(sizes[run[0]])
         if size == 0:
             yield "\n" * len(run)
             continue

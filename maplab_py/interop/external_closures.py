@@ -1,7 +1,7 @@
-"""Loop closures of other programs in maplab's YAML: times, poses, and the transformation between.
+"""Reader of external loop closures in maplab's YAML format: times, poses, relative poses.
 
 A list of entries with `camera_from` and `camera_to` (each `timestamp_ns` and `pose`: where that
-program believed the device to be, in G), `T_from_to`, `switch_variable`, `switch_variable_variance`
+program estimated the device in G), `T_from_to`, `switch_variable`, `switch_variable_variance`
 and `covariance` (36 numbers, position before orientation). Poses are `rotation_xyzw` and
 `translation_m`.
 """
@@ -14,21 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
+from maplab_py.input_files import read_text
+from maplab_py.report import counted
+from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import LoopClosureEdges, VIMap
 from maplab_py.vimap.edits import content_rng
 from maplab_py.vimap.ids import random_ids
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _MAX_TIME_NS = 20_000_000
-"""Entries farther in time from every vertex are left out, as maplab does."""
+"""Maximum time between an entry and a vertex, as in maplab; other entries are skipped."""
 
 
 def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges, list[str]]:
-    """Read loop closures and carry them over to the nearest vertices.
+    """Read loop closures and transform them to the nearest vertices.
 
     From the device's pose S at the entry's time to the vertex pose S2 nearby, and T to T2 at the
     other end: T_S2_T2 = T_S2_S T_S_T T_T_T2, where T_S2_S follows from the map and the entry's pose.
@@ -72,21 +73,20 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
         switch_variable_variance=switch[rows, 1],
     )
     left_out = count - len(rows)
-    notes = [f"{left_out} of {count} entries have no vertex within 20 ms"] if left_out else []
+    of = counted(count, "entry", "entries")
+    notes = [f"{left_out} of {of} without a vertex within 20 ms"] if left_out else []
     return edges, notes
 
 
 def _entries(path: Path) -> list[Any]:
-    import yaml
-
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = parse_yaml(read_text(path, error=MapError), str(path))
     except OSError as error:
         raise MapError(f"cannot read {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MapError(f"{path} is not YAML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path} is not YAML: it is not UTF-8 text") from error
     if not isinstance(content, list):
-        raise MapError(f"{path}: a list of loop closures is wanted")
+        raise MapError(f"{path}: a list of loop closures is expected")
     return content
 
 
@@ -99,7 +99,7 @@ def _pose(node: Any) -> F64:
 
 
 def _nearest(vi_map: VIMap, time_ns: I64) -> tuple[I64, NDArray[np.bool_]]:
-    """Return the vertex rows (N, 2) nearest in time, and which are near enough."""
+    """Return the vertex rows (N, 2) nearest in time and a mask of those within the limit."""
     order = np.argsort(vi_map.vertices.timestamp_ns, kind="stable")
     times = vi_map.vertices.timestamp_ns[order]
     if len(times) == 0:

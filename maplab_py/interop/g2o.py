@@ -1,5 +1,6 @@
 """Pose graphs in g2o's text format: VERTEX_SE3:QUAT, EDGE_SE3:QUAT, VERTEX_SE2, EDGE_SE2 and FIX.
 
+Files may be compressed with gzip. A file of edges alone starts from the poses along the odometry.
 Information matrices are of Log(T_measured^-1 T_A_B), position before angle, as GTSAM and SE-Sync
 read them.
 """
@@ -7,25 +8,28 @@ read them.
 from __future__ import annotations
 
 import dataclasses
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
+from maplab_py.input_files import TooLarge, inflate, read_bytes
+from maplab_py.interop.information_matrices import positive_definite
+from maplab_py.interop.odometry_chain import chained_poses
 from maplab_py.interop.text_table import format_rows
 from maplab_py.output_files import write_text
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _POSE, _PLANAR_POSE = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 _EDGE, _PLANAR_EDGE = "EDGE_SE3:QUAT", "EDGE_SE2"
 _WIDTH = {_POSE: 8, _EDGE: 30, _PLANAR_POSE: 4, _PLANAR_EDGE: 11}
+_MAX_BYTES = 500_000_000
+_GZIP, _GZIP_WINDOW = b"\x1f\x8b", 31
 _OUT_OF_PLANE = 1e4
-"""Information of the height and the tilt that a planar edge says nothing of."""
+"""Information of the height and tilt of planar edges, which they do not measure."""
 _PLANAR = np.array([0, 1, 5])
 
 
@@ -39,49 +43,75 @@ class PoseGraph:
     second: I64  # (E,)
     T_A_B: F64  # (E, 7)
     information: F64  # (E, 6, 6) position, orientation
-    fixed: I64  # rows of poses that are to stay
+    fixed: I64  # rows of fixed poses
+    num_repaired: int = 0  # edges whose information in the file was not positive definite
 
 
 def read_g2o(path: Path) -> PoseGraph:
-    """Read a pose graph.
+    """Read a pose graph, compressed with gzip or not.
+
+    Information matrices that are not positive definite are repaired; `num_repaired` counts them.
+    Without any pose in the file the poses are those along the edges.
 
     Raises:
         MapError: The file cannot be read or a line is wrong; names file and line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise MapError(f"cannot read {path}: {reason}") from error
-    found = _split(lines, path)
-    poses = [_numbers(found, kind, path) for kind in (_POSE, _PLANAR_POSE)]
-    edges = [_numbers(found, kind, path) for kind in (_EDGE, _PLANAR_EDGE)]
+    sections = _split(_text(path).splitlines(), path)
+    poses = [_numbers(sections, kind, path) for kind in (_POSE, _PLANAR_POSE)]
+    edges = [_numbers(sections, kind, path) for kind in (_EDGE, _PLANAR_EDGE)]
+    ends = np.concatenate([edges[0][0], edges[1][0]])
+    T_A_B = np.concatenate([_pose(edges[0][1][:, :7]), _planar_pose(edges[1][1][:, :3])])
     ids = np.concatenate([poses[0][0][:, 0], poses[1][0][:, 0]])
     T = np.concatenate([_pose(poses[0][1]), _planar_pose(poses[1][1])])
-    if len(ids) == 0:
+    if len(ids) == 0 and len(ends) == 0:
         raise MapError(f"{path}: there are no poses in the file")
+    if len(ids) == 0:
+        ids = np.unique(ends)
+        a, b = np.searchsorted(ids, ends).T
+        T = chained_poses(ids, a, b, T_A_B)
     order = np.argsort(ids, kind="stable")
     ids, T = ids[order], T[order]
     if np.any(ids[1:] == ids[:-1]):
         twice = ids[1:][ids[1:] == ids[:-1]][0]
-        raise MapError(f"{path}: pose {twice} is there twice")
-    ends = np.concatenate([edges[0][0], edges[1][0]])
+        raise MapError(f"{path}: pose {twice} occurs twice")
     rows = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
     missing = np.flatnonzero(ids[rows] != ends)
     if len(missing):
         raise MapError(f"{path}: an edge names pose {ends.ravel()[missing[0]]}, which is not there")
-    fixed = np.array([int(words[1]) for _, words in found.get("FIX", [])], dtype=np.int64)
+    fixed = np.array([int(words[1]) for _, words in sections.get("FIX", [])], dtype=np.int64)
+    information, num_repaired = positive_definite(
+        np.concatenate(
+            [_symmetric(edges[0][1][:, 7:], 6), _lifted(_symmetric(edges[1][1][:, 3:], 3))]
+        )
+    )
     return PoseGraph(
         id=ids,
         T_G_V=T,
         first=rows[:, 0],
         second=rows[:, 1],
-        T_A_B=np.concatenate([_pose(edges[0][1][:, :7]), _planar_pose(edges[1][1][:, :3])]),
-        information=np.concatenate(
-            [_symmetric(edges[0][1][:, 7:], 6), _lifted(_symmetric(edges[1][1][:, 3:], 3))]
-        ),
+        T_A_B=T_A_B,
+        information=information,
         fixed=np.flatnonzero(np.isin(ids, fixed)),
+        num_repaired=num_repaired,
     )
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file, unpacked if it is compressed."""
+    remedy = "split it into parts"
+    try:
+        content = read_bytes(path, _MAX_BYTES, remedy=remedy, error=MapError)
+        if content.startswith(_GZIP):
+            content = bytes(inflate(content, _MAX_BYTES, wbits=_GZIP_WINDOW)[0])
+        return content.decode("utf-8")
+    except TooLarge as error:
+        raise MapError(f"{path}: unpacks to {error}; {remedy}") from error
+    except (EOFError, zlib.error) as error:
+        raise MapError(f"{path}: is damaged: wrong gzip data; copy it again") from error
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"cannot read {path}: it is not text") from error
 
 
 def write_g2o(graph: PoseGraph, path: Path, *, overwrite: bool = False) -> None:
@@ -106,7 +136,7 @@ def write_g2o(graph: PoseGraph, path: Path, *, overwrite: bool = False) -> None:
 
 def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]]]:
     """Return line numbers and words by the first word."""
-    found: dict[str, list[tuple[int, list[str]]]] = {}
+    sections: dict[str, list[tuple[int, list[str]]]] = {}
     for number, line in enumerate(lines, 1):
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -117,16 +147,16 @@ def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]
         wanted = _WIDTH.get(kind, len(words) - 1)
         if len(words) - 1 != wanted:
             raise MapError(f"{path}:{number}: {kind} has {len(words) - 1} numbers, not {wanted}")
-        found.setdefault(kind, []).append((number, words))
-    return found
+        sections.setdefault(kind, []).append((number, words))
+    return sections
 
 
 def _numbers(
-    found: dict[str, list[tuple[int, list[str]]]], kind: str, path: Path
+    sections: dict[str, list[tuple[int, list[str]]]], kind: str, path: Path
 ) -> tuple[I64, F64]:
     """Return the ids (N, 1 or 2) and the values of the lines of one kind."""
     ids = 2 if kind in (_EDGE, _PLANAR_EDGE) else 1
-    lines = found.get(kind, [])
+    lines = sections.get(kind, [])
     try:
         names = [[int(word) for word in words[1 : 1 + ids]] for _, words in lines]
         values = [[float(word) for word in words[1 + ids :]] for _, words in lines]

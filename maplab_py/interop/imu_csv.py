@@ -35,7 +35,7 @@ def read_imu_csv(path: Path) -> ImuRecording:
     table = read_text_table(path)
     if table.values.shape[1] != 6:
         raise MapError(
-            f"{path}: 7 columns are wanted (time, gyroscope xyz, accelerometer xyz), "
+            f"{path}: 7 columns are expected (time, gyroscope xyz, accelerometer xyz), "
             f"not {table.values.shape[1] + 1}"
         )
     order = [3, 4, 5, 0, 1, 2]

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, U8
 from maplab_py.errors import MapError
+from maplab_py.input_files import DEFAULT_MAX_BYTES
 from maplab_py.output_files import write_bytes
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -24,12 +23,17 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_MAX_HEADER_BYTES = 100_000
+_BYTES_PER_POINT = 110
+"""Memory of a point [bytes] while columns are read and concatenated."""
+_TEXT_PARTS = 60
+"""Memory of the words of an ascii file per byte of the file."""
 _INTENSITIES = ("intensity", "scalar_intensity", "scalar_Intensity", "i")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PlyCloud:
-    """What a PLY file holds."""
+    """Content of a PLY file."""
 
     p: F64  # (N, 3) [m]
     colours: U8 | None = None  # (N, 3)
@@ -45,28 +49,25 @@ class _Element:
     list_types: tuple[str, str] | None = None  # types of the count and of the entries
 
 
-def read_ply(path: Path) -> PlyCloud:
-    """Read a PLY file, ascii or binary.
-
-    Raises:
-        MapError: The file cannot be read, or is not PLY with vertices x, y, z.
-    """
-    try:
-        return parse_ply(path.read_bytes(), str(path))
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def parse_ply(data: bytes, source: str) -> PlyCloud:
+def parse_ply(data: bytes, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> PlyCloud:
     """Read the content of a PLY file.
 
     Raises:
-        MapError: It is not PLY with vertices x, y, z; names the source.
+        MapError: It is not PLY with vertices x, y, z, or takes more memory than twice max_bytes;
+            names the source.
     """
     order, elements, begin = _header(data, source)
+    wanted = _BYTES_PER_POINT * sum(e.count for e in elements if e.name in ("vertex", "face"))
+    if order == "=":
+        wanted += _TEXT_PARTS * len(data)
+    if wanted > 2 * max_bytes:
+        raise MapError(
+            f"{source}: the PLY data take more than {2 * max_bytes / 1e6:g} MB of memory; "
+            "take fewer points" + (", or the binary format" if order == "=" else "")
+        )
     vertices: NDArray[np.void] | None = None
     faces: NDArray[np.int32] | None = None
-    body = data[begin:]
+    body = memoryview(data)[begin:]
     try:
         if order == "=":
             vertices, faces = _read_ascii(body, elements)
@@ -83,10 +84,10 @@ def parse_ply(data: bytes, source: str) -> PlyCloud:
 
 
 def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
-    end = data.find(b"end_header")
+    end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     if not data.startswith(b"ply") or end < 0:
         raise MapError(f"{source}: this is not a PLY file")
-    begin = data.index(b"\n", end) + 1
+    begin = data.find(b"\n", end) + 1 or len(data)
     order, elements = "", list[_Element]()
     for line in data[:end].decode("ascii", errors="replace").splitlines():
         words = line.split()
@@ -94,7 +95,7 @@ def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
             if words[:1] == ["format"]:
                 order = _ORDERS[words[1]]
             elif words[:1] == ["element"]:
-                elements.append(_Element(words[1], int(words[2]), []))
+                elements.append(_Element(words[1], _count(words[2]), []))
             elif words[:2] == ["property", "list"]:
                 elements[-1].list_types = (_TYPES[words[2]], _TYPES[words[3]])
             elif words[:1] == ["property"]:
@@ -102,17 +103,23 @@ def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
         except (KeyError, IndexError, ValueError):
             raise MapError(f"{source}: the PLY header has a wrong line '{line.strip()}'") from None
     if not order:
-        raise MapError(f"{source}: the PLY header names no format")
+        raise MapError(f"{source}: the PLY header states no format")
     return order, elements, begin
 
 
+def _count(word: str) -> int:
+    if not word.isdecimal():
+        raise ValueError(word)
+    return int(word)
+
+
 def _read_binary(
-    body: bytes, elements: list[_Element], order: str
+    body: memoryview, elements: list[_Element], order: str
 ) -> tuple[NDArray[np.void] | None, NDArray[np.int32] | None]:
     vertices, faces, place = None, None, 0
     for element in elements:
         if element.list_types is not None and (element.fields or element.name != "face"):
-            break  # of no use here, and its length is not known in advance
+            break  # not needed, and its length is not known in advance
         dtype = np.dtype([(name, order + kind) for name, kind in element.fields])
         if element.list_types is not None:
             count, entry = (order + kind for kind in element.list_types)
@@ -129,9 +136,9 @@ def _read_binary(
 
 
 def _read_ascii(
-    body: bytes, elements: list[_Element]
+    body: memoryview, elements: list[_Element]
 ) -> tuple[NDArray[np.void] | None, NDArray[np.int32] | None]:
-    lines = body.decode("ascii", errors="replace").splitlines()
+    lines = str(body, "ascii", errors="replace").splitlines()
     vertices, faces, place = None, None, 0
     for element in elements:
         rows = lines[place : place + element.count]
@@ -165,12 +172,17 @@ def _colours(vertices: NDArray[np.void]) -> U8 | None:
     return None
 
 
-def write_ply(cloud: PlyCloud, path: Path) -> None:
-    """Write points, with colours and intensities where there are any, as binary PLY.
+def write_ply(cloud: PlyCloud, path: Path, *, overwrite: bool = True) -> None:
+    """Write a cloud or mesh as binary PLY; see `encode_ply`.
 
     Raises:
-        UserError: The file cannot be written.
+        UserError: The file cannot be written, or exists and `overwrite` is not set.
     """
+    write_bytes(path, encode_ply(cloud), overwrite=overwrite)
+
+
+def encode_ply(cloud: PlyCloud) -> list[bytes]:
+    """Return points, with the colours, intensities and faces that there are, as binary PLY."""
     fields = [(name, "<f4") for name in ("x", "y", "z")]
     columns: list[NDArray[Any]] = [cloud.p[:, axis] for axis in range(3)]
     if cloud.intensity is not None:
@@ -185,5 +197,10 @@ def write_ply(cloud: PlyCloud, path: Path) -> None:
     kinds = {"<f4": "float", "u1": "uchar"}
     lines = [f"property {kinds[kind]} {name}" for name, kind in fields]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *lines]
-    header = ("\n".join([*head, "end_header"]) + "\n").encode()
-    write_bytes(path, [header, table.tobytes()], overwrite=True)
+    chunks = [table.tobytes()]
+    if cloud.faces is not None:
+        faces = np.zeros(len(cloud.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+        faces["count"], faces["corner"] = 3, cloud.faces
+        head += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        chunks.append(faces.tobytes())
+    return [("\n".join([*head, "end_header"]) + "\n").encode(), *chunks]

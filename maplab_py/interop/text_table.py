@@ -1,6 +1,6 @@
-"""Tables of numbers as text, read and written at the speed of the C library.
+"""Fast reading and writing of text tables of numbers.
 
-Time stamps are parsed from their digits, never through a float: 19-digit nanoseconds and
+Time stamps are parsed from their digits without conversion to float: 19-digit nanoseconds and
 "1403715529.112143517" seconds are both exact.
 """
 
@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
+from maplab_py.input_files import read_text
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
+_MAX_BYTES = 500_000_000
+_SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
 _NANOSECONDS_FROM = 10**14
-"""Whole numbers above this are nanoseconds: as seconds they would be in three million years."""
+"""Integers above this are nanoseconds; as seconds they would be three million years."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ def read_text_table(path: Path) -> TextTable:
             first one; names file and line.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, _MAX_BYTES, remedy=_SPLIT, error=MapError, encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise MapError(f"cannot read {path}: {reason}") from error
@@ -70,7 +71,7 @@ def parse_text_table(text: str, source: str) -> TextTable:
             f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}"
         )
     if widths[0] < 2:
-        raise MapError(f"{source}:{numbers[0]}: a time stamp and values are wanted")
+        raise MapError(f"{source}:{numbers[0]}: a time stamp and values are expected")
     times, is_nanoseconds = _parse_times([row[0] for row in rows], source, numbers)
     values = _parse_values([row[1:] for row in rows], source, numbers)
     return TextTable(source, header, times, values, np.array(numbers), is_nanoseconds, has_commas)

@@ -1,6 +1,7 @@
-"""Trajectories as files: TUM text, EuRoC / ASL ground truth, and CSV with named columns.
+"""Trajectory files: TUM text, EuRoC / ASL ground truth, KITTI, and CSV with named columns.
 
-TUM: `t[s] x y z qx qy qz qw`. EuRoC: `t[ns], p, q (w first), v, gyro bias, accel bias`.
+TUM: `t[s] x y z qx qy qz qw`. EuRoC: `t[ns], p, q (w first), v, gyro bias, accel bias`. KITTI: the upper
+three rows of a homogeneous matrix, row by row, with the time stamps in a file of their own.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
+from maplab_py.geometry import se3
+from maplab_py.input_files import read_text
 from maplab_py.interop.text_table import (
     TextTable,
     format_rows,
@@ -21,11 +25,9 @@ from maplab_py.interop.text_table import (
 )
 from maplab_py.output_files import write_text
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
+_MAX_BYTES = 500_000_000
 _UNIT_TOLERANCE = 0.02
-"""Largest deviation of a quaternion's length from 1: files with three digits pass."""
+"""Largest deviation of a quaternion's norm from 1; accepts files with three digits."""
 _KINDS = {
     "p": "p", "t": "p", "pos": "p", "position": "p", "": "p",
     "q": "q", "quat": "q", "quaternion": "q", "orientation": "q",
@@ -67,13 +69,13 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a trajectory; the format is told from the content.
+    """Read a trajectory; the format is detected from the content.
 
-    Columns are found by the names in the header where there is one; without names, eight columns
+    Columns are identified by the names in the header if there is one; without names, eight columns
     are TUM (quaternion w last), whole nanoseconds with commas are EuRoC (w first).
 
     Raises:
-        MapError: The file cannot be read or is no trajectory; names file and line.
+        MapError: The file cannot be read or is not a trajectory; names file and line.
     """
     table = read_text_table(path)
     names = _columns(table)
@@ -81,7 +83,7 @@ def read_trajectory(path: Path) -> Trajectory:
     if missing:
         raise MapError(
             f"{path}: no trajectory: there is no column for {', '.join(missing)}; TUM (t x y z qx "
-            "qy qz qw), EuRoC (t, p, q wxyz) or a header with such names is wanted"
+            "qy qz qw), EuRoC (t, p, q wxyz) or a header with such names is expected"
         )
     q = table.values[:, [names[f"q{i}"] for i in "xyzw"]]
     norm = np.linalg.norm(q, axis=1)
@@ -97,6 +99,49 @@ def read_trajectory(path: Path) -> Trajectory:
         accel_bias=_optional(table, names, "b_a"),
         source=str(path),
     )
+
+
+def read_kitti(path: Path, times_file: Path) -> Trajectory:
+    """Read poses of KITTI's odometry benchmark and their time stamps [s].
+
+    Raises:
+        MapError: A file cannot be read, a line is no pose or time stamp, or their numbers differ.
+    """
+    matrices = _numbers(path, 12, "a pose of KITTI (3 x 4 numbers)").reshape(-1, 3, 4)
+    times_s = _numbers(times_file, 1, "a time stamp")[:, 0]
+    if len(times_s) != len(matrices):
+        raise MapError(f"{times_file} has {len(times_s)} time stamps, {path} {len(matrices)} poses")
+    R = matrices[:, :, :3]
+    error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero((error > _UNIT_TOLERANCE) | (np.linalg.det(R) < 0.0))
+    if len(wrong):
+        raise MapError(f"{path}: pose {wrong[0] + 1} is no rotation and position")
+    if np.any(np.diff(times_s) < 0.0):
+        raise MapError(f"{times_file}: the time stamps are not in the order of time")
+    homogeneous = np.tile(np.eye(4), (len(R), 1, 1))
+    homogeneous[:, :3] = matrices
+    times_ns = np.round(times_s * 1e9).astype(np.int64)
+    return Trajectory(times_ns, se3.from_matrix(homogeneous), source=str(path))
+
+
+def _numbers(path: Path, width: int, what: str) -> F64:
+    """Return the rows (N, width) of a file of numbers without stamps."""
+    try:
+        text = read_text(path, _MAX_BYTES, remedy="split it into parts", error=MapError)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise MapError(f"cannot read {path}: {reason}") from error
+    rows = [line.split() for line in text.splitlines()]
+    wrong = [number for number, row in enumerate(rows, 1) if row and len(row) != width]
+    if wrong:
+        raise MapError(f"{path}:{wrong[0]}: {what} is wanted")
+    try:
+        values = np.array([row for row in rows if row], dtype=np.float64).reshape(-1, width)
+    except ValueError as error:
+        raise MapError(f"{path}: {what} is wanted per line: {error}") from None
+    if not len(values) or not np.all(np.isfinite(values)):
+        raise MapError(f"{path}: {what} is wanted per line")
+    return values
 
 
 def write_tum(trajectory: Trajectory, path: Path, *, overwrite: bool = False) -> None:
@@ -155,8 +200,8 @@ def _columns(table: TextTable) -> dict[str, int]:
 
 def _optional(table: TextTable, names: dict[str, int], kind: str) -> F64 | None:
     places = [names.get(f"{kind}{axis}") for axis in "xyz"]
-    found = [place for place in places if place is not None]
-    return table.values[:, found] if len(found) == 3 else None
+    present = [place for place in places if place is not None]
+    return table.values[:, present] if len(present) == 3 else None
 
 
 def _refuse(table: TextTable, wrong: NDArray[np.bool_], reason: str) -> None:

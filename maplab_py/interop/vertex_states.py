@@ -1,4 +1,4 @@
-"""The states of a map's vertices as a table, and maplab's two files of them.
+"""Table of the vertex states of a map, and maplab's two export formats.
 
 `asl`: comma-separated poses in G and M, velocities and biases. `rpg`: TUM.
 """
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_vectors, slerp
@@ -21,9 +22,6 @@ from maplab_py.output_files import write_text
 from maplab_py.vimap import VIMap, ids
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import MissionSensor
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 ASL_FILE, RPG_FILE = "vertex_poses_velocities_biases.csv", "stamped_traj_estimate.txt"
 _ASL_HEADER = (
@@ -36,7 +34,7 @@ _ASL_HEADER = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VertexStates:
-    """States by mission, then time. S is the reference sensor, the IMU unless another is asked."""
+    """States by mission, then time. S is the reference sensor, by default the IMU."""
 
     times_ns: I64  # (N,)
     vertex: I64  # (N,) vertex row; the one before, for states between vertices
@@ -62,7 +60,7 @@ def vertex_states(
     Args:
         vi_map: Map.
         missions: Mission rows; None = all.
-        reference_sensor_id: Sensor or camera whose poses are wanted; empty = each mission's IMU.
+        reference_sensor_id: Sensor or camera of the poses; empty = each mission's IMU.
         at_imu_times: States at every IMU sample between the vertices: cubic position (which uses
             the velocities), rotation along the great arc, velocity and biases linear.
 

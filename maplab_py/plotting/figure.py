@@ -1,4 +1,4 @@
-"""What all figures have in common: size, colours, and how they become files."""
+"""Common parts of all figures: size, colours, writing to files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def mission_colour(row: int) -> Any:
 
 
 def thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return at most some thousands of rows, evenly taken, as more cannot be told apart."""
+    """Return at most some thousands of rows, evenly spaced, since a figure cannot show more."""
     return rows[:: max(1, -(-len(rows) // _MAX_POINTS))]
 
 
@@ -66,7 +66,7 @@ def legend(axes: Axes, count: int) -> None:
 
 
 def check_plot_file(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that cannot become a figure, before any work is done.
+    """Check the path of a figure before any work is done.
 
     Raises:
         UserError: Its suffix is not one of `SUFFIXES`, or it exists and `overwrite` is not set.
@@ -82,8 +82,11 @@ def write_figure(figure: Figure, path: Path) -> None:
     Raises:
         UserError: The file cannot be written.
     """
+    import matplotlib as mpl
+
     metadata = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     suffix = path.suffix.lower()
     content = io.BytesIO()
-    figure.savefig(content, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
+    with mpl.rc_context({"svg.hashsalt": "maplab"}):  # ids in SVG files are random without it
+        figure.savefig(content, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
     write_bytes(path, [content.getvalue()], overwrite=True)

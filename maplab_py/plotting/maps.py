@@ -1,4 +1,4 @@
-"""Figures of whole maps: the trajectories from above, the landmarks, who shares landmarks with whom."""
+"""Figures of whole maps: trajectories from above, landmark statistics, shared landmarks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from maplab_py.plotting.figure import (
     new_figure,
     thinned,
 )
+from maplab_py.report import counted
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import coobservation_counts, mission_mask, observation_counts
 from maplab_py.vimap.tables import LandmarkQuality
@@ -64,7 +65,7 @@ def trajectories(
     axes.set_aspect("equal", adjustable="datalim")
     unknown = np.count_nonzero(~vi_map.baseframes.is_known[vi_map.missions.baseframe[chosen]])
     note = f"; {unknown} of unknown base frame" if unknown else ""
-    label(axes, "x in G [m]", "y in G [m]", f"{len(chosen)} missions from above{note}")
+    label(axes, "x in G [m]", "y in G [m]", f"{counted(len(chosen), 'mission')} from above{note}")
     legend(axes, len(chosen))
     return figure
 
@@ -81,7 +82,7 @@ def _draw_landmarks(axes: Axes, vi_map: VIMap, chosen: NDArray[np.int64]) -> Non
 
 
 def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None) -> Figure:
-    """Draw how often landmarks are observed, how far they are, and how they were judged.
+    """Draw observation counts, distances and quality of the landmarks.
 
     Raises:
         UserError: There are no landmarks.
@@ -109,7 +110,7 @@ def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None
 
 
 def coobservability(vi_map: VIMap) -> Figure:
-    """Draw how many landmarks each pair of missions shares; the diagonal has those of a mission.
+    """Draw the number of landmarks that each pair of missions shares.
 
     Raises:
         UserError: There are no missions.

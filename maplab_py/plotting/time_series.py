@@ -31,18 +31,12 @@ def errors_over_time(
 ) -> tuple[Figure, float]:
     """Draw the position and attitude errors of the vertices; also return the RMSE of position [m].
 
-    All chosen missions are laid on the ground truth together, as `evaluate_trajectory` does.
+    All chosen missions are aligned with the ground truth jointly, as in `evaluate_trajectory`.
 
     Raises:
         EstimationError: Fewer than three vertices have ground truth.
     """
-    rows = np.flatnonzero(mission_mask(vi_map, missions)[vi_map.vertices.mission])
-    T_R_B, matched = match(ground_truth, vi_map.vertices.timestamp_ns[rows], options)
-    if np.count_nonzero(matched) < 3:
-        raise EstimationError(
-            f"fewer than three vertices have ground truth in {ground_truth.source}"
-        )
-    rows, T_R_B = rows[matched], T_R_B[matched]
+    rows, T_R_B = _with_truth(vi_map, ground_truth, options, missions)
     T_R_I, _ = pose_errors.align(T_R_B, vi_map.T_G_I[rows], options.alignment)
     error_m, error_deg = pose_errors.absolute_errors(T_R_B, T_R_I)
     offset_m = T_R_I[:, 4:] - T_R_B[:, 4:]
@@ -68,23 +62,33 @@ def errors_over_time(
 def truth_in_global_frame(
     vi_map: VIMap, ground_truth: Trajectory, missions: NDArray[np.int64] | None = None
 ) -> NDArray[np.float64]:
-    """Return the positions (N, 3) of a ground truth, laid on the vertices by a rigid motion.
+    """Return the positions (N, 3) of a ground truth, aligned with the vertices rigidly.
 
     Raises:
         EstimationError: Fewer than three vertices have ground truth.
     """
+    rows, T_R_B = _with_truth(vi_map, ground_truth, TrajectoryEvaluationOptions(), missions)
+    T_G_I = vi_map.T_G_I[rows]
+    T_R_I, _ = pose_errors.align(T_R_B, T_G_I, "se3")
+    T_G_R = se3.compose(T_G_I[:1], se3.inverse(T_R_I[:1]))
+    positions: NDArray[np.float64] = se3.transform(T_G_R, ground_truth.T_R_B[:, 4:])
+    return positions
+
+
+def _with_truth(
+    vi_map: VIMap,
+    ground_truth: Trajectory,
+    options: TrajectoryEvaluationOptions,
+    missions: NDArray[np.int64] | None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the vertices (N,) of some missions that have ground truth, and it (N, 7)."""
     rows = np.flatnonzero(mission_mask(vi_map, missions)[vi_map.vertices.mission])
-    options = TrajectoryEvaluationOptions()
     T_R_B, matched = match(ground_truth, vi_map.vertices.timestamp_ns[rows], options)
     if np.count_nonzero(matched) < 3:
         raise EstimationError(
             f"fewer than three vertices have ground truth in {ground_truth.source}"
         )
-    T_G_I = vi_map.T_G_I[rows[matched]]
-    T_R_I, _ = pose_errors.align(T_R_B[matched], T_G_I, "se3")
-    T_G_R = se3.compose(T_G_I[:1], se3.inverse(T_R_I[:1]))
-    positions: NDArray[np.float64] = se3.transform(T_G_R, ground_truth.T_R_B[:, 4:])
-    return positions
+    return rows[matched], T_R_B[matched]
 
 
 def inertial_states(vi_map: VIMap, mission: int) -> Figure:

@@ -29,12 +29,20 @@ class Distortion(Enum):
 
 
 INTRINSICS_SIZE = {Projection.PINHOLE: 4, Projection.UNIFIED: 5}
-DISTORTION_SIZE = {
-    Distortion.NONE: 0,
-    Distortion.RADTAN: 4,
-    Distortion.EQUIDISTANT: 4,
-    Distortion.FOV: 1,
+DISTORTION_NAMES: dict[Distortion, tuple[str, ...]] = {
+    Distortion.NONE: (),
+    Distortion.RADTAN: ("k1", "k2", "p1", "p2"),
+    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+    Distortion.FOV: ("w",),
 }
+DISTORTION_SIZE = {model: len(names) for model, names in DISTORTION_NAMES.items()}
+
+
+def parameter_names(projection: Projection, distortion: Distortion) -> list[tuple[str, str]]:
+    """Return name and unit of every entry of the intrinsics and the distortion parameters."""
+    mirror = [("mirror xi", "")] if projection is Projection.UNIFIED else []
+    pinhole = [(f"{what} {axis}", "px") for what in ("focal length", "centre") for axis in "uv"]
+    return [*mirror, *pinhole, *((f"distortion {k}", "") for k in DISTORTION_NAMES[distortion])]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

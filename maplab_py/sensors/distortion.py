@@ -1,4 +1,4 @@
-"""Lens distortion on the z = 1 plane: forward with Jacobians, and undone.
+"""Lens distortion on the z = 1 plane with Jacobians, and undistortion.
 
 All radial models are written x_d = s(r) x with r = |x|, so that with s' = ds/dr
 dx_d/dx = s I + (s'/r) x x^T, where s and s'/r are smooth at r = 0.
@@ -6,20 +6,19 @@ dx_d/dx = s I + (s'/r) x x^T, where s and s'/r are smooth at r = 0.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, Mask
 from maplab_py.sensors.camera import Distortion
 
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Distorted = tuple[F64, F64, F64]
 """Distorted points (..., 2), d/dx (..., 2, 2), d/dparameters (..., 2, n)."""
 
 _SMALL_RADIUS = 1e-3
-"""Below this radius series replace quotients by r; their error is under 1e-12."""
+"""Below this radius series replace quotients by r with an error below 1e-12."""
 _SMALL_FOV_RAD = 1e-4
 """Below this field-of-view parameter the FOV model is replaced by its series in w."""
 _MAX_ITERATIONS = 50
@@ -33,10 +32,10 @@ def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
 
 
 def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
-    """Return undistorted points (..., 2) and whether they were found (...,).
+    """Return undistorted points (..., 2) and whether they are valid (...,).
 
     Points beyond the image of the model (for radial-tangential and equidistant: beyond the radius
-    up to which the distortion grows) are not found; their value is without meaning, but finite.
+    up to which the distortion grows) are invalid; their value is finite but has no meaning.
     """
     if kind is Distortion.NONE:
         return x_d, np.ones(x_d.shape[:-1], dtype=np.bool_)
@@ -50,10 +49,10 @@ def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
 def largest_radius(kind: Distortion, parameters: F64) -> float:
     """Return the radius on the z = 1 plane up to which the distorted radius grows.
 
-    Beyond it the polynomial models fold back and show points that no lens would.
+    Beyond this radius the polynomial models are not injective.
     """
     if kind is Distortion.RADTAN:
-        return float(np.sqrt(_first_root([1.0, 3 * parameters[0], 5 * parameters[1]])))
+        return float(np.sqrt(_first_root((1.0, 3 * parameters[0], 5 * parameters[1]))))
     if kind is Distortion.EQUIDISTANT:
         theta = _largest_theta(parameters)
         return float(np.tan(theta)) if theta < 0.5 * np.pi else float(np.inf)
@@ -61,10 +60,11 @@ def largest_radius(kind: Distortion, parameters: F64) -> float:
 
 
 def _largest_theta(k: F64) -> float:
-    return float(np.sqrt(_first_root([1.0, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]])))
+    return float(np.sqrt(_first_root((1.0, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]))))
 
 
-def _first_root(ascending: list[float]) -> float:
+@functools.lru_cache(maxsize=256)  # a camera asks for the same root at each projection
+def _first_root(ascending: tuple[float, ...]) -> float:
     """Return the smallest positive real root of a polynomial, infinity when there is none."""
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(np.array(ascending), "b"))
     real = roots.real[np.abs(roots.imag) <= 1e-12 * np.maximum(np.abs(roots.real), 1e-300)]
@@ -126,9 +126,12 @@ def _fov(parameters: F64, x: F64) -> Distorted:
     r = np.linalg.norm(x, axis=-1)
     if abs(w) < _SMALL_FOV_RAD:
         # r_d = r (1 + w^2 (1/12 - r^2/3)) + O(w^4)
-        bend = 1.0 / 12.0 - r**2 / 3.0
+        expansion = 1.0 / 12.0 - r**2 / 3.0
         return _radial(
-            x, 1.0 + w**2 * bend, np.full_like(r, -2.0 / 3.0 * w**2), (2.0 * w * bend)[..., None]
+            x,
+            1.0 + w**2 * expansion,
+            np.full_like(r, -2.0 / 3.0 * w**2),
+            (2.0 * w * expansion)[..., None],
         )
     m = 2.0 * np.tan(0.5 * w)
     small = r < _SMALL_RADIUS
@@ -160,13 +163,13 @@ def _undistort_fov(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
         return scale[..., None] * x_d, np.ones(r_d.shape, dtype=np.bool_)
     m = 2.0 * np.tan(0.5 * w)
     angle = abs(w) * r_d
-    found = angle < 0.5 * np.pi
-    angle = np.where(found, angle, 0.0)
+    valid = angle < 0.5 * np.pi
+    angle = np.where(valid, angle, 0.0)
     small = r_d < _SMALL_RADIUS
     safe = np.where(small, 1.0, r_d)
     series = w / m * (1.0 + angle**2 / 3.0 + 2.0 * angle**4 / 15.0)
     scale = np.where(small, series, np.tan(angle) / (abs(m) * safe))
-    return scale[..., None] * x_d, found
+    return scale[..., None] * x_d, valid
 
 
 def _undistort_equidistant(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
@@ -184,13 +187,13 @@ def _undistort_equidistant(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
         theta = np.clip(theta - step, 0.0, limit)
         if np.all(np.abs(step) < _CONVERGED):
             break
-    found = (np.abs(step) < _CONVERGED) & (theta < limit)
-    theta = np.where(found, theta, 0.0)
+    valid = (np.abs(step) < _CONVERGED) & (theta < limit)
+    theta = np.where(valid, theta, 0.0)
     small = r_d < _SMALL_RADIUS
     safe = np.where(small, 1.0, r_d)
     # theta = r_d - k1 r_d^3, tan(theta) = theta + theta^3 / 3, to O(r_d^5)
     series = 1.0 + (1.0 / 3.0 - k[0]) * r_d**2
-    return np.where(small, series, np.tan(theta) / safe)[..., None] * x_d, found
+    return np.where(small, series, np.tan(theta) / safe)[..., None] * x_d, valid
 
 
 def _undistort_radtan(parameters: F64, x_d: F64) -> tuple[F64, Mask]:

@@ -8,6 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+TRIANGLE_NAMES = {
+    "x scale": (0, 0),
+    "y scale": (1, 1),
+    "z scale": (2, 2),
+    "xy misalignment": (0, 1),
+    "xz misalignment": (0, 2),
+    "yz misalignment": (1, 2),
+}
+"""Names of the entries of the upper triangular matrices, in the order of the estimated parameters."""
+
 
 def _identity() -> NDArray[np.float64]:
     return np.eye(3)
@@ -15,7 +25,7 @@ def _identity() -> NDArray[np.float64]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImuIntrinsics:
-    """Scale, misalignment and internal rotation (thesis eq. 7.7-7.10).
+    """Scale, misalignment and internal rotation (Schneider 2019, eq. 7.7-7.10).
 
     w_measured = T_g w_I + b_g;  a_measured = T_a R_AI R_IG (a_G - g_G) + b_a, T upper triangular.
     """

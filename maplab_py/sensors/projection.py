@@ -1,19 +1,17 @@
 """Points to pixels and pixels to rays, with exact Jacobians, for every camera model of the format.
 
 Parameters are ordered [intrinsics..., distortion...] as in `Camera`. Pinhole is the unified
-projection (Mei and Rives, ICRA 2007) with xi = 0: x = p / (z + xi |p|).
+projection (Mei 2007) with xi = 0: x = p / (z + xi |p|).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maplab_py.array_types import F64, Mask
 from maplab_py.sensors import distortion
 from maplab_py.sensors.camera import Camera, Projection
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _MIN_DENOMINATOR = 1e-10
 """Smallest z + xi |p| [m] of a visible point."""
@@ -81,7 +79,7 @@ def back_project(camera: Camera, uv: ArrayLike) -> tuple[F64, Mask]:
     x_d = np.where(finite[..., None], x_d, 0.0)
     x, valid = distortion.undistort(camera.distortion, camera.distortion_parameters, x_d)
     r2 = np.sum(x * x, axis=-1)
-    # Mei and Rives eq. (5): the sphere point whose projection from (0, 0, -xi) is x
+    # Mei 2007, eq. (5): the sphere point whose projection from (0, 0, -xi) is x
     discriminant = 1.0 + (1.0 - xi * xi) * r2
     valid = valid & finite & (discriminant >= 0.0)
     scale = (xi + np.sqrt(np.maximum(discriminant, 0.0))) / (1.0 + r2)

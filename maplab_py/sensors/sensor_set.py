@@ -1,4 +1,4 @@
-"""All sensors of a map and how they are mounted: the content of sensors.yaml."""
+"""All sensors of a map and their extrinsics: the content of sensors.yaml."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from maplab_py.sensors.rig import CameraRig
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OtherSensor:
-    """A sensor that is kept as it was found: odometry, wheels, absolute poses, lidar, GPS."""
+    """A sensor without a model, whose entry is kept unchanged: odometry, wheels, lidar, GPS."""
 
     id: str
     sensor_type: str  # as in sensors.yaml, e.g. ODOMETRY_6DOF
@@ -26,7 +26,7 @@ class OtherSensor:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """How a sensor is mounted on its base sensor."""
+    """Extrinsics of a sensor relative to its base sensor."""
 
     base_sensor_id: str
     T_B_S: NDArray[np.float64]  # (7,)
@@ -72,7 +72,7 @@ class SensorSet:
         return se3.identity() if entry is None else entry.T_B_S
 
     def T_I_C(self, imu_id: str, ncamera_id: str) -> NDArray[np.float64]:
-        """Return the poses (n, 7) of a rig's cameras on the IMU.
+        """Return the poses (n, 7) of a rig's cameras on the IMU; see `T_I_S`.
 
         Raises:
             MapError: A sensor is missing, or no chain of base sensors joins the two.
@@ -83,26 +83,43 @@ class SensorSet:
     def T_I_S(self, imu_id: str, sensor_id: str) -> NDArray[np.float64]:
         """Return the pose (7,) of a sensor, or of one camera of a rig, on the IMU.
 
+        Args:
+            imu_id: Id of the IMU; empty or all zero = the mission has none, and its body frame is that
+                of the last base sensor.
+            sensor_id: Id of the sensor or camera.
+
         Raises:
             MapError: A sensor is missing, or no chain of base sensors joins the two.
         """
-        imu = self.imu(imu_id)
+        imu = self.imu(imu_id) if imu_id.strip("0") else None
         for rig in self.sensors.values():
             for row, camera in enumerate(rig.cameras if isinstance(rig, CameraRig) else ()):
                 if camera.id == sensor_id:
                     return np.asarray(self.T_I_C(imu_id, rig.id)[row])
         if sensor_id not in self.sensors:
             raise MapError(f"sensors.yaml has no sensor with id {sensor_id}")
-        imu_root, T_R_I = self._mounted(imu.id)
         sensor_root, T_R_S = self._mounted(sensor_id)
+        if imu is None:
+            return T_R_S
+        imu_root, T_R_I = self._mounted(imu.id)
         if imu_root != sensor_root and self._has_mount(imu.id) and self._has_mount(sensor_id):
             raise MapError(
                 f"sensors.yaml: sensor {sensor_id} and IMU {imu.id} have no base sensor in common"
             )
         return se3.relative(T_R_I, T_R_S)
 
+    def T_R_S(self, sensor_id: str) -> NDArray[np.float64]:
+        """Return the pose (7,) of a sensor on the last of its base sensors, R.
+
+        R is the body of missions without an IMU.
+
+        Raises:
+            MapError: The base sensors form a cycle.
+        """
+        return self._mounted(sensor_id)[1]
+
     def without_extrinsics(self) -> tuple[str, ...]:
-        """Return the ids of sensors that have no entry and are taken to sit at their base."""
+        """Return the ids of sensors without extrinsics, which default to the pose of their base."""
         return tuple(sensor_id for sensor_id in self.sensors if sensor_id not in self.extrinsics)
 
     def _has_mount(self, sensor_id: str) -> bool:
@@ -115,8 +132,6 @@ class SensorSet:
             pose = se3.compose(self.extrinsics[root].T_B_S, pose)
             root = self.extrinsics[root].base_sensor_id
             if root in seen:
-                raise MapError(
-                    f"sensors.yaml: the base sensors of {sensor_id} go round in a circle"
-                )
+                raise MapError(f"sensors.yaml: the base sensors of {sensor_id} form a cycle")
             seen.add(root)
         return root, pose

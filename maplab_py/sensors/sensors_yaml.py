@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
+from maplab_py.input_files import DEFAULT_MAX_BYTES, read_text
 from maplab_py.sensors.camera import (
     DISTORTION_SIZE,
     INTRINSICS_SIZE,
@@ -29,8 +30,6 @@ from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor, Sensor, Sensor
 from maplab_py.sensors.yaml_entry import Entry
 from maplab_py.sensors.yaml_text import dump_yaml, parse_yaml
 
-F64 = NDArray[np.float64]
-
 _NOISE_KEYS = (
     "acc_noise_density",
     "acc_bias_random_walk_noise_density",
@@ -42,18 +41,18 @@ _LIDAR_CAMERA = "camera-3d-lidar"
 _SAME_POSE = 1e-9
 
 
-def read_sensors(path: Path) -> SensorSet:
+def read_sensors(path: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSet:
     """Read a sensors.yaml of a map, or a 1.x ncamera.yaml or imu.yaml.
 
     Raises:
         MapError: The file cannot be read or its content is wrong; names sensor and key.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, max_bytes, error=MapError)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise MapError(f"cannot read {path}: {reason}") from error
-    return parse_sensors(text, str(path))
+    return parse_sensors(text, str(path), max_bytes)
 
 
 def read_legacy_sensors(ncamera_path: Path, imu_path: Path) -> SensorSet:
@@ -70,13 +69,13 @@ def read_legacy_sensors(ncamera_path: Path, imu_path: Path) -> SensorSet:
     return SensorSet({imu.id: imu, rig.id: rig}, mounts, {**imus.extra, **rigs.extra})
 
 
-def parse_sensors(text: str, source: str) -> SensorSet:
+def parse_sensors(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSet:
     """Read the text of a sensors.yaml; `source` is its name in error messages.
 
     Raises:
         MapError: One line that names the source, the sensor and the key.
     """
-    value = parse_yaml(text, source)
+    value = parse_yaml(text, source, max_bytes)
     if value is None:
         return SensorSet()
     top = Entry(value, source)
@@ -136,10 +135,10 @@ def sensor_entry(sensor: Sensor) -> dict[str, Any]:
 
 
 def _only(sensor_set: SensorSet, kind: type[Any], path: Path) -> Any:
-    found = [sensor for sensor in sensor_set.sensors.values() if isinstance(sensor, kind)]
-    if len(found) != 1:
-        raise MapError(f"{path}: one {kind.__name__} is wanted, {len(found)} found")
-    return found[0]
+    matching = [sensor for sensor in sensor_set.sensors.values() if isinstance(sensor, kind)]
+    if len(matching) != 1:
+        raise MapError(f"{path}: one {kind.__name__} is expected, {len(matching)} found")
+    return matching[0]
 
 
 def _parse_sensor(value: Any, source: str) -> Sensor:
@@ -157,7 +156,7 @@ def _parse_sensor(value: Any, source: str) -> Sensor:
 
 
 def _has_lidar_camera(entry: Entry) -> bool:
-    """Tell whether the rig holds a lidar, which has no image: such a rig is kept as found."""
+    """Tell whether the rig holds a lidar, which has no image: the entry of such a rig is kept unchanged."""
     cameras = [Entry(item, entry.where) for item in entry.items("cameras")]
     return any(camera.child("camera").text("type") == _LIDAR_CAMERA for camera in cameras)
 
@@ -263,7 +262,7 @@ def _model(entry: Entry, key: str, kinds: Any) -> Any:
     name = str(entry.raw(key))
     known = [kind.value for kind in kinds]
     if name not in known:
-        raise MapError(f"{entry.where}: key '{key}': '{name}' is none of {', '.join(known)}")
+        raise MapError(f"{entry.where}: key '{key}': '{name}' is not one of {', '.join(known)}")
     return kinds(name)
 
 
@@ -286,7 +285,7 @@ def _parse_extrinsics(
 def _parse_mount(entry: Entry, forward: str, backward: str) -> tuple[F64, dict[str, Any]]:
     """Return the pose T_B_S (7,) given as T_B_S or T_S_B, and the raw key that gave it."""
     if forward in entry and backward in entry:
-        raise MapError(f"{entry.where}: keys '{forward}' and '{backward}' exclude each other")
+        raise MapError(f"{entry.where}: keys '{forward}' and '{backward}' cannot be combined")
     key = backward if backward in entry else forward
     pose = entry.pose(key)
     return (pose if key == forward else se3.inverse(pose)), {key: entry.raw(key)}

@@ -1,4 +1,4 @@
-"""One YAML mapping that is read key by key, checks what it gives and knows what was left over."""
+"""A YAML mapping that is read key by key, with checks, and that tracks unread keys."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: hand-written calibrations with four digits pass."""
 
 
 class Entry:
-    """A mapping with its place in the file. Every error is a MapError that names place and key."""
+    """A mapping with its location in the file. Errors are MapErrors that name location and key."""
 
     def __init__(self, values: Any, where: str) -> None:
         """Wrap a parsed YAML value; it must be a mapping."""
         if not isinstance(values, Mapping):
-            raise MapError(f"{where}: key-value pairs are wanted, not {_kind(values)}")
+            raise MapError(f"{where}: key-value pairs are expected, not {_kind(values)}")
         self.where = where
         self._values = values
         self._used: set[str] = set()
@@ -44,7 +42,7 @@ class Entry:
         return self._values[key]
 
     def rest(self) -> dict[str, Any]:
-        """Return the keys that were not asked for, those of sub-entries nested likewise."""
+        """Return the keys that were not read, including those of sub-entries."""
         rest = {key: value for key, value in self._values.items() if key not in self._used}
         for key, child in self._children.items():
             if child_rest := child.rest():
@@ -65,16 +63,16 @@ class Entry:
         return value
 
     def text(self, *keys: str, default: str = "") -> str:
-        """Return the text of the first of the keys that is there."""
-        found = default
+        """Return the text of the first existing key."""
+        result = default
         for key in reversed(keys):
             self._used.add(key)
             if key in self:
                 value = self._values[key]
                 if isinstance(value, (dict, list)):
                     raise MapError(f"{self.where}: key '{key}' must be text, not {_kind(value)}")
-                found = str(value)
-        return found
+                result = str(value)
+        return result
 
     def identifier(self, key: str = "id") -> str:
         """Return an id of 32 hexadecimal digits that is not all zero."""
@@ -172,7 +170,7 @@ def _floats(value: Any) -> Any:
 
 
 def _as_float(value: Any) -> float:
-    """Return a number, NaN for whatever is none."""
+    """Return a number, or NaN if the value is not a number."""
     if isinstance(value, bool) or value is None:
         return float("nan")
     try:

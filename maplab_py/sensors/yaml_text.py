@@ -1,8 +1,8 @@
-"""YAML text to plain values and back, without surprises.
+"""Convert YAML text to plain values and back.
 
 PyYAML follows YAML 1.1: it reads `1e-05` as a string, `12:30` as a number, `no` as false and an id
 of 32 decimal digits as an integer. Here only true / false, null, and numbers that print back to
-the same value are converted; every other scalar stays the text that it is.
+the same value are converted; every other scalar stays text.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ from typing import Any
 import yaml
 
 from maplab_py.errors import MapError
+from maplab_py.input_files import DEFAULT_MAX_BYTES, RAISE_THE_BOUND
 
+_BYTES_PER_VALUE = 4000
+"""Memory of one value while a text is read: events, nodes with their marks, values."""
 _ID_LENGTH = 32
 _DIGITS = re.compile(r"^[0-9]*e?[0-9]*$")
 _SCALARS = (
@@ -31,7 +34,7 @@ _SCALARS = (
 
 
 class _Resolver:
-    """Decides which plain scalars are not text; shared by reader and writer."""
+    """Resolver of plain scalars, shared by reader and writer."""
 
     def resolve(self, kind: type[Any], value: Any, implicit: Any) -> Any:
         is_plain = kind is yaml.ScalarNode and isinstance(value, str) and implicit[0]
@@ -40,8 +43,35 @@ class _Resolver:
         return super().resolve(kind, value, implicit)  # type: ignore[misc]
 
 
+class _TooLarge(yaml.YAMLError):
+    """The text expands to more values than the bound allows."""
+
+
 class _Loader(_Resolver, yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self, text: str, most_values: int) -> None:
+        super().__init__(text)
+        self._most_values = most_values
+        self._values = 0  # with those that aliases repeat
+        self._values_of: dict[int, int] = {}  # by node
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Count the values of a node with expanded aliases."""
+        is_alias = self.check_event(yaml.AliasEvent)
+        before = self._values
+        node = super().compose_node(parent, index)
+        if is_alias:
+            self._values += self._values_of.get(id(node), 1)
+        else:
+            self._values += 1
+            if node is not None:
+                self._values_of[id(node)] = self._values - before
+        if self._values > self._most_values:
+            raise _TooLarge(
+                f"it stands for more than {self._most_values} values, aliases written out"
+            )
+        return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -79,17 +109,25 @@ for _tag, _pattern, _first in _SCALARS:
             _class.yaml_implicit_resolvers.setdefault(_key, []).append(_entry)
 
 
-def parse_yaml(text: str, source: str) -> Any:
+def parse_yaml(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> Any:
     """Return the plain value of a YAML text.
 
     Raises:
-        MapError: The text is not YAML, has a key twice, or has an alias to itself.
+        MapError: The text is not YAML, has a key twice, has an alias to itself, or stands for more
+            values than fit into max_bytes of memory.
     """
+    loader = None
     try:
-        return yaml.load(text, Loader=_Loader)
+        loader = _Loader(text, max_bytes // _BYTES_PER_VALUE)
+        return loader.get_single_data()
+    except _TooLarge as error:
+        raise MapError(f"{source}: {error}; {RAISE_THE_BOUND}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise MapError(f"{source}: not valid YAML: {' '.join(lines)}") from error
+    finally:
+        if loader is not None:
+            loader.dispose()
 
 
 def dump_yaml(value: Any) -> str:

@@ -1,1 +1,1 @@
-"""Visual-inertial sessions with known truth: motion, world, sensors, appearance, drift."""
+"""Simulation of visual-inertial sessions with ground truth."""

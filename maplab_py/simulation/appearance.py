@@ -1,11 +1,11 @@
-"""Binary descriptors: signs of activations that are correlated, move with the viewpoint and age.
+"""Model of binary descriptors: signs of correlated activations that vary with view and session.
 
-A point has a latent vector z. Seen from another direction or distance, and in another session, z
-moves a little; bit i is the sign of w_i . z + noise. So bits with an activation near zero flip
-first, near views look alike, and bits that compare similar image regions flip together, as in
-BRISK or FREAK. Some observations are far noisier than others (blur, borders, a shifted keypoint).
-The defaults give distances between equal and between different points like those in maps that
-maplab has recorded with BRISK: medians of 51 and 178 bits out of 384.
+A point has a latent vector z, which varies with view direction, distance and session. Bit i is the
+sign of w_i . z + noise. Bits with an activation near zero therefore flip first, near views have
+similar descriptors, and bits that compare similar image regions flip together, as in BRISK or FREAK.
+Some observations are much noisier than others (blur, borders, a shifted keypoint). With the
+defaults, distances of equal and of different points match maps that maplab recorded with BRISK:
+medians of 51 and 178 bits out of 384.
 """
 
 from __future__ import annotations
@@ -15,20 +15,18 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F32, I64
 from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions
 
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-
 _REFERENCE_DISTANCE_M = 3.0
 _DETECTIONS_AT_ONCE = 1 << 14
-"""Descriptors that are made in one go: bounds the memory to some 100 MB."""
+"""Number of descriptors per batch; bounds the memory to about 100 MB."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Appearance:
-    """How all points of a world look. Activations have unit variance over points."""
+    """Appearance of all points of a world. Activations have unit variance over points."""
 
     options: AppearanceOptions
     weights: F32  # (latent, bits)
@@ -40,7 +38,7 @@ class Appearance:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SessionAppearance:
-    """How points look, and whether they are there, in one session."""
+    """Appearance and presence of points in a session."""
 
     world: Appearance
     change: F32  # (K, latent)
@@ -48,7 +46,7 @@ class SessionAppearance:
 
 
 def make_appearance(options: AppearanceOptions, look: I64, rng: np.random.Generator) -> Appearance:
-    """Draw how the points look; points of equal look (L,) look alike."""
+    """Draw the appearance of the points; points of equal `look` (L,) have the same appearance."""
     points = int(look.max(initial=-1)) + 1
     bits, size = 8 * options.descriptor_bytes, options.latent_dimensions
     weights = rng.standard_normal((size, bits), dtype=np.float32)
@@ -62,7 +60,7 @@ def make_appearance(options: AppearanceOptions, look: I64, rng: np.random.Genera
 
 
 def make_session_appearance(world: Appearance, rng: np.random.Generator) -> SessionAppearance:
-    """Draw what has changed in a session, and what has vanished."""
+    """Draw the changed appearance and the missing points of a session."""
     change = rng.standard_normal(world.latent.shape, dtype=np.float32)
     change *= world.options.session_change
     is_there = rng.uniform(size=len(world.look)) >= world.options.vanish_share
@@ -70,30 +68,30 @@ def make_session_appearance(world: Appearance, rng: np.random.Generator) -> Sess
 
 
 def describe(
-    session: SessionAppearance, found: Detections, rng: np.random.Generator
+    session: SessionAppearance, detections: Detections, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """Return the descriptors (N, bytes) of detections."""
     size = session.world.options.descriptor_bytes
-    descriptors = np.empty((len(found.frame), size), dtype=np.uint8)
-    for first in range(0, len(found.frame), _DETECTIONS_AT_ONCE):
+    descriptors = np.empty((len(detections.frame), size), dtype=np.uint8)
+    for first in range(0, len(detections.frame), _DETECTIONS_AT_ONCE):
         rows = slice(first, first + _DETECTIONS_AT_ONCE)
-        descriptors[rows] = _describe(session, found, rows, rng)
+        descriptors[rows] = _describe(session, detections, rows, rng)
     return descriptors
 
 
 def _describe(
-    session: SessionAppearance, found: Detections, rows: slice, rng: np.random.Generator
+    session: SessionAppearance, detections: Detections, rows: slice, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     world = session.world
-    point = found.point[rows]
+    point = detections.point[rows]
     view = np.concatenate(
         [
-            found.view_G[rows],
-            np.log2(found.distance_m[rows, None] / _REFERENCE_DISTANCE_M),
+            detections.view_G[rows],
+            np.log2(detections.distance_m[rows, None] / _REFERENCE_DISTANCE_M),
         ],
         axis=1,
     ).astype(np.float32)
-    # clutter has point -1: its latent vector is drawn anew
+    # clutter has point -1: its latent vector is drawn separately
     latent = rng.standard_normal((len(point), world.latent.shape[1]), dtype=np.float32)
     of_point = point >= 0
     known = world.look[point[of_point]]

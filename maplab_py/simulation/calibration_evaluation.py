@@ -1,4 +1,4 @@
-"""How far the sensors of a map are from the devices that recorded it."""
+"""Calibration errors of the sensors of a map against the simulated devices."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import so3
 from maplab_py.sensors import ImuIntrinsics
@@ -14,8 +15,6 @@ from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
-
-F64 = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)

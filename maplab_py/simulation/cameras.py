@@ -1,13 +1,11 @@
-"""Projection for the simulator, written apart from the estimator's so that each checks the other."""
+"""Projection for the simulator, independent of the estimator's so that tests can compare both."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.sensors import Camera, Distortion, Projection
-
-F64 = NDArray[np.float64]
 
 _LARGEST_RADIUS = 6.0
 """Normalised radius up to which a distortion is searched for its turning point."""

@@ -1,4 +1,4 @@
-"""What a tracker finds in the images: detections of world points, joined to tracks that break."""
+"""Simulated detector and tracker: detections of world points, joined to tracks that break."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
@@ -16,26 +17,23 @@ from maplab_py.simulation.scenario import MeasurementOptions
 from maplab_py.simulation.tracks import drifts, number_tracks, swap_identities
 from maplab_py.simulation.world import World
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _FRAMES_AT_ONCE = 64
-"""Frames that are projected in one go: bounds the memory to some 50 MB."""
+"""Number of frames per batch of projections; bounds the memory to about 50 MB."""
 _SCORE_NOISE = 0.1
-"""A detector's response differs this much between images; a point's own is uniform in [0, 1]."""
+"""Variation of a detector's response between images; the response of a point is uniform in [0, 1]."""
 
 
 _BORDER_PX, _BORDER_SIGMAS = 1.0, 5.0
-"""What is nearer to the border could be carried out of the image by noise."""
+"""Margin at the image border for measurement noise."""
 _READOUT_ROUNDS = 4
-"""The row at which a point appears depends on when it is read out; each round gains 2 digits."""
+"""Iterations for the readout time of the row of a point; each gains 2 digits."""
 _SIZE_SPREAD = 0.7
 _OCTAVE_DISTANCE_M = 6.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CameraPoses:
-    """Where a camera is at its images, stamped in the middle of their readout."""
+    """Camera poses at its images, stamped in the middle of their readout."""
 
     time_s: F64  # (F,)
     T_G_C: F64  # (F, 7)
@@ -54,7 +52,7 @@ class Detections:
     uv_px: F64  # (N, 2)
     view_G: F64  # (N, 3) unit, from the point to the camera; clutter: zero
     distance_m: F64  # (N,) clutter: 1
-    octave: I64  # (N,) of the image pyramid in which it was found
+    octave: I64  # (N,) of the image pyramid in which it was detected
 
 
 def detect(
@@ -71,7 +69,7 @@ def detect(
         camera: The camera.
         poses: Where it is, and when.
         world: Points and what hides them.
-        is_there: Which points (L,) can be seen in this session at all.
+        is_there: Mask (L,) of the points that exist in this session.
         options: Limits, probabilities and noise.
         rng: Source of all of it.
     """
@@ -89,8 +87,8 @@ def detect(
     noisy = uv + sigma[:, None] * rng.standard_normal(uv.shape)
     if options.track_drift_share > 0.0:
         noisy += drifts(track, frame, options.track_drift_share, options.track_drift_px, rng)
-    found = Detections(frame, point, track, uv, noisy, view, distance, octave)
-    return _with_clutter(found, len(poses.time_s), camera, options.clutter_share, rng)
+    detections = Detections(frame, point, track, uv, noisy, view, distance, octave)
+    return _with_clutter(detections, len(poses.time_s), camera, options.clutter_share, rng)
 
 
 def sigma_of_octave(options: MeasurementOptions, octave: I64) -> F64:
@@ -99,7 +97,7 @@ def sigma_of_octave(options: MeasurementOptions, octave: I64) -> F64:
 
 
 def _octaves(point: I64, distance: F64, points: int, octaves: int, rng: np.random.Generator) -> I64:
-    """Return the octave (N,) in which a point is found: the nearer and larger, the higher."""
+    """Return the octave (N,) in which a point is detected: the nearer and larger, the higher."""
     if octaves == 1:
         return np.zeros(len(point), dtype=np.int64)
     size = rng.normal(0.0, _SIZE_SPREAD, points)
@@ -156,7 +154,7 @@ def _seen(
     normal_G: F64,
     options: MeasurementOptions,
 ) -> tuple[I64, I64, F64, F64, F64]:
-    """Return what some images would show of points (1 or F, L, 3) if nothing hid them."""
+    """Project points (1 or F, L, 3) into images without occlusion."""
     T_G_C = poses.T_G_C[frames]
     least_cosine = np.cos(np.deg2rad(options.max_view_angle_deg))
     ray = T_G_C[:, None, 4:] - p_G
@@ -188,7 +186,7 @@ def _rolling(camera: Camera, poses: CameraPoses, time_s: F64, p_G: F64, uv: F64)
 
 
 def _is_best(frame: I64, score: F64, most: int) -> NDArray[np.bool_]:
-    """Tell which detections (N,) are among the `most` with the highest score of their image."""
+    """Return which detections (N,) are among the `most` with the highest score in their image."""
     order = np.lexsort((-score, frame))
     ordered = frame[order]
     begins = np.searchsorted(ordered, ordered, side="left")
@@ -198,25 +196,25 @@ def _is_best(frame: I64, score: F64, most: int) -> NDArray[np.bool_]:
 
 
 def _with_clutter(
-    found: Detections, frames: int, camera: Camera, share: float, rng: np.random.Generator
+    detections: Detections, frames: int, camera: Camera, share: float, rng: np.random.Generator
 ) -> Detections:
-    """Add keypoints that belong to nothing, as a share of all keypoints, and sort by image."""
-    counts = np.bincount(found.frame, minlength=frames)
+    """Add clutter keypoints as a share of all keypoints and sort by image."""
+    counts = np.bincount(detections.frame, minlength=frames)
     extra = np.floor(counts * share / (1.0 - share) + rng.uniform(size=frames)).astype(np.int64)
     extra = extra if share > 0.0 else np.zeros_like(extra)
     total = int(extra.sum())
     size = np.array([camera.width_px - 1, camera.height_px - 1])
     uv = rng.uniform(size=(total, 2)) * size
     none = np.full(total, -1, dtype=np.int64)
-    frame = np.concatenate([found.frame, np.repeat(np.arange(frames), extra)])
+    frame = np.concatenate([detections.frame, np.repeat(np.arange(frames), extra)])
     order = np.argsort(frame, kind="stable")
     return Detections(
         frame[order],
-        np.concatenate([found.point, none])[order],
-        np.concatenate([found.track, none])[order],
-        np.concatenate([found.uv_true_px, uv])[order],
-        np.concatenate([np.clip(found.uv_px, 0.0, size), uv])[order],
-        np.concatenate([found.view_G, np.zeros((total, 3))])[order],
-        np.concatenate([found.distance_m, np.ones(total)])[order],
-        np.concatenate([found.octave, np.zeros(total, dtype=np.int64)])[order],
+        np.concatenate([detections.point, none])[order],
+        np.concatenate([detections.track, none])[order],
+        np.concatenate([detections.uv_true_px, uv])[order],
+        np.concatenate([np.clip(detections.uv_px, 0.0, size), uv])[order],
+        np.concatenate([detections.view_G, np.zeros((total, 3))])[order],
+        np.concatenate([detections.distance_m, np.ones(total)])[order],
+        np.concatenate([detections.octave, np.zeros(total, dtype=np.int64)])[order],
     )

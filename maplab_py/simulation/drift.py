@@ -1,25 +1,23 @@
-"""Initial states as a visual-inertial odometry leaves them: drifting in yaw, position and scale."""
+"""Initial states with the drift of visual-inertial odometry in yaw, position and scale."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.simulation.scenario import DriftOptions
 from maplab_py.simulation.spline import MotionState
 
-F64 = NDArray[np.float64]
-
 _TILT_TIME_S = 10.0
-"""Roll and pitch errors are bound by gravity: they come and go with this time constant."""
+"""Correlation time of roll and pitch errors, which gravity bounds."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DriftedStates:
-    """What the odometry believes at the vertices, in the mission frame M."""
+    """Odometry estimates at the vertices in the mission frame M."""
 
     T_M_I: F64  # (V, 7)
     v_M: F64  # (V, 3)
@@ -69,6 +67,6 @@ def _tilt(options: DriftOptions, time_s: F64, rng: np.random.Generator) -> F64:
 
 
 def baseframe(options: DriftOptions, rng: np.random.Generator) -> F64:
-    """Return the T_G_M (7,) that the map stores: any yaw and position, for nobody knows it yet."""
+    """Return the initial T_G_M (7,) of the map, with random yaw and position."""
     offset = rng.uniform(-options.baseframe_offset_m, options.baseframe_offset_m, 3)
     return yaw.to_pose(np.append(offset, rng.uniform(-np.pi, np.pi)))

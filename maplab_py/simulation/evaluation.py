@@ -1,4 +1,4 @@
-"""How far a map is from the truth: states, missions, landmarks, merges, edges, calibration."""
+"""Errors of a map against ground truth: states, missions, landmarks, merges, edges, calibration."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
@@ -16,9 +17,6 @@ from maplab_py.simulation.merge_evaluation import count_merges, shown_points, si
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _FALSE_EDGE_M, _FALSE_EDGE_DEG = 0.5, 5.0
 
@@ -30,8 +28,8 @@ class MissionError:
     mission: str  # beginning of its id
     vertices: int
     ate_m: float  # RMSE of positions, the mission aligned by itself
-    offset_m: float  # its place among the other missions is wrong by this
-    yaw_deg: float  # and by this
+    offset_m: float  # position error of the mission relative to the whole map
+    yaw_deg: float  # yaw error likewise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +47,9 @@ class MapErrors(Report):
     accel_bias_mps2: float  # RMSE
     landmarks: int  # of which the truth is known, and whose point does not move
     landmark_median_m: float | None  # error of positions; None = there are none
-    landmark_90_percent_m: float | None  # nine of ten err by less
+    landmark_90_percent_m: float | None = dataclasses.field(
+        metadata={"title": "landmark, 90th percentile", "unit": "m"}
+    )
     merges: int  # simulated landmarks that were joined to another one
     false_merges: int  # of these: joined to landmarks of another world point
     missed_merges: int  # landmarks that could still be joined to one of the same world point
@@ -63,11 +63,11 @@ class MapErrors(Report):
 def evaluate_map(vi_map: VIMap, truth: Truth) -> MapErrors:
     """Compare a map with the truth, by id.
 
-    A mission's place: fit yaw and position of the mission to the truth, and of the whole map to
-    the truth; offset and yaw are what differs between the two, at the middle of the mission.
+    Offset and yaw of a mission: difference between the alignment of the mission with the truth and
+    the alignment of the whole map, at the middle of the mission.
 
     Raises:
-        UserError: The truth knows none of the map's vertices.
+        UserError: The truth contains none of the map's vertices.
     """
     row = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
     known = np.flatnonzero(row >= 0)
@@ -117,11 +117,14 @@ def _mission_errors(
     mission = vi_map.vertices.mission[known]
     errors = []
     for number in np.unique(mission):
-        own = mission == number
-        ate = _rmse(p_true[own], se3.transform(umeyama(p_true[own], p_G[own])[0], p_G[own]))
-        offset, angle = _misplacement(level, p_true[own], p_G[own])
+        rows = mission == number
+        ate = _rmse(
+            p_true[rows],
+            se3.transform(umeyama(p_true[rows], p_G[rows])[0], p_G[rows]),
+        )
+        offset, angle = _misplacement(level, p_true[rows], p_G[rows])
         name = to_hex(vi_map.missions.id[number])[:8]
-        errors.append(MissionError(name, int(own.sum()), ate, offset, angle))
+        errors.append(MissionError(name, int(rows.sum()), ate, offset, angle))
     return tuple(errors)
 
 
@@ -146,7 +149,7 @@ def _landmark_errors(vi_map: VIMap, truth: Truth, shown: I64, T_true_G: F64) -> 
 
 
 def _false_loop_edges(vi_map: VIMap, truth: Truth) -> NDArray[np.bool_]:
-    """Tell which loop closure edges (E,) of the map claim what is not so."""
+    """Return which loop closure edges (E,) of the map are wrong."""
     edges, index = vi_map.loop_closure_edges, IdIndex(truth.vertex_id)
     a, b = (
         index.rows(vi_map.vertices.id[vertex]) for vertex in (edges.from_vertex, edges.to_vertex)
@@ -160,11 +163,11 @@ def _false_loop_edges(vi_map: VIMap, truth: Truth) -> NDArray[np.bool_]:
 
 
 def _misplacement(T_true_G: F64, p_true: F64, p_G: F64) -> tuple[float, float]:
-    """Return how far [m], [deg] a mission sits from where the whole map's alignment puts it."""
-    own = align_yaw_position(p_true, p_G)
+    """Return the offset [m] and yaw [deg] of a mission relative to the whole map's alignment."""
+    alignment = align_yaw_position(p_true, p_G)
     middle = p_G.mean(axis=0)
-    gap = se3.transform(own, middle) - se3.transform(T_true_G, middle)
-    turn = yaw.wrap(yaw.yaw_of(own[:4]) - yaw.yaw_of(T_true_G[:4]))
+    gap = se3.transform(alignment, middle) - se3.transform(T_true_G, middle)
+    turn = yaw.wrap(yaw.yaw_of(alignment[:4]) - yaw.yaw_of(T_true_G[:4]))
     return float(np.linalg.norm(gap)), float(abs(np.rad2deg(turn)))
 
 

@@ -1,4 +1,4 @@
-"""What an IMU measures along a motion: the thesis' model, with biases that walk."""
+"""IMU measurements along a motion (Schneider 2019, section 7) with random-walk biases."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.geometry import so3
 from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.scenario import ImuOptions
 from maplab_py.simulation.spline import MotionState
 
-F64 = NDArray[np.float64]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImuRecording:
-    """Samples and the biases that are in them."""
+    """IMU samples and their true biases."""
 
     accel_gyro: F64  # (N, 6) [ax ay az gx gy gz]
     accel_bias: F64  # (N, 3)
     gyro_bias: F64  # (N, 3)
 
     def take(self, rows: NDArray[np.int64]) -> ImuRecording:
-        """Return some of the samples."""
+        """Return the samples of a mask or rows."""
         return ImuRecording(self.accel_gyro[rows], self.accel_bias[rows], self.gyro_bias[rows])
 
 
@@ -59,10 +58,10 @@ def measure(
     motion: MotionState,
     rng: np.random.Generator,
 ) -> ImuRecording:
-    """Return what the IMU reports at the times of a motion, 1 / rate_hz apart.
+    """Return the IMU measurements at the times of a motion, 1 / rate_hz apart.
 
-    Thesis eq. (7.7)-(7.11): w~ = T_g w + b_g + n_g, a~ = T_a R_A_I R_I_G (a_G - g_G) + b_a + n_a;
-    then what the options ask for beyond it, and saturation.
+    Schneider 2019, eq. (7.7)-(7.11): w~ = T_g w + b_g + n_g,
+    a~ = T_a R_A_I R_I_G (a_G - g_G) + b_a + n_a; then the effects of the options and saturation.
     """
     count = len(motion.v_G)
     rate = options.rate_hz
@@ -96,13 +95,13 @@ def _specific_force(options: ImuOptions, motion: MotionState) -> F64:
 
 
 def _warmth(options: ImuOptions, count: int) -> F64:
-    """Return the factor (N, 1) that both scales have while the device warms up."""
+    """Return the scale factor (N, 1) of both sensors while the device warms up."""
     time = np.arange(count) / options.rate_hz
     return 1.0 + options.warming_scale * -np.expm1(-time / options.warming_time_s)[:, None]
 
 
 def _bias(count: int, sigma: float, walk: float, rate: float, rng: np.random.Generator) -> F64:
-    """Return a bias (count, 3) that starts at random and walks."""
+    """Return a random-walk bias (count, 3) with random start."""
     steps = walk / np.sqrt(rate) * rng.standard_normal((count, 3))
     steps[0] = sigma * rng.standard_normal(3)
     return np.asarray(np.cumsum(steps, axis=0))

@@ -1,4 +1,4 @@
-"""Which values a scenario may have."""
+"""Valid ranges of the values of a scenario."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from maplab_py.simulation.scenario import (
     CalibrationOptions,
     CameraOptions,
     DriftOptions,
+    LidarOptions,
     MotionOptions,
     Scenario,
+    SessionImages,
     SessionOptions,
 )
 
@@ -65,6 +67,7 @@ _PROBABILITIES = (
     "appearance.vanish_share",
     "other_sensors.loop_edge_false_share",
     "images.gain_swing",
+    "images.bare_share",
     "images.vignette",
 )
 _NOT_NEGATIVE = (
@@ -101,8 +104,13 @@ _NOT_NEGATIVE = (
         if not field.name.endswith("_factor")
     ),
 )
+_LAYOUT_OF_KIND = {
+    **dict.fromkeys(("room_scan", "figure_8", "loop", "vehicle"), "rooms"),
+    "corridor": "corridor",
+    "streets": "city",
+}
 _LARGEST = 1e6
-"""No number of a scenario may be larger: what is, is a slip of the pen."""
+"""Maximum magnitude of any number of a scenario."""
 _MOST_SAMPLES = 10_000_000
 
 
@@ -133,6 +141,7 @@ def check_scenario(scenario: Scenario) -> None:
     if scenario.measurement.frame_rate_hz > scenario.imu.rate_hz:
         raise UserError("measurement.frame_rate_hz: must not exceed imu.rate_hz")
     _check_times(scenario)
+    _check_lidar(scenario.lidar)
     if not scenario.sessions:
         raise UserError("sessions: at least one is needed")
     if not scenario.cameras:
@@ -154,6 +163,17 @@ def _check_times(scenario: Scenario) -> None:
             raise UserError(f"cameras[{row}].line_delay_s: reads longer than 0.05 s for an image")
 
 
+def _check_lidar(lidar: LidarOptions) -> None:
+    if lidar.rate_hz < 0.0 or lidar.range_sigma_m < 0.0:
+        raise UserError("lidar.rate_hz, range_sigma_m: must be 0 or greater")
+    if lidar.rings < 2 or lidar.columns < 16:
+        raise UserError("lidar.rings, columns: must be at least 2 and 16")
+    if not -80.0 <= lidar.lowest_deg < lidar.highest_deg <= 80.0:
+        raise UserError("lidar.lowest_deg, highest_deg: must lie between -80 and 80, in order")
+    if not 0.0 <= lidar.min_range_m < lidar.max_range_m:
+        raise UserError("lidar.min_range_m, max_range_m: must be 0 or greater, in order")
+
+
 def _value(scenario: Scenario, key: str) -> Any:
     value: Any = scenario
     for part in key.split("."):
@@ -162,7 +182,7 @@ def _value(scenario: Scenario, key: str) -> Any:
 
 
 def _check_finite(group: Any, key: str) -> None:
-    """Check every number, whatever it is for."""
+    """Check that every number is finite and not too large."""
     if dataclasses.is_dataclass(group):
         for field in dataclasses.fields(group):
             inner = f"{key}.{field.name}" if key else field.name
@@ -185,6 +205,17 @@ def _check_world(scenario: Scenario) -> None:
         raise UserError("world.room_size_m: must be greater than 0")
     if world.layout == "corridor" and min(world.room_size_m[:2]) < 4.0 * world.corridor_width_m:
         raise UserError("world.corridor_width_m: must not exceed a quarter of room_size_m")
+    if min(world.blocks) < 1:
+        raise UserError("world.blocks: must be 1 or greater")
+    if world.corridor_rooms and world.corridor_width_m > world.room_size_m[1]:
+        raise UserError("world.corridor_width_m: must not exceed the width of a room")
+    for room in world.corridor_rooms:
+        if not 0 <= room < world.rooms:
+            raise UserError(
+                f"world.corridor_rooms: must be from 0 to {world.rooms - 1}, not {room}"
+            )
+    if world.identical_rooms and len(set(world.corridor_rooms)) == world.rooms:
+        raise UserError("world.corridor_rooms: leaves no room that could look like another")
 
 
 def _check_session(scenario: Scenario, session: SessionOptions, key: str) -> None:
@@ -195,12 +226,31 @@ def _check_session(scenario: Scenario, session: SessionOptions, key: str) -> Non
         raise UserError(f"{key}.duration_s: gives more than {_MOST_SAMPLES} IMU samples")
     if not session.device >= 0:
         raise UserError(f"{key}.device: must be 0 or greater")
+    _check_images(session.images, f"{key}.images")
+    if not session.trajectory_start_s >= 0.0:
+        raise UserError(f"{key}.trajectory_start_s: must be 0 or greater")
     if session.trajectory:
         return
+    if session.recorded_imu or session.keep_frame:
+        name = "recorded_imu" if session.recorded_imu else "keep_frame"
+        raise UserError(f"{key}.{name}: is of a trajectory; give {key}.trajectory, too")
     if not session.phases:
         _check_motion(scenario, session, key)
     for row, phase in enumerate(session.phases):
         _check_motion(scenario, phase, f"{key}.phases[{row}]")
+
+
+def _check_images(images: SessionImages, key: str) -> None:
+    if not images.light > 0.0:
+        raise UserError(f"{key}.light: must be greater than 0, not {images.light:g}")
+    if not 0.0 <= images.repainted_share <= 1.0:
+        raise UserError(
+            f"{key}.repainted_share: must be between 0 and 1, not {images.repainted_share:g}"
+        )
+    if not 0.0 <= images.gain_jump < 1.0:
+        raise UserError(f"{key}.gain_jump: must be less than 1, not {images.gain_jump:g}")
+    if not images.gain_jump_every_s >= 0.0:
+        raise UserError(f"{key}.gain_jump_every_s: must be 0 or greater")
 
 
 def _check_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
@@ -216,16 +266,32 @@ def _check_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
         raise UserError(f"{key}.shake_hz: must be greater than 0")
     if not 0 <= motion.room < world.rooms:
         raise UserError(f"{key}.room: must be from 0 to {world.rooms - 1}")
-    if world.layout == "corridor" and motion.kind in ("room_scan", "figure_8", "loop", "vehicle"):
-        raise UserError(f"{key}.kind: the corridor layout has no room for {motion.kind}")
-    if world.layout != "corridor" and motion.kind == "corridor":
-        raise UserError(f"{key}.kind: corridor needs world.layout: corridor")
+    layout = _LAYOUT_OF_KIND.get(motion.kind, world.layout)
+    if layout != world.layout:
+        raise UserError(f"{key}.kind: {motion.kind} needs world.layout: {layout}")
+    if world.layout == "city":
+        _check_street_motion(scenario, motion, key)
+        return
     size = world.room_size_m
     if not 0.0 < motion.wall_distance_m < 0.5 * min(size[:2]):
         raise UserError(f"{key}.wall_distance_m: leaves no room to move in")
     swing = abs(motion.height_swing_m) + motion.shake_m
     if not swing < motion.height_m < size[2] - swing:
         raise UserError(f"{key}.height_m: leads through floor or ceiling")
+
+
+def _check_street_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
+    if motion.kind != "streets":
+        raise UserError(f"{key}.kind: in a city only streets is possible")
+    for first, last, count in zip(
+        motion.first_block, motion.last_block, scenario.world.blocks, strict=True
+    ):
+        if not 0 <= first <= last < count:
+            raise UserError(
+                f"{key}.first_block, last_block: must be blocks of world.blocks, in order"
+            )
+    if motion.height_m <= abs(motion.height_swing_m) + motion.shake_m:
+        raise UserError(f"{key}.height_m: leads through the ground")
 
 
 def _check_camera(camera: CameraOptions, key: str) -> None:
@@ -242,7 +308,7 @@ def _check_camera(camera: CameraOptions, key: str) -> None:
     for name, size in sizes:
         if len(getattr(camera, name)) != size:
             raise UserError(
-                f"{key}.{name}: {size} values are wanted, not {len(getattr(camera, name))}"
+                f"{key}.{name}: {size} values are expected, not {len(getattr(camera, name))}"
             )
     if min(camera.width_px, camera.height_px) < 16:
         raise UserError(f"{key}.width_px, height_px: the image is too small")

@@ -1,24 +1,21 @@
-"""Which landmarks were rightly merged, wrongly merged, or not merged although they are one point."""
+"""Evaluate landmark merges: correct, wrong and missing merges."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sightings:
-    """The map's observations (O,) of which the truth knows what they show."""
+    """Observations (O,) of the map whose world point the truth contains."""
 
     landmark: I64  # row in the map
     point: I64  # world point, -1 = nothing (clutter)
@@ -27,7 +24,7 @@ class Sightings:
 
 @dataclasses.dataclass(frozen=True)
 class MergeCounts:
-    """Landmarks of the simulation (tracks) that share a landmark of the map, or should."""
+    """Counts of simulated landmarks (tracks) that were merged or should be."""
 
     merges: int  # tracks that were joined to another one
     false_merges: int  # of these: joined to tracks of another world point
@@ -36,9 +33,9 @@ class MergeCounts:
 
 
 def sightings(vi_map: VIMap, truth: Truth) -> Sightings:
-    """Look up what the observations of a map show.
+    """Look up the world points of the observations of a map.
 
-    Frames with another number of keypoints than they had at first are left out.
+    Frames whose number of keypoints has changed are skipped.
     """
     row = IdIndex(truth.frame_id).rows(vi_map.frames.id)
     usable = row >= 0
@@ -55,7 +52,7 @@ def sightings(vi_map: VIMap, truth: Truth) -> Sightings:
 def shown_points(seen: Sightings, landmarks: int) -> I64:
     """Return the world point (L,) that most observations of each landmark show, -1 = none.
 
-    Of points that are shown equally often the one of the lowest row counts.
+    Ties are resolved by the lowest row.
     """
     real = seen.point >= 0
     pairs, votes = np.unique(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.atomic import write_file
 from maplab_py.simulation.surfaces import Surfaces
 
 
@@ -25,7 +26,4 @@ def write_mesh(surfaces: Surfaces, path: Path) -> None:
         f"element vertex {4 * len(c)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    with path.open("wb") as file:
-        file.write(header.encode())
-        file.write(corners.astype("<f4").tobytes())
-        file.write(faces.tobytes())
+    write_file(path, [header.encode(), corners.astype("<f4").tobytes(), faces.tobytes()])

@@ -1,12 +1,12 @@
-"""Motion of a session: pieces along paths or from where the body is, spliced without a jerk."""
+"""Motion of a session: smoothly joined pieces along paths or from the current pose."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.simulation.occlusion import is_hidden
@@ -16,16 +16,14 @@ from maplab_py.simulation.spline import PoseSpline
 from maplab_py.simulation.trajectory_motion import trajectory_spline
 from maplab_py.simulation.world import World
 
-F64 = NDArray[np.float64]
-
 CONTROL_SPACING_S = 0.1
 
 _SHAKES = 3
-"""Sinusoids per axis that make up the shaking of a hand."""
+"""Number of sinusoids per axis of the shaking of a hand."""
 _RAMP_S = 1.0
-"""Pieces of a composed motion begin and end at rest, and need this time to get to speed."""
+"""Acceleration time of pieces of a composed motion, which start and end at rest."""
 _SETTLE_S = 0.5
-"""Shaking grows and fades in this time where two pieces meet."""
+"""Fade-in and fade-out time of shaking at the ends of a piece."""
 _BRIDGE_SPEED_MPS = 0.8
 _BRIDGE_RATE_RADPS = 0.8
 _HOVER_HZ = 0.15
@@ -34,29 +32,33 @@ _BODY_RADIUS_M = 0.05
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Entry:
-    """Where a piece of motion begins: the level pose that the one before has reached."""
+    """Start of a piece of motion: the level pose at the end of the previous piece."""
 
     position: F64  # (3,)
     yaw: float
-    turns: dict[str, float]  # where each path was left [turns]
+    turns: dict[str, float]  # parameter at which each path ended [turns]
     is_first: bool
 
 
 def motion_spline(
-    options: SessionOptions, world: WorldOptions, rng: np.random.Generator
+    options: SessionOptions,
+    world: WorldOptions,
+    rng: np.random.Generator,
+    together: tuple[SessionOptions, ...] = (),
 ) -> PoseSpline:
     """Return the motion of one session.
 
     Args:
         options: One piece of motion, several of them, or a trajectory file.
-        world: Gives the paths their measures.
+        world: Determines the size of the paths.
         rng: Source of start phase and shaking.
+        together: Sessions whose trajectories share a frame with this one's.
 
     Raises:
         UserError: The trajectory file cannot be used.
     """
     if options.trajectory:
-        return trajectory_spline(options, world)
+        return trajectory_spline(options, world, together)
     total = options.total_s
     count = int(np.ceil(total / CONTROL_SPACING_S)) + 4
     time: F64 = (np.arange(count, dtype=np.float64) - 1.0) * CONTROL_SPACING_S
@@ -69,18 +71,18 @@ def motion_spline(
         end = begin + phase.duration_s
         first = -np.inf if number == 0 else begin
         last = np.inf if number + 1 == len(options.phases) else end
-        own = (time >= first) & (time < last)
-        poses, entry = _piece(phase, world, entry, time[own] - begin, rng, is_alone=False)
+        in_phase = (time >= first) & (time < last)
+        poses, entry = _piece(phase, world, entry, time[in_phase] - begin, rng, is_alone=False)
         parts.append(poses)
         begin = end
     return PoseSpline(np.concatenate(parts), CONTROL_SPACING_S)
 
 
 def check_free_way(spline: PoseSpline, world: World, key: str) -> None:
-    """Check that a motion stays inside the world and goes through no wall.
+    """Check that a motion stays inside the world and does not cross walls.
 
     Raises:
-        UserError: It does not; the message begins with `key`.
+        UserError: The check fails; the message starts with `key`.
     """
     way = spline.control[:, 4:]
     low, high = world.bounds
@@ -113,7 +115,7 @@ def _piece(
     """Return the poses (N, 7) of one piece at times since its begin, and where it ends."""
     jitter = rng.uniform(-0.02, 0.02)
     duration = motion.duration_s
-    # the end of the piece rides along as the last time
+    # the last time is the end of the piece
     at = np.append(time, duration)
     progress = at / duration if is_alone else _eased(at, duration)
     turns = dict(entry.turns)
@@ -150,7 +152,7 @@ def _path_piece(
 
 
 def _free_piece(motion: MotionOptions, entry: _Entry, progress: F64) -> tuple[F64, F64]:
-    """Return positions (N, 3) and yaw (N,) of a piece that begins where the body is."""
+    """Return positions (N, 3) and yaw (N,) of a piece that starts at the current pose."""
     sign = -1.0 if motion.reverse else 1.0
     turned = 2.0 * np.pi * sign * motion.turns * progress if motion.kind == "rotation" else 0.0
     yaw = entry.yaw + turned + np.zeros_like(progress)
@@ -160,7 +162,7 @@ def _free_piece(motion: MotionOptions, entry: _Entry, progress: F64) -> tuple[F6
 
 
 def _nodding(motion: MotionOptions, progress: F64) -> F64:
-    """Return roll and pitch (N, 3) of somebody who turns on the spot and looks around."""
+    """Return roll and pitch (N, 3) of a rotation in place."""
     look = np.zeros((len(progress), 3))
     if motion.kind == "rotation":
         angle = 2.0 * np.pi * max(abs(motion.turns), 1.0) * progress
@@ -170,9 +172,9 @@ def _nodding(motion: MotionOptions, progress: F64) -> F64:
 
 
 def _first_entry(pieces: tuple[MotionOptions, ...], world: WorldOptions) -> _Entry:
-    """Return where the body is at first: where the first path begins, if there is one.
+    """Return the initial pose: the start of the first path, if there is one.
 
-    Otherwise the middle of the room, its wall for `straight`, or the first corridor.
+    Otherwise it is the middle of the room, its wall for `straight`, or the first corridor.
     """
     for piece in pieces:
         if piece.kind in PATH_KINDS:
@@ -193,7 +195,7 @@ def _first_entry(pieces: tuple[MotionOptions, ...], world: WorldOptions) -> _Ent
 
 
 def _bridge(entry: _Entry, position: F64, yaw: F64, time: F64) -> tuple[F64, F64]:
-    """Begin at the entry and glide onto the path; return positions and yaw."""
+    """Blend from the entry pose to the path; return positions and yaw."""
     now = int(np.argmin(np.abs(time)))
     gap = float(np.linalg.norm(position[now] - entry.position))
     behind = entry.yaw - yaw[now]
@@ -208,7 +210,7 @@ def _bridge(entry: _Entry, position: F64, yaw: F64, time: F64) -> tuple[F64, F64
 
 
 def _eased(time: F64, duration: float) -> F64:
-    """Return progress 0 .. 1 at even speed but for soft ramps from and to rest."""
+    """Return progress 0 .. 1 at constant speed with smooth ramps from and to rest."""
     ramp = min(_RAMP_S, 0.5 * duration)
     t = np.clip(time, 0.0, duration)
 
@@ -240,7 +242,7 @@ def _about_z(yaw: F64) -> F64:
 
 
 def _shaking(motion: MotionOptions, time: F64, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Return how a hand shakes position (N, 3) and rotation vector (N, 3)."""
+    """Return hand shake as position (N, 3) and rotation vector (N, 3)."""
     hertz = _HOVER_HZ if motion.kind == "hover" else motion.shake_hz
     shake_p = _shake(time, motion.shake_m, hertz, rng)
     shake_q = _shake(time, motion.shake_rad, hertz, rng)

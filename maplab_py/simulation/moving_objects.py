@@ -1,16 +1,14 @@
-"""Things that move through the world and carry landmarks: what a static map must reject."""
+"""Moving objects with landmarks, which a static map must reject."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.simulation.scenario import WorldOptions
 from maplab_py.simulation.surfaces import box_surfaces, scatter
-
-F64 = NDArray[np.float64]
 
 _SIZE_M = np.array([0.6, 0.6, 1.5])
 _REACH_M = (1.0, 2.5)
@@ -18,14 +16,14 @@ _REACH_M = (1.0, 2.5)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingObject:
-    """A box that goes to and fro; its landmarks are stored where it is in the middle of its way."""
+    """A box that oscillates; its landmarks are stored at the middle of its path."""
 
     reach_G: F64  # (3,) from the middle to a turning point [m]
     period_s: float
     phase: float
 
     def displacement(self, time_s: F64) -> F64:
-        """Return where the object is (N, 3) [m] at times (N,), seen from the middle of its way."""
+        """Return the offset (N, 3) [m] of the object from the middle of its path at times (N,)."""
         swing = np.sin(2.0 * np.pi * time_s / self.period_s + self.phase)
         return np.asarray(swing[:, None] * self.reach_G)
 

@@ -1,15 +1,15 @@
-"""What hides what: lines of sight against axis-parallel boxes."""
+"""Occlusion of lines of sight by axis-parallel boxes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from maplab_py.array_types import F64
 
 
 def is_hidden(boxes: F64, eye: F64, point: F64) -> NDArray[np.bool_]:
-    """Tell which lines of sight from eyes (N, 3) to points (N, 3) cross a box of (B, 2, 3).
+    """Return which lines of sight from eyes (N, 3) to points (N, 3) cross a box of (B, 2, 3).
 
     The slab test of Kay and Kajiya (1986), one box at a time.
     """

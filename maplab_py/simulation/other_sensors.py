@@ -1,10 +1,11 @@
-"""Measurements beside camera and IMU: absolute poses, odometry, wheels, loop closure edges."""
+"""Simulate absolute poses, odometry, wheel odometry and loop closure edges."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
@@ -13,10 +14,6 @@ from maplab_py.simulation.scenario import OtherSensorOptions
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.tables import AbsolutePoses, LoopClosureEdges, TransformationEdges
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 
 _SWITCH_VARIANCE = 1e-3
 _SENSOR_NAMES = {
@@ -33,7 +30,7 @@ def add_other_sensors(
     options: OtherSensorOptions,
     rng: np.random.Generator,
 ) -> tuple[VIMap, NDArray[np.bool_]]:
-    """Add what the options ask for to the map of a session.
+    """Add the measurements of the options to the map of a session.
 
     Returns:
         The map, and which of its loop closure edges (E,) are true.
@@ -75,7 +72,7 @@ def add_other_sensors(
 
 
 def _with_sensor(vi_map: VIMap, kind: MissionSensor, words: U64, imu_id: str, T_I_S: F64) -> VIMap:
-    """Enter a sensor into the map's sensors and its mission."""
+    """Add a sensor to the map's sensors and its mission."""
     sensor_id, name = to_hex(words), _SENSOR_NAMES[kind]
     keys = {"id": sensor_id, "sensor_type": name, "topic": name.lower()}
     sensors = SensorSet(
@@ -142,9 +139,9 @@ def _odometry(
 def _loop_edges(
     T_G_I: F64, time_ns: I64, options: OtherSensorOptions, rng: np.random.Generator
 ) -> tuple[LoopClosureEdges, NDArray[np.bool_]]:
-    """Join places that were visited twice, and a share of places that only look the same.
+    """Add edges between places visited twice, and a share of false edges.
 
-    A false edge claims of two places far apart what is true of two near ones.
+    A false edge joins two distant places with the relative pose of two near ones.
     """
     from scipy.spatial.distance import cdist
 
@@ -157,7 +154,7 @@ def _loop_edges(
     if len(near) < options.loop_edges or len(far) < false_count:
         raise UserError(
             f"other_sensors.loop_edges: the motion offers {len(near)} pairs of near and {len(far)} "
-            f"of far places; {options.loop_edges} and {false_count} are wanted"
+            f"of far places; {options.loop_edges} and {false_count} are needed"
         )
     claimed = near[rng.choice(len(near), options.loop_edges, replace=False)]
     joined = claimed.copy()

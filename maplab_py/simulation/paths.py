@@ -1,31 +1,30 @@
-"""Paths that a world lays down: where to be, and where to look, after how many turns."""
+"""Paths in a world: position and yaw as functions of the number of turns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.simulation.scenario import MotionOptions, WorldOptions
+from maplab_py.simulation.streets import street_route
 from maplab_py.simulation.world import stair_half_length
-
-F64 = NDArray[np.float64]
 
 Path = Callable[[F64, MotionOptions, WorldOptions], tuple[F64, F64]]
 """Takes turns (N,) [rad]; returns positions (N, 3) above the height of the motion, and yaw (N,)."""
 
 _POINTS_PER_TURN = 4096
 _LANE_M = 0.4
-"""Distance from the middle of a doorway, so that the ways there and back differ."""
+"""Distance from the middle of a doorway, so that the paths in both directions differ."""
 _DOOR_APPROACH_M = 1.5
 
 
 def follow(turn: F64, motion: MotionOptions, world: WorldOptions) -> tuple[F64, F64]:
     """Return positions (N, 3) above the height of the motion and yaw (N,) after turns (N,) [rad].
 
-    The yaw looks where `turn` grows; who walks in reverse looks the other way on all but
-    room_scan.
+    The yaw points in the direction of increasing `turn`; in reverse motion it is opposite except
+    on room_scan.
     """
     position, yaw = _PATHS[motion.kind](turn, motion, world)
     if motion.reverse and motion.kind != "room_scan":
@@ -58,9 +57,13 @@ def _loop(turn: F64, motion: MotionOptions, world: WorldOptions) -> tuple[F64, F
     xy = _superellipse(half, 4)
     xy[:, 0] += 0.5 * (world.rooms - 1) * size_x
     narrow = min(_LANE_M / half[1], 1.0)
+    wide_y = xy[:, 1].copy()
     for door in range(1, world.rooms):
         distance = xy[:, 0] - (door - 0.5) * size_x
         xy[:, 1] *= 1.0 - (1.0 - narrow) * np.exp(-((distance / _DOOR_APPROACH_M) ** 2))
+    for room in world.corridor_rooms:
+        inside = np.abs(xy[:, 0] - room * size_x) <= 0.5 * size_x
+        xy[:, 1] = np.where(inside, narrow * wide_y, xy[:, 1])
     return _along(np.column_stack([xy, np.zeros(len(xy))]), turn)
 
 
@@ -85,12 +88,19 @@ def _corridor(turn: F64, _: MotionOptions, world: WorldOptions) -> tuple[F64, F6
     return position, yaw
 
 
+def _streets(turn: F64, motion: MotionOptions, world: WorldOptions) -> tuple[F64, F64]:
+    """Walk the streets round a rectangle of blocks and look ahead."""
+    xy = street_route(world, motion.first_block, motion.last_block)
+    return _along(np.column_stack([xy, np.zeros(len(xy))]), turn)
+
+
 _PATHS: dict[str, Path] = {
     "room_scan": _room_scan,
     "figure_8": _figure_8,
     "loop": _loop,
     "vehicle": _loop,
     "corridor": _corridor,
+    "streets": _streets,
 }
 
 
@@ -126,5 +136,5 @@ def _along(curve: F64, turn: F64) -> tuple[F64, F64]:
 
 
 def _smooth(fraction: F64) -> F64:
-    """Return a rise from 0 to 1 that begins and ends level."""
+    """Return a smooth step from 0 to 1 with zero slope at both ends."""
     return fraction**2 * (3.0 - 2.0 * fraction)

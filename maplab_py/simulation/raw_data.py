@@ -1,8 +1,9 @@
-"""Raw recordings as EuRoC folders, and the truth that belongs to them in folders of its own.
+"""Raw recordings as EuRoC folders, and their ground truth in separate folders.
 
 `raw/session_1/mav0` has `imu0` and `cam0`, `cam1`, ... with `data.csv`, `sensor.yaml` and, where
-the scenario renders images, `data/<time stamp>.png`. `truth/session_1` has the true trajectory and
-depth images (millimetres along the optical axis, 16 bit), `truth/mesh.ply` the surfaces.
+the scenario renders images, `data/<time stamp>.png`, and the true states as EuRoC has them, in
+`state_groundtruth_estimate0`. `truth/session_1` has the same states and depth images (millimetres
+along the optical axis, 16 bit), `truth/mesh.ply` the surfaces.
 """
 
 from __future__ import annotations
@@ -10,9 +11,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.errors import UserError
+from maplab_py.array_types import F64
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import ImuRecording as ImuFile
 from maplab_py.interop.imu_csv import write_imu_csv
@@ -20,22 +20,20 @@ from maplab_py.interop.trajectories import Trajectory, write_euroc
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
-from maplab_py.simulation.imaging import Imager
+from maplab_py.simulation.image_files import SessionFolders, write_images
 from maplab_py.simulation.mesh import write_mesh
-from maplab_py.simulation.rendering import Scene, make_scene
+from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.scene import make_scene
 from maplab_py.simulation.simulate import RecordedSession, SimulatedData
 
-F64 = NDArray[np.float64]
-
-_SCENE_STREAM, _NOISE_STREAM = 21, 22
+_SCENE_STREAM, _REPAINT_STREAM = 21, 24
 _DISTORTION_NAMES = {
     Distortion.NONE: "none",
     Distortion.RADTAN: "radial-tangential",
     Distortion.EQUIDISTANT: "equidistant",
     Distortion.FOV: "fov",
 }
-_PNG_LEVEL = 1
 
 
 def write_raw_data(
@@ -46,7 +44,7 @@ def write_raw_data(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> list[Path]:
-    """Write what the sensors of all sessions recorded.
+    """Write the sensor recordings of all sessions.
 
     Returns:
         The folders of the sessions.
@@ -58,7 +56,7 @@ def write_raw_data(
     scene = None
     if scenario.images.render:
         rng = np.random.default_rng([scenario.seeds.world, _SCENE_STREAM])
-        scene = make_scene(data.world.bounds, data.world.boxes, scenario.images.texel_m, rng)
+        scene = make_scene(data.world.bounds, data.world.boxes, scenario.images, rng)
         truth_folder = folder / "truth"
         truth_folder.mkdir(parents=True, exist_ok=True)
         write_mesh(scene.surfaces, truth_folder / "mesh.ply")
@@ -68,9 +66,16 @@ def write_raw_data(
         target = folder / "raw" / name
         _write_session(scenario, session, target / "mav0", overwrite=overwrite)
         truth = folder / "truth" / name
-        _write_trajectory(session, truth, overwrite=overwrite)
+        _write_trajectory(session, truth / "ground_truth.csv", overwrite=overwrite)
+        states = target / "mav0" / "state_groundtruth_estimate0"
+        _write_trajectory(session, states / "data.csv", overwrite=overwrite)
+        _write_lines(states / "sensor.yaml", _states_yaml(), overwrite)
         if scene is not None:
-            _write_images(scenario, number, session, scene, target / "mav0", truth, progress)
+            rng = np.random.default_rng([scenario.seeds.appearance, _REPAINT_STREAM, number])
+            share = scenario.sessions[number].images.repainted_share
+            painted = painted_boxes(scene.repainted(share, rng))
+            to = SessionFolders(target / "mav0", truth)
+            write_images(scenario, number, session, painted, to, progress=progress)
         folders.append(target)
     return folders
 
@@ -93,10 +98,10 @@ def _write_session(
         _write_lines(home / "sensor.yaml", text, overwrite)
 
 
-def _write_trajectory(session: RecordedSession, folder: Path, *, overwrite: bool) -> None:
-    """Write the true trajectory in the form of EuRoC's ground truth, G being the world."""
+def _write_trajectory(session: RecordedSession, path: Path, *, overwrite: bool) -> None:
+    """Write the true states in the form of EuRoC's ground truth, G being the world."""
     recording = session.recording
-    folder.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     trajectory = Trajectory(
         recording.imu_time_ns,
         recording.imu_motion.T_G_I,
@@ -104,50 +109,7 @@ def _write_trajectory(session: RecordedSession, folder: Path, *, overwrite: bool
         gyro_bias=recording.imu.gyro_bias,
         accel_bias=recording.imu.accel_bias,
     )
-    write_euroc(trajectory, folder / "ground_truth.csv", overwrite=overwrite)
-
-
-def _write_images(
-    scenario: Scenario,
-    number: int,
-    session: RecordedSession,
-    scene: Scene,
-    mav: Path,
-    truth: Path,
-    progress: Progress,
-) -> None:
-    import cv2
-
-    device, recording = session.device, session.recording
-    count, options = len(recording.time_ns), scenario.images
-    for row, camera in enumerate(device.true_rig.cameras):
-        T_I_C = device.true_rig.T_B_C[row]
-
-        def at_time(time_s: F64, T_I_C: F64 = T_I_C) -> F64:
-            inside = np.clip(time_s, 0.0, recording.spline.duration_s)
-            return se3.compose(recording.spline.evaluate(inside).T_G_I, T_I_C)
-
-        delay = scenario.cameras[row].line_delay_s
-        imager = Imager.of(scene, camera, options, delay, at_time)
-        images, depths = mav / f"cam{row}" / "data", truth / f"depth{row}"
-        images.mkdir(exist_ok=True)
-        if options.depth:
-            depths.mkdir(exist_ok=True)
-        for frame, stamp in enumerate(recording.time_ns.tolist()):
-            progress.step(frame, count, f"images of session {number + 1}, camera {row}")
-            seed = [scenario.seeds.measurement, _NOISE_STREAM, number, row, frame]
-            time_s = float(recording.frame_s[frame])
-            image, depth = imager.image(time_s, np.random.default_rng(seed))
-            _write_png(cv2, images / f"{stamp}.png", image)
-            if options.depth:
-                millimetres = np.clip(np.round(1000.0 * depth), 0, 65535).astype(np.uint16)
-                _write_png(cv2, depths / f"{stamp}.png", millimetres)
-
-
-def _write_png(cv2: object, path: Path, image: NDArray[np.generic]) -> None:
-    done = cv2.imwrite(str(path), image, [16, _PNG_LEVEL])  # type: ignore[attr-defined]
-    if not done:
-        raise UserError(f"cannot write {path}")
+    write_euroc(trajectory, path, overwrite=overwrite)
 
 
 def _write_lines(path: Path, lines: list[str], overwrite: bool) -> None:
@@ -158,6 +120,14 @@ def _matrix_yaml(T_B_S: F64) -> list[str]:
     rows = [", ".join(f"{value:.17g}" for value in row) for row in se3.to_matrix(T_B_S)]
     data = ",\n         ".join(rows)
     return ["T_BS:", "  cols: 4", "  rows: 4", f"  data: [{data}]"]
+
+
+def _states_yaml() -> list[str]:
+    return [
+        "sensor_type: visual-inertial",
+        "comment: true states of the simulated body",
+        *_matrix_yaml(se3.identity()),
+    ]
 
 
 def _imu_yaml(imu: Imu, rate_hz: float) -> list[str]:

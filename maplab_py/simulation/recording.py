@@ -1,4 +1,4 @@
-"""What the sensors of one session record."""
+"""Recordings of all sensors of a session."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.simulation.appearance import SessionAppearance, describe
 from maplab_py.simulation.detection import CameraPoses, Detections, detect
 from maplab_py.simulation.drift import DriftedStates, drift
 from maplab_py.simulation.imu import ImuRecording, measure
 from maplab_py.simulation.motion import check_free_way, motion_spline
+from maplab_py.simulation.recorded_imu import recorded_samples
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.sensors import Device
 from maplab_py.simulation.spline import MotionState, PoseSpline
 from maplab_py.simulation.world import World
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _EPOCH_NS = 1_600_000_000_000_000_000
 _SESSION_GAP_NS = 3_600_000_000_000
@@ -27,7 +26,7 @@ _SESSION_GAP_NS = 3_600_000_000_000
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SessionSeeds:
-    """One generator per kind of chance."""
+    """Random generators, one per source of randomness."""
 
     motion: np.random.Generator
     measurement: np.random.Generator
@@ -38,7 +37,7 @@ class SessionSeeds:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recording:
-    """Everything that was recorded, at the V vertices unless said otherwise."""
+    """All recorded data, at the V vertices unless stated otherwise."""
 
     time_ns: I64  # (V,)
     motion: MotionState
@@ -61,31 +60,35 @@ def record(
     appearance: SessionAppearance,
     seeds: SessionSeeds,
 ) -> Recording:
-    """Move the device through the world and record what it measures.
+    """Move the device through the world and record its measurements.
 
     Args:
         scenario: The whole scenario.
         number: Which of its sessions.
         world: The world that all sessions share.
-        device: What the session is recorded with.
-        appearance: How the world looks in this session.
+        device: The recording device.
+        appearance: Appearance of the world in this session.
         seeds: Generators of this session.
 
     Raises:
         UserError: The motion leads out of the world or through a wall.
     """
     options = scenario.sessions[number]
-    spline = motion_spline(options, scenario.world, seeds.motion)
+    together = tuple(s for s in scenario.sessions if s.keep_frame) if options.keep_frame else ()
+    spline = motion_spline(options, scenario.world, seeds.motion, together)
     check_free_way(spline, world, f"sessions[{number}]")
-    clock = _Clock.of(scenario, options.total_s)
-    imu_motion = spline.evaluate(clock.sample_s + clock.lead_s)
-    felt = imu_motion
-    if scenario.imu.time_offset_s != 0.0:
+    lead_s = _lead_s(scenario)
+    samples = recorded_samples(options, lead_s)
+    if samples is None:
+        clock = _Clock.of(scenario, options.total_s, lead_s)
         felt = spline.evaluate(clock.sample_s + clock.lead_s - scenario.imu.time_offset_s)
-    imu = measure(scenario.imu, device.true_imu, felt, seeds.measurement)
+        imu = measure(scenario.imu, device.true_imu, felt, seeds.measurement)
+    else:
+        clock, imu = _Clock.of_samples(scenario, samples.time_s, lead_s), samples.imu
+    imu_motion = spline.evaluate(clock.sample_s + clock.lead_s)
     motion = spline.evaluate(clock.sample_s[clock.frame_row] + clock.lead_s)
     states = drift(scenario.drift, motion, clock.sample_s[clock.frame_row], seeds.measurement)
-    found = _detect_all(scenario, world, device, spline, clock, appearance, seeds)
+    detections = _detect_all(scenario, world, device, spline, clock, appearance, seeds)
     kept, stamp_ns = _stamps(scenario, clock, seeds.other)
     begin_ns = _EPOCH_NS + number * _SESSION_GAP_NS
     return Recording(
@@ -96,8 +99,8 @@ def record(
         imu_motion.take(kept),
         imu.take(kept),
         np.searchsorted(kept, clock.frame_row),
-        found,
-        describe(appearance, found, seeds.appearance),
+        detections,
+        describe(appearance, detections, seeds.appearance),
         spline,
         clock.sample_s[clock.frame_row] + clock.lead_s,
     )
@@ -112,14 +115,28 @@ class _Clock:
     lead_s: float  # motion before the begin, for what is measured late
 
     @classmethod
-    def of(cls, scenario: Scenario, seconds: float) -> _Clock:
+    def of(cls, scenario: Scenario, seconds: float, lead: float) -> _Clock:
         rate, frame_rate = scenario.imu.rate_hz, scenario.measurement.frame_rate_hz
-        readout = max(abs(c.line_delay_s) * c.height_px for c in scenario.cameras)
-        lead = max(abs(scenario.imu.time_offset_s), readout)
         samples = int(np.floor((seconds - 2.0 * lead) * rate + 1e-6)) + 1
         frames = int(np.floor((seconds - 2.0 * lead) * frame_rate + 1e-6)) + 1
         row = np.unique(np.minimum(np.round(np.arange(frames) * rate / frame_rate), samples - 1))
         return cls(np.arange(samples) / rate, row.astype(np.int64), lead)
+
+    @classmethod
+    def of_samples(cls, scenario: Scenario, time_s: F64, lead: float) -> _Clock:
+        """Take images at those of the recorded samples (S,) that are nearest to the frame rate."""
+        frame_rate = scenario.measurement.frame_rate_hz
+        frames = int(np.floor((time_s[-1] - time_s[0]) * frame_rate + 1e-6)) + 1
+        wanted = time_s[0] + np.arange(frames) / frame_rate
+        middle = 0.5 * (time_s[1:] + time_s[:-1])
+        row = np.unique(np.searchsorted(middle, wanted))
+        return cls(time_s - lead, row.astype(np.int64), lead)
+
+
+def _lead_s(scenario: Scenario) -> float:
+    """Return how long the body moves before the first sample and after the last one [s]."""
+    readout = max(abs(c.line_delay_s) * c.height_px for c in scenario.cameras)
+    return max(abs(scenario.imu.time_offset_s), readout)
 
 
 def _stamps(scenario: Scenario, clock: _Clock, rng: np.random.Generator) -> tuple[I64, I64]:
@@ -163,13 +180,13 @@ def _detect_all(
 
         delay = scenario.cameras[row].line_delay_s
         poses = CameraPoses(time_s, se3.compose(T_G_I, T_I_C), delay, at_time)
-        found = detect(
+        detections = detect(
             camera, poses, world, appearance.is_there, scenario.measurement, seeds.measurement
         )
-        track = np.where(found.track >= 0, found.track + tracks, -1)
+        track = np.where(detections.track >= 0, detections.track + tracks, -1)
         tracks = max(tracks, int(track.max(initial=-1)) + 1)
-        frame = found.frame * len(cameras) + row
-        parts.append(dataclasses.replace(found, frame=frame, track=track))
+        frame = detections.frame * len(cameras) + row
+        parts.append(dataclasses.replace(detections, frame=frame, track=track))
     names = [field.name for field in dataclasses.fields(Detections)]
     joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
     order = np.argsort(joined["frame"], kind="stable")

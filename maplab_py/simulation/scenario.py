@@ -1,18 +1,18 @@
-"""Scenarios: everything that describes a simulated data set, as it stands in a YAML file."""
+"""Scenarios: the description of a simulated data set, as in a YAML file."""
 
 from __future__ import annotations
 
 import dataclasses
 
-PATH_KINDS = ("room_scan", "figure_8", "loop", "corridor", "vehicle")
-"""Motions along a path that the world lays down; the others start wherever the body is."""
+PATH_KINDS = ("room_scan", "figure_8", "loop", "corridor", "vehicle", "streets")
+"""Motions along a path of the world; other motions start at the current pose."""
 MOTION_KINDS = (*PATH_KINDS, "straight", "rotation", "stationary", "hover", "shake")
-LAYOUTS = ("rooms", "corridor")
+LAYOUTS = ("rooms", "corridor", "city")
 
 
 @dataclasses.dataclass(frozen=True)
 class Seeds:
-    """Independent seeds: changing one leaves what the others produce as it was."""
+    """Independent seeds: a change of one does not affect the results of the others."""
 
     world: int = 1
     motion: int = 1
@@ -25,20 +25,24 @@ class WorldOptions:
     """Surfaces with landmarks on them.
 
     `rooms`: rooms in a row along x, joined by open doorways. `corridor`: a ring of corridors around
-    a solid block, `floors` above each other, joined by stairs in the two short sides.
+    a solid block, `floors` above each other, joined by stairs in the two short sides. `city`: a grid
+    of streets between blocks of houses.
     """
 
-    layout: str = "rooms"  # or corridor
+    layout: str = "rooms"  # or corridor, city
     rooms: int = 1
+    corridor_rooms: tuple[int, ...] = ()  # are corridors with an appearance of their own
     floors: int = 1  # of a corridor
-    room_size_m: tuple[float, float, float] = (10.0, 8.0, 3.5)  # corridor: of one floor
-    corridor_width_m: float = 2.5
-    landmarks_per_room: int = 2500  # corridor: per floor
+    blocks: tuple[int, int] = (3, 2)  # columns and rows of a city
+    room_size_m: tuple[float, float, float] = (10.0, 8.0, 3.5)  # corridor: of a floor; city: block
+    corridor_width_m: float = 2.5  # city: of the streets
+    landmarks_per_room: int = 2500  # corridor: per floor; city: per block
     furniture_per_room: int = 4
     patchiness: float = 0.6  # 0 = even density, 1 = all landmarks in clusters
     bare_share: float = 0.0  # of the surfaces: carry a tenth of the landmarks that others do
-    identical_rooms: bool = False  # all rooms look alike
-    distinct_share: float = 0.03  # of the landmarks of identical rooms: the room's own
+    identical_rooms: bool = False  # all rooms but corridor_rooms have the same appearance
+    identical_floors: bool = False  # all floors of a corridor have the same appearance
+    distinct_share: float = 0.03  # share of landmarks that distinguish a room from the others
     moving_objects: int = 0
     landmarks_per_object: int = 60
     object_speed_mps: float = 0.5
@@ -46,7 +50,7 @@ class WorldOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ImuOptions:
-    """The thesis' IMU model."""
+    """IMU model of Schneider 2019, section 7."""
 
     rate_hz: float = 200.0
     gyro_noise_density: float = 1.7e-4  # [rad/s/sqrt(Hz)]
@@ -65,7 +69,7 @@ class ImuOptions:
     gyro_misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)  # T_g [01, 02, 12]
     accel_misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)  # T_a [01, 02, 12]
     accel_rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # log R_A_I
-    # what no model in the map knows of
+    # effects that the IMU model of the map does not include
     g_sensitivity: float = 0.0  # of the gyroscope, along each axis [rad/s per m/s^2]
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the accelerometer, in I
     warming_scale: float = 0.0  # by which both scales grow while the device warms up
@@ -90,7 +94,7 @@ class CameraOptions:
 
 @dataclasses.dataclass(frozen=True)
 class MeasurementOptions:
-    """What the cameras see and what a tracker makes of it."""
+    """Visibility, detection and tracking of landmarks."""
 
     frame_rate_hz: float = 10.0
     keypoint_sigma_px: float = 0.8  # in the lowest octave
@@ -125,7 +129,7 @@ class AppearanceOptions:
 
 @dataclasses.dataclass(frozen=True)
 class DriftOptions:
-    """How a visual-inertial odometry leaves its states."""
+    """Drift of the visual-inertial odometry."""
 
     position_walk: float = 0.01  # [m/sqrt(s)]
     yaw_walk_deg: float = 0.25  # [deg/sqrt(s)]
@@ -134,14 +138,14 @@ class DriftOptions:
     velocity_sigma: float = 0.03  # [m/s]
     gyro_bias_sigma: float = 5e-4  # [rad/s]
     accel_bias_sigma: float = 0.01  # [m/s^2]
-    baseframe_offset_m: float = 5.0  # the stored T_G_M means nothing yet
+    baseframe_offset_m: float = 5.0  # the stored T_G_M is arbitrary
 
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationOptions:
-    """How far a device is from the calibration that its maps carry; only the truth file knows.
+    """Deviation of a device from the calibration of its maps; only the truth file contains it.
 
-    `imu` and `cameras` of the scenario are what the maps say. Deviations are drawn per device.
+    `imu` and `cameras` of the scenario are the calibration in the maps. Deviations are drawn per device.
     """
 
     focal_sigma_px: float = 0.0
@@ -154,14 +158,14 @@ class CalibrationOptions:
     gyro_misalignment_sigma: float = 0.0
     accel_misalignment_sigma: float = 0.0
     accel_rotation_sigma_deg: float = 0.0
-    session_share: float = 0.0  # of all of these: drawn anew for every session
+    session_share: float = 0.0  # share of all of these that is drawn for every session
     imu_noise_factor: float = 1.0  # noise densities in the map / true ones
     keypoint_noise_factor: float = 1.0  # keypoint sigma in the map / true one
 
 
 @dataclasses.dataclass(frozen=True)
 class OtherSensorOptions:
-    """Sensors beside cameras and IMU; errors are white and as large as their covariances say."""
+    """Other sensors than cameras and IMU; errors are white with the stated covariances."""
 
     absolute_pose_every_s: float = 0.0  # 0 = none; of S in the frame of the world
     absolute_pose_sigma_m: float = 0.05
@@ -170,7 +174,7 @@ class OtherSensorOptions:
     wheel_odometry: bool = False  # likewise, of the IMU
     odometry_sigma_m: float = 0.005  # per edge, both kinds
     odometry_sigma_deg: float = 0.05
-    wheel_scale: float = 1.0  # of the way that the wheels report; nobody is told
+    wheel_scale: float = 1.0  # of the distance that the wheels report; not stated in the map
     sensor_position_m: tuple[float, float, float] = (0.1, 0.0, 0.2)  # of S in I
     sensor_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
     loop_edges: int = 0  # per session
@@ -182,12 +186,29 @@ class OtherSensorOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class LidarOptions:
+    """A spinning lidar. Its clouds are of one moment each: motion during a turn is compensated."""
+
+    rate_hz: float = 0.0  # clouds per second; 0 = no lidar
+    rings: int = 16
+    columns: int = 900  # per turn
+    lowest_deg: float = -22.5  # elevation of the lowest ring
+    highest_deg: float = 22.5
+    range_sigma_m: float = 0.01
+    min_range_m: float = 0.3
+    max_range_m: float = 30.0
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.15)  # of the lidar in I
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
+
+
+@dataclasses.dataclass(frozen=True)
 class ImageOptions:
     """Rendered images; they show the world's surfaces through the true cameras."""
 
     render: bool = False
     depth: bool = True  # beside the truth
     texel_m: float = 0.005  # of the finest texture
+    bare_share: float = 0.0  # of the surfaces: a hundredth of the shapes that others have
     exposure_s: float = 0.004
     blur_samples: int = 3  # moments within the exposure; 1 = no motion blur
     gain_swing: float = 0.15  # by which brightness comes and goes
@@ -201,8 +222,8 @@ class MotionOptions:
 
     Along a path: `room_scan` looks at the walls of a room, `figure_8` crosses it, `loop` goes round
     all rooms through their doorways, `vehicle` does so on wheels, `corridor` walks the corridors and
-    stairs. From where the body is: `straight` (constant velocity), `rotation` (position kept),
-    `stationary`, `hover`, `shake`.
+    stairs, `streets` goes round a rectangle of blocks of a city. From where the body is: `straight`
+    (constant velocity), `rotation` (position kept), `stationary`, `hover`, `shake`.
     """
 
     kind: str = "room_scan"
@@ -211,6 +232,11 @@ class MotionOptions:
     start_turn: float = 0.0  # counted from where the last piece of the same kind ended
     reverse: bool = False
     room: int = 0  # of room_scan and figure_8
+    first_block: tuple[int, int] = (
+        0,
+        0,
+    )  # of streets: column and row at the rectangle's low corner
+    last_block: tuple[int, int] = (0, 0)  # and at its high corner
     height_m: float = 1.5
     height_swing_m: float = 0.2
     wall_distance_m: float = 2.2
@@ -222,12 +248,26 @@ class MotionOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class SessionImages:
+    """What the rendered images of a session have of their own."""
+
+    light: float = 1.0  # by which grey values are multiplied
+    gain_jump: float = 0.0  # the gain of the cameras jumps to values within 1 -+ gain_jump
+    gain_jump_every_s: float = 0.0  # mean time between the jumps; 0 = none
+    repainted_share: float = 0.0  # of the surfaces' area looks different
+
+
+@dataclasses.dataclass(frozen=True)
 class SessionOptions(MotionOptions):
     """One recording: a single piece of motion, several of them one after the other, or a file."""
 
     phases: tuple[MotionOptions, ...] = ()  # where there are any, they are the motion
     trajectory: str = ""  # EuRoC or TUM file; where there is one, it is the motion
+    trajectory_start_s: float = 0.0  # of the part that is used, counted from the begin of the file
+    keep_frame: bool = False  # trajectories that do are placed together, not each by itself
+    recorded_imu: str = ""  # EuRoC file with the IMU samples of the trajectory; empty = simulated
     device: int = 0  # devices of other numbers have other deviations and ids
+    images: SessionImages = SessionImages()
 
     @property
     def total_s(self) -> float:
@@ -252,46 +292,10 @@ class Scenario:
     drift: DriftOptions = DriftOptions()
     calibration: CalibrationOptions = CalibrationOptions()
     other_sensors: OtherSensorOptions = OtherSensorOptions()
+    lidar: LidarOptions = LidarOptions()
     images: ImageOptions = ImageOptions()
     sessions: tuple[SessionOptions, ...] = (SessionOptions(),)
 
     def with_seed(self, seed: int) -> Scenario:
         """Return the scenario with all four seeds exchanged."""
         return dataclasses.replace(self, seeds=Seeds(seed, seed, seed, seed))
-
-    def without_noise(self) -> Scenario:
-        """Return the scenario with perfect sensors, a perfect tracker and no drift."""
-        zero = 0.0
-        return dataclasses.replace(
-            self,
-            imu=dataclasses.replace(
-                self.imu,
-                gyro_noise_density=zero,
-                accel_noise_density=zero,
-                gyro_bias_walk=zero,
-                accel_bias_walk=zero,
-                g_sensitivity=zero,
-                lever_arm_m=(zero, zero, zero),
-                warming_scale=zero,
-                time_offset_s=zero,
-                time_jitter_s=zero,
-            ),
-            measurement=dataclasses.replace(
-                self.measurement,
-                keypoint_sigma_px=zero,
-                identity_swap_share=zero,
-                track_drift_share=zero,
-                clutter_share=zero,
-            ),
-            drift=dataclasses.replace(
-                self.drift,
-                position_walk=zero,
-                yaw_walk_deg=zero,
-                tilt_sigma_deg=zero,
-                scale_sigma=zero,
-                velocity_sigma=zero,
-                gyro_bias_sigma=zero,
-                accel_bias_sigma=zero,
-            ),
-            calibration=CalibrationOptions(),
-        )

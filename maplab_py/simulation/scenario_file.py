@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.simulation.limits import check_scenario
+from maplab_py.simulation.reports import ScenarioLine, ScenarioList
 from maplab_py.simulation.scenario import Scenario
 
 _FOLDER = Path(__file__).parent / "scenarios"
@@ -22,6 +24,16 @@ _KINDS: dict[type, str] = {bool: "true or false", int: "a whole number", float: 
 def scenario_names() -> list[str]:
     """Return the names of the scenarios that come with the program."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+
+
+def list_scenarios() -> ScenarioList:
+    """Describe the scenarios that come with the program."""
+    lines = []
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        seconds = sum(session.total_s for session in scenario.sessions)
+        lines.append(ScenarioLine(name, len(scenario.sessions), seconds, scenario.description))
+    return ScenarioList(tuple(lines))
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
@@ -39,7 +51,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             f"there is no scenario '{name_or_path}': give a YAML file or one of {known}"
         )
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, SCRIPT_MAX_BYTES, remedy="scenarios are shorter")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise UserError(f"cannot read {path}: {reason}") from None
@@ -78,11 +90,17 @@ def _syntax_error(source: str, error: MapError) -> str:
 
 
 def _with_absolute_paths(scenario: Scenario, folder: Path) -> Scenario:
-    """Return the scenario with its trajectory files looked up beside the scenario file."""
+    """Return the scenario with the files of its sessions looked up beside the scenario file."""
+
+    def beside(file: str) -> str:
+        return str(folder / file) if file else ""
+
     sessions = tuple(
-        dataclasses.replace(session, trajectory=str(folder / session.trajectory))
-        if session.trajectory
-        else session
+        dataclasses.replace(
+            session,
+            trajectory=beside(session.trajectory),
+            recorded_imu=beside(session.recorded_imu),
+        )
         for session in scenario.sessions
     )
     return dataclasses.replace(scenario, sessions=sessions)
@@ -101,12 +119,12 @@ def _read(kind: Any, value: Any, key: str) -> Any:
         return float(value)
     if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
         return value
-    raise UserError(f"{key}: {_KINDS.get(kind, 'a text')} is wanted, not {value!r}")
+    raise UserError(f"{key}: {_KINDS.get(kind, 'a text')} is expected, not {value!r}")
 
 
 def _read_group(kind: type, value: Any, key: str) -> Any:
     if not isinstance(value, Mapping):
-        raise UserError(f"{key or 'the file'}: a mapping of keys is wanted, not {value!r}")
+        raise UserError(f"{key or 'the file'}: a mapping of keys is expected, not {value!r}")
     hints = typing.get_type_hints(kind)
     fields: dict[str, Any] = {}
     for name, item in value.items():
@@ -121,11 +139,11 @@ def _read_group(kind: type, value: Any, key: str) -> Any:
 
 def _read_list(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise UserError(f"{key}: a list is wanted, not {value!r}")
+        raise UserError(f"{key}: a list is expected, not {value!r}")
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         kinds = (kinds[0],) * len(value)
     if len(kinds) != len(value):
-        raise UserError(f"{key}: {len(kinds)} values are wanted, not {len(value)}")
+        raise UserError(f"{key}: {len(kinds)} values are expected, not {len(value)}")
     return tuple(
         _read(kind, item, f"{key}[{row}]")
         for row, (kind, item) in enumerate(zip(kinds, value, strict=True))

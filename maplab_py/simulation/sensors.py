@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import (
     Camera,
@@ -22,18 +22,16 @@ from maplab_py.simulation.imu import intrinsics_of
 from maplab_py.simulation.scenario import CameraOptions, Scenario
 from maplab_py.vimap.ids import random_ids, to_hex
 
-F64 = NDArray[np.float64]
-
 # C looks along x of I: x_C = -y_I, y_C = -z_I, z_C = x_I
 _R_I_C_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _ID_STREAM, _DEVIATION_STREAM = 11, 13
 _SMALL_DENSITY = 1e-6
-"""An estimator needs some noise to weigh by, even where there is none."""
+"""Noise densities of perfect sensors in the map, which an estimator needs as weights."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Device:
-    """What one device is believed to be, and what it truly is in one session."""
+    """Nominal calibration of a device and its true calibration in a session."""
 
     sensor_set: SensorSet  # as the map stores it
     imu_id: str
@@ -46,7 +44,7 @@ def make_device(scenario: Scenario, number: int, session: int) -> Device:
     """Build IMU and camera rig of a device as they are in a session.
 
     Args:
-        scenario: Its `imu` and `cameras` are what the maps say.
+        scenario: Scenario, whose `imu` and `cameras` are the calibration in the maps.
         number: Which device: ids and deviations depend on it.
         session: Deviations depend on it by the calibration's session_share.
     """
@@ -77,7 +75,7 @@ def make_device(scenario: Scenario, number: int, session: int) -> Device:
 
 
 class _Deviation:
-    """Draws how the true values differ, always in the same order."""
+    """Draws the deviations of the true values in a fixed order."""
 
     def __init__(self, scenario: Scenario, device: int, session: int) -> None:
         """Seed by device and by session."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.simulation.detection import Detections, sigma_of_octave
 from maplab_py.simulation.drift import baseframe
 from maplab_py.simulation.initial_landmarks import InitialLandmarks, initial_landmarks
@@ -15,6 +16,7 @@ from maplab_py.simulation.sensors import Device
 from maplab_py.simulation.truth import Truth, session_truth
 from maplab_py.simulation.world import World
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import from_hex, random_ids
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.tables import (
@@ -30,11 +32,9 @@ from maplab_py.vimap.tables import (
     Vertices,
 )
 
-I64 = NDArray[np.int64]
-
 _KEYPOINT_SCALE = 20.0
 _MIN_SIGMA_PX = 0.1
-"""Standard deviation that perfect keypoints announce, so that they can be weighed."""
+"""Standard deviation of perfect keypoints in the map, which an estimator needs as weight."""
 
 
 def session_map(
@@ -103,7 +103,7 @@ def _assemble(
 
 
 def _imu_tables(recording: Recording, seeds: SessionSeeds) -> tuple[ImuEdges, ImuSamples]:
-    """Cut the recording at the vertices; neighbouring edges share the sample between them."""
+    """Split the recording at the vertices; neighbouring edges share the boundary sample."""
     row = recording.imu_row
     count = np.diff(row) + 1
     edges = len(count)
@@ -132,43 +132,46 @@ def _image_tables(
     landmark_of: I64,
     seeds: SessionSeeds,
 ) -> tuple[Frames, Keypoints]:
-    found, cameras = recording.keypoints, len(device.rig.cameras)
+    detections, cameras = recording.keypoints, len(device.rig.cameras)
     vertices = len(recording.time_ns)
     count = vertices * cameras
     present = FrameField.SIGMA | FrameField.SCALE | FrameField.TRACK_ID | FrameField.LANDMARK_ID
     delays = np.array([camera.line_delay_s for camera in scenario.cameras])
     if delays.any():
         present |= FrameField.TIME_OFFSET
+    keypoint_count = np.bincount(detections.frame, minlength=count)
     frames = Frames.filled(
         count,
         id=random_ids(count, seeds.ids),
         vertex=np.repeat(np.arange(vertices), cameras),
         camera_index=np.tile(np.arange(cameras), vertices),
         timestamp_ns=np.repeat(recording.time_ns, cameras),
-        keypoint_count=np.bincount(found.frame, minlength=count),
-        descriptor_size=np.full(count, recording.descriptors.shape[1]),
+        keypoint_count=keypoint_count,
+        descriptor_blocks=binary_blocks(keypoint_count, recording.descriptors.shape[1]),
         present=np.full(count, int(present)),
     )
     factor = scenario.calibration.keypoint_noise_factor
-    sigma = np.maximum(factor * sigma_of_octave(scenario.measurement, found.octave), _MIN_SIGMA_PX)
-    no_offset = np.zeros((len(found.frame), 0), dtype=np.int32)
+    sigma = np.maximum(
+        factor * sigma_of_octave(scenario.measurement, detections.octave), _MIN_SIGMA_PX
+    )
+    no_offset = np.zeros((len(detections.frame), 0), dtype=np.int32)
     keypoints = Keypoints.filled(
-        len(found.frame),
-        uv_px=found.uv_px,
+        len(detections.frame),
+        uv_px=detections.uv_px,
         sigma_px=sigma,
-        scale=_KEYPOINT_SCALE * 2.0**found.octave,
-        time_offset_ns=_readout_ns(scenario, found) if delays.any() else no_offset,
-        track_id=found.track,
+        scale=_KEYPOINT_SCALE * 2.0**detections.octave,
+        time_offset_ns=_readout_ns(scenario, detections) if delays.any() else no_offset,
+        track_id=detections.track,
         landmark=landmark_of,
         descriptor=recording.descriptors,
     )
     return frames, keypoints
 
 
-def _readout_ns(scenario: Scenario, found: Detections) -> NDArray[np.int32]:
+def _readout_ns(scenario: Scenario, detections: Detections) -> NDArray[np.int32]:
     """Return when (K, 1) keypoints are read out, counted from the image's time stamp."""
-    camera = found.frame % len(scenario.cameras)
+    camera = detections.frame % len(scenario.cameras)
     delay_s = np.array([options.line_delay_s for options in scenario.cameras])[camera]
     middle = 0.5 * np.array([options.height_px for options in scenario.cameras])[camera]
-    offset = np.round(1e9 * delay_s * (found.uv_px[:, 1] - middle))
+    offset = np.round(1e9 * delay_s * (detections.uv_px[:, 1] - middle))
     return np.asarray(offset[:, None], dtype=np.int32)

@@ -1,4 +1,4 @@
-"""The whole of it: a scenario becomes maps and their truth."""
+"""Simulate a scenario: maps and their ground truth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from maplab_py.progress import SILENT, Progress
 from maplab_py.simulation.appearance import make_appearance, make_session_appearance
+from maplab_py.simulation.lidar import Lidar, with_lidar_clouds
 from maplab_py.simulation.recording import Recording, SessionSeeds, record
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.sensors import Device, make_device
@@ -16,13 +17,13 @@ from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.vimap import VIMap
 
-_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER = range(6)
+_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR = range(7)
 """Streams of random numbers; a session's number selects within a stream."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedSession:
-    """What one session recorded, and with what."""
+    """A recorded session with its device."""
 
     device: Device
     recording: Recording
@@ -30,7 +31,7 @@ class RecordedSession:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SimulatedData:
-    """One map per session, as an odometry would have left it, and the truth of all."""
+    """One map per session with odometry drift, and the truth of all."""
 
     maps: list[VIMap]
     truth: Truth
@@ -42,7 +43,7 @@ def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedDat
     """Simulate all sessions of a scenario. The same scenario gives the same bytes.
 
     Raises:
-        UserError: The scenario describes something that cannot be.
+        UserError: The scenario cannot be simulated.
         Cancelled: The user wants to stop.
     """
     seeds = scenario.seeds
@@ -50,6 +51,9 @@ def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedDat
     appearance = make_appearance(
         scenario.appearance, world.look, _generator(seeds.appearance, _APPEARANCE)
     )
+    lidar = None
+    if scenario.lidar.rate_hz > 0.0:
+        lidar = Lidar.of(world, scenario.lidar, _generator(seeds.world, _LIDAR))
     maps, truths, recordings = [], [], []
     for number in range(len(scenario.sessions)):
         progress.step(number, len(scenario.sessions), f"session {number + 1}")
@@ -66,6 +70,9 @@ def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedDat
         device = make_device(scenario, scenario.sessions[number].device, number)
         recording = record(scenario, number, world, device, look, of_session)
         vi_map, truth = session_map(scenario, world, device, recording, of_session)
+        if lidar is not None:
+            noise = _generator(seeds.measurement, _LIDAR, number)
+            vi_map = with_lidar_clouds(vi_map, device.imu_id, recording, lidar, noise)
         maps.append(vi_map)
         truths.append(truth)
         recordings.append(RecordedSession(device, recording))

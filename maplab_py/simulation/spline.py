@@ -1,7 +1,6 @@
 """Cumulative cubic B-splines on R3 x SO(3): a smooth motion with exact derivatives.
 
-Source: Sommer et al., Efficient Derivative Computation for Cumulative B-Splines on Lie Groups,
-CVPR 2020, eq. (9) and (16)-(21), for order 4.
+Source: Sommer 2020, eq. (9) and (16)-(21), for order 4.
 """
 
 from __future__ import annotations
@@ -11,10 +10,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-
-F64 = NDArray[np.float64]
 
 # Cumulative blending of a uniform cubic B-spline: rows are lambda_1 .. lambda_3, columns powers of u
 _BLEND = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
@@ -76,10 +74,10 @@ class PoseSpline:
 
     def _blending(self, u: F64) -> tuple[F64, F64, F64]:
         """Return the blending values (N, 3) at fractions u (N,), and their time derivatives."""
-        one, zero = np.ones_like(u), np.zeros_like(u)
-        powers = np.stack([one, u, u**2, u**3], axis=1)
-        first = np.stack([zero, one, 2.0 * u, 3.0 * u**2], axis=1) / self.spacing_s
-        second = np.stack([zero, zero, 2.0 * one, 6.0 * u], axis=1) / self.spacing_s**2
+        ones, zeros = np.ones_like(u), np.zeros_like(u)
+        powers = np.stack([ones, u, u**2, u**3], axis=1)
+        first = np.stack([zeros, ones, 2.0 * u, 3.0 * u**2], axis=1) / self.spacing_s
+        second = np.stack([zeros, zeros, 2.0 * ones, 6.0 * u], axis=1) / self.spacing_s**2
         return powers @ _BLEND.T, first @ _BLEND.T, second @ _BLEND.T
 
     def _rotation(

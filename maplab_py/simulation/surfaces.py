@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.simulation.scenario import WorldOptions
-
-F64 = NDArray[np.float64]
 
 _CLUSTER_SIZE_M = 0.5
 _CLUSTERS_PER_LANDMARK = 1.0 / 40.0
 _BARE_DENSITY = 0.1
 _SURFACE_OFFSET_M = 1e-6
-"""Landmarks float this far off their surface, so that the surface does not hide them."""
+"""Distance of landmarks from their surface, so that it does not occlude them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,7 +51,7 @@ def box_surfaces(low: F64, high: F64, *, inwards: bool) -> Surfaces:
 
 
 def join(parts: list[Surfaces]) -> Surfaces:
-    """Put surfaces together."""
+    """Concatenate surfaces."""
     names = [field.name for field in dataclasses.fields(Surfaces)]
     return Surfaces(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I64, U8, Mask
+from maplab_py.simulation.scenario import ImageOptions
+from maplab_py.simulation.shading_kernels import LEVELS
 from maplab_py.simulation.surfaces import Surfaces
 
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-
-LEVELS = 5
-"""Each level halves the resolution of the one before."""
 _SHAPES_PER_M2 = 40.0
+_BARE_SHAPES_PER_M2 = 0.4
 _SHAPE_SIZES_M = (0.015, 0.3)
 _MOST_PIXELS = 40_000_000
+_PATCH_M = 0.5
+"""Side of the squares that are repainted."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,68 +29,73 @@ class Textures:
     width: I64  # (S, LEVELS)
     height: I64  # (S, LEVELS)
     texel_m: float  # of the finest level
-
-    def sample(self, surface: I64, u_m: F32, v_m: F32, footprint_m: F32) -> F32:
-        """Return grey values (N,) at places on surfaces (N,), blurred as their footprint asks.
-
-        Bilinear in the plane, linear between the two levels whose texels enclose the footprint.
-        """
-        texel = np.float32(self.texel_m)
-        level = np.clip(np.log2(np.maximum(footprint_m / texel, 1.0)), 0.0, LEVELS - 1.001)
-        fine = level.astype(np.int64)
-        share = level - fine.astype(np.float32)
-        below = self._bilinear(surface, fine, u_m, v_m)
-        return np.asarray(below + share * (self._bilinear(surface, fine + 1, u_m, v_m) - below))
-
-    def _bilinear(self, surface: I64, level: I64, u_m: F32, v_m: F32) -> F32:
-        image = LEVELS * surface + level
-        scale = (np.float32(1.0 / self.texel_m) * np.float32(0.5) ** np.arange(LEVELS)).astype(
-            np.float32
-        )[level]
-        right, bottom = self.width.ravel()[image] - 1, self.height.ravel()[image] - 1
-        x = np.clip(u_m * scale - np.float32(0.5), 0, right.astype(np.float32))
-        y = np.clip(v_m * scale - np.float32(0.5), 0, bottom.astype(np.float32))
-        column, row = x.astype(np.int64), y.astype(np.int64)
-        fx, fy = x - column.astype(np.float32), y - row.astype(np.float32)
-        to_right = column < right
-        first = self.offset.ravel()[image] + row * (right + 1) + column
-        upper = self._between(first, to_right, fx)
-        first += np.where(row < bottom, right + 1, 0)
-        return np.asarray(upper + fy * (self._between(first, to_right, fx) - upper))
-
-    def _between(self, first: I64, to_right: NDArray[np.bool_], share: F32) -> F32:
-        left = self.pixels.take(first).astype(np.float32)
-        right = self.pixels.take(first + to_right).astype(np.float32)
-        return np.asarray(left + share * (right - left))
+    is_bare: Mask  # (S,) surfaces with hardly any shapes
 
 
-def make_textures(surfaces: Surfaces, texel_m: float, rng: np.random.Generator) -> Textures:
+def make_textures(surfaces: Surfaces, options: ImageOptions, rng: np.random.Generator) -> Textures:
     """Paint surfaces with overlapping shapes of many sizes: corners and edges at every distance.
 
-    Where all of them together would need more than 40 million pixels, texels are made larger.
+    A share of the surfaces stays bare: a hundredth of the shapes. Where all textures together would
+    need more than 40 million pixels, texels are made larger.
     """
-    area = float(np.maximum(surfaces.area, texel_m**2).sum())
-    texel_m = max(texel_m, np.sqrt(area / _MOST_PIXELS))
-    images, offset = [], 0
-    starts = np.zeros((len(surfaces.normal), LEVELS), dtype=np.int64)
+    area = float(np.maximum(surfaces.area, options.texel_m**2).sum())
+    texel_m = max(options.texel_m, np.sqrt(area / _MOST_PIXELS))
+    is_bare = np.zeros(len(surfaces.area), dtype=np.bool_)
+    if options.bare_share > 0.0:
+        is_bare = rng.uniform(size=len(is_bare)) < options.bare_share
+    return _joined(_paintings(surfaces, is_bare, texel_m, rng), is_bare, texel_m)
+
+
+def repainted(
+    textures: Textures, surfaces: Surfaces, share: float, rng: np.random.Generator
+) -> Textures:
+    """Return textures of which squares of half a metre are replaced: `share` of them, at random."""
+    others = _paintings(surfaces, textures.is_bare, textures.texel_m, rng)
+    side = max(1, round(_PATCH_M / textures.texel_m))
+    images = []
+    for row, other in enumerate(others):
+        height, width = other.shape
+        begin = textures.offset[row, 0]
+        image = textures.pixels[begin : begin + other.size].reshape(height, width)
+        squares = rng.uniform(size=(-(-height // side), -(-width // side))) < share
+        is_new = squares.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
+        images.append(np.where(is_new, other, image))
+    return _joined(images, textures.is_bare, textures.texel_m)
+
+
+def _paintings(
+    surfaces: Surfaces, is_bare: Mask, texel_m: float, rng: np.random.Generator
+) -> Iterator[U8]:
+    """Paint one surface after the other."""
+    sizes_m = (np.linalg.norm(side, axis=1) for side in (surfaces.side_u, surfaces.side_v))
+    for u_m, v_m, bare in zip(*sizes_m, is_bare, strict=True):
+        density = _BARE_SHAPES_PER_M2 if bare else _SHAPES_PER_M2
+        yield _painted(float(u_m), float(v_m), texel_m, density, rng)
+
+
+def _joined(images: Iterable[U8], is_bare: Mask, texel_m: float) -> Textures:
+    """Return the finest images (v, u) of the surfaces with their pyramids as textures."""
+    pixels, offset = [], 0
+    starts = np.zeros((len(is_bare), LEVELS), dtype=np.int64)
     widths, heights = np.zeros_like(starts), np.zeros_like(starts)
-    for row, (side_u, side_v) in enumerate(zip(surfaces.side_u, surfaces.side_v, strict=True)):
-        size_m = float(np.linalg.norm(side_u)), float(np.linalg.norm(side_v))
-        for level, image in enumerate(_pyramid(_painted(*size_m, texel_m, rng))):
+    for row, finest in enumerate(images):
+        for level, image in enumerate(_pyramid(finest)):
             starts[row, level] = offset
             heights[row, level], widths[row, level] = image.shape
             offset += image.size
-            images.append(image.ravel())
-    return Textures(np.concatenate(images), starts, widths, heights, texel_m)
+            pixels.append(image.ravel())
+    return Textures(np.concatenate(pixels), starts, widths, heights, texel_m, is_bare)
 
 
-def _painted(u_m: float, v_m: float, texel_m: float, rng: np.random.Generator) -> U8:
+def _painted(
+    u_m: float, v_m: float, texel_m: float, shapes_per_m2: float, rng: np.random.Generator
+) -> U8:
     """Return a grey image of a surface (v, u)."""
     import cv2
 
     width, height = (max(1, round(side / texel_m)) for side in (u_m, v_m))
     image = np.full((height, width), int(rng.integers(90, 170)), dtype=np.uint8)
-    count = int(_SHAPES_PER_M2 * u_m * v_m)
+    count = int(shapes_per_m2 * u_m * v_m)
     low, high = np.log(_SHAPE_SIZES_M)
     # the large ones first, so that small ones stay visible on top of them
     sizes = np.sort(np.exp(rng.uniform(low, high, count)))[::-1] / texel_m

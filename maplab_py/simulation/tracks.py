@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from maplab_py.array_types import F64, I64
 
 _SWAP_CANDIDATES = 8
 """A track is swapped with the nearest of so many others of its frame."""
@@ -37,15 +35,15 @@ def swap_identities(track: I64, frame: I64, uv: F64, share: float, rng: np.rando
     if wanted == 0:
         return track
     start = np.searchsorted(frame, np.arange(frame.max() + 2))
-    one = rng.integers(0, len(track), wanted)
-    low, high = start[frame[one]], start[frame[one] + 1]
+    track_a = rng.integers(0, len(track), wanted)
+    low, high = start[frame[track_a]], start[frame[track_a] + 1]
     others = low[:, None] + np.floor(
         rng.uniform(size=(wanted, _SWAP_CANDIDATES)) * (high - low)[:, None]
     ).astype(np.int64)
-    gap = np.linalg.norm(uv[others] - uv[one][:, None], axis=2)
-    gap[others == one[:, None]] = np.inf
+    gap = np.linalg.norm(uv[others] - uv[track_a][:, None], axis=2)
+    gap[others == track_a[:, None]] = np.inf
     other = others[np.arange(wanted), np.argmin(gap, axis=1)]
-    pair = np.stack([track[one], track[other]], axis=1)
+    pair = np.stack([track[track_a], track[other]], axis=1)
     _, first, count = np.unique(pair, return_index=True, return_counts=True)
     once = np.zeros(pair.size, dtype=np.bool_)
     once[first[count == 1]] = True
@@ -54,7 +52,7 @@ def swap_identities(track: I64, frame: I64, uv: F64, share: float, rng: np.rando
     since = np.full(tracks, np.iinfo(np.int64).max)
     for side in (0, 1):
         partner[pair[chosen, side]] = pair[chosen, 1 - side]
-        since[pair[chosen, side]] = frame[one[chosen]]
+        since[pair[chosen, side]] = frame[track_a[chosen]]
     return np.where(frame >= since[track], partner[track], track)
 
 

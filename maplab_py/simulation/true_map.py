@@ -1,4 +1,4 @@
-"""A simulated map with everything set to its true value."""
+"""Simulated map with all states set to their true values."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from maplab_py.vimap.ids import IdIndex, from_hex
 def true_map(vi_map: VIMap, truth: Truth) -> VIMap:
     """Return the map with true poses, velocities, biases, landmarks, base frames and calibrations.
 
-    Measurements stay as they are. Each landmark takes the place of the world point that most of its
-    observations show. Sensors get their values in the session that saw them first.
+    Measurements do not change. Each landmark gets the position of the world point that most of its
+    observations show. Sensors get their calibration in the first session that uses them.
 
     Raises:
         UserError: The truth is of another data set.

@@ -1,4 +1,4 @@
-"""The truth of a simulated data set, kept apart from the maps: no estimator opens it."""
+"""Ground truth of a simulated data set, stored separately from the maps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U64
+from maplab_py.atomic import replaced_file
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3
+from maplab_py.input_files import read_npz
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.simulation.drift import mission_frame
 from maplab_py.simulation.recording import Recording
@@ -19,13 +21,8 @@ from maplab_py.simulation.world import World
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import from_hex
 
-F64 = NDArray[np.float64]
-U64 = NDArray[np.uint64]
-I64 = NDArray[np.int64]
-
-
 STATIONARY_MPS, STATIONARY_RADPS = 1e-3, 1e-3
-"""Whoever moves slower than both stands still."""
+"""Speed limits below which the body is at rest."""
 _MOST_PARAMETERS = 9
 
 
@@ -66,25 +63,25 @@ class Truth:
     camera_parameters: F64  # (M, C, 9) intrinsics, then distortion, then NaN
     T_I_C: F64  # (M, C, 7)
     point_G: F64  # (P, 3) world points
-    point_look: I64  # (P,) points of equal number look alike
+    point_look: I64  # (P,) points of equal number have the same appearance
     point_moving: I64  # (P,) number of the object that carries the point about, -1 = none
 
     def save(self, path: Path) -> None:
         """Write the truth to an .npz file."""
-        with path.open("wb") as file:
+        with replaced_file(path) as file:
             np.savez_compressed(file, **dataclasses.asdict(self))
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` has written.
+        """Read a truth file written by `save`.
 
         Raises:
             UserError: The file is missing or is not such a file.
         """
         names = [field.name for field in dataclasses.fields(cls)]
         try:
-            with np.load(path, allow_pickle=False) as content:
-                return cls(**{name: content[name] for name in names})
+            content = read_npz(path)
+            return cls(**{name: content[name] for name in names})
         except FileNotFoundError:
             raise UserError(f"{path}: there is no such truth file") from None
         except (OSError, ValueError, KeyError) as error:
@@ -126,11 +123,6 @@ class Truth:
             source=source,
         )
 
-    def vertex_p_M(self) -> F64:
-        """Return the true positions (V, 3) of the vertices in their missions."""
-        T_M_G = se3.inverse(self.T_G_M)[self.vertex_mission]
-        return se3.transform(T_M_G, self.T_G_I[:, 4:])
-
 
 def session_truth(
     vi_map: VIMap,
@@ -150,7 +142,7 @@ def session_truth(
         point_of: World point (L,) of every landmark of the map.
         loop_edge_is_true: Which loop closure edges (E,) of the map join what they claim to.
     """
-    row, motion, found = recording.imu_row, recording.motion, recording.keypoints
+    row, motion, detections = recording.imu_row, recording.motion, recording.keypoints
     cameras = device.true_rig.cameras
     parameters = np.full((1, len(cameras), _MOST_PARAMETERS), np.nan)
     for number, camera in enumerate(cameras):
@@ -172,9 +164,9 @@ def session_truth(
         landmark_point=point_of,
         frame_id=vi_map.frames.id,
         frame_keypoints=vi_map.frames.keypoint_count.astype(np.int64),
-        keypoint_point=found.point,
+        keypoint_point=detections.point,
         keypoint_landmark=vi_map.keypoints.landmark.astype(np.int64),
-        keypoint_uv_px=found.uv_true_px,
+        keypoint_uv_px=detections.uv_true_px,
         sample_mission=np.zeros(len(recording.imu_time_ns), dtype=np.int64),
         sample_time_ns=recording.imu_time_ns,
         sample_T_G_I=recording.imu_motion.T_G_I,

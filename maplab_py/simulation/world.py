@@ -1,4 +1,4 @@
-"""Worlds: rooms in a row or corridors around a block, with landmarks on their surfaces."""
+"""Worlds: rooms in a row, corridors around a block or streets, with landmarks on their surfaces."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.simulation.moving_objects import MovingObject, make_moving_objects
 from maplab_py.simulation.scenario import WorldOptions
+from maplab_py.simulation.streets import block_boxes, street_bounds, street_landmarks
 from maplab_py.simulation.surfaces import Surfaces, box_surfaces, join, scatter
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _DOOR_WIDTH_M = 2.0
 _DOOR_HEIGHT_M = 2.4
@@ -23,11 +22,11 @@ _STAIR_MARGIN_M = 0.3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """Landmarks with normals, and boxes that hide what is behind them. Room 0 is centred at 0."""
+    """Landmarks with normals, and boxes that occlude them. Room 0 is centred at 0."""
 
     p_G: F64  # (L, 3)
     normal_G: F64  # (L, 3) unit, into the free space
-    look: I64  # (L,) landmarks of equal number look alike
+    look: I64  # (L,) landmarks of equal number have the same appearance
     boxes: F64  # (B, 2, 3) lower and upper corners
     bounds: F64  # (2, 3) lower and upper corner of everything
     moving: I64  # (L,) number of the object that carries the landmark, -1 = none
@@ -38,6 +37,8 @@ def make_world(options: WorldOptions, rng: np.random.Generator) -> World:
     """Build the walls, scatter landmarks on their surfaces, and let objects move."""
     if options.layout == "corridor":
         world = _corridor(options, rng)
+    elif options.layout == "city":
+        world = _city(options, rng)
     elif options.identical_rooms:
         world = _identical_rooms(options, rng)
     else:
@@ -70,55 +71,84 @@ def _standing(p_G: F64) -> I64:
 
 
 def _rooms(options: WorldOptions, rng: np.random.Generator) -> World:
-    size = np.asarray(options.room_size_m, dtype=np.float64)
-    points, normals, boxes = [], [], []
-    for room in range(options.rooms):
-        low = _corner_of_room(room, size)
-        furniture = _furniture(options.furniture_per_room, low, size, rng)
-        surfaces = _room_surfaces(low, size, furniture)
-        p, n = scatter(surfaces, options, options.landmarks_per_room, rng)
-        keep = ~_in_doorway(p, room, options.rooms, size)
-        points.append(p[keep])
-        normals.append(n[keep])
-        boxes.append(furniture)
-    p_G = np.concatenate(points)
-    return _world_of_rooms(options, p_G, np.concatenate(normals), np.arange(len(p_G)), boxes)
+    rooms = [_furnished(room, options, rng) for room in range(options.rooms)]
+    p_G = np.concatenate([room.p_G for room in rooms])
+    return _world_of_rooms(options, rooms, np.arange(len(p_G)))
 
 
 def _identical_rooms(options: WorldOptions, rng: np.random.Generator) -> World:
-    """Build one room, repeat it, and give each a few landmarks of its own."""
+    """Build one room, repeat it, and add some distinct landmarks to each; corridors differ."""
     size = np.asarray(options.room_size_m, dtype=np.float64)
     low = _corner_of_room(0, size)
     furniture = _furniture(options.furniture_per_room, low, size, rng)
     surfaces = _room_surfaces(low, size, furniture)
-    own = round(options.distinct_share * options.landmarks_per_room)
-    common_p, common_n = scatter(surfaces, options, options.landmarks_per_room - own, rng)
-    points, normals, looks, boxes = [], [], [], []
-    for room in range(options.rooms):
-        shift = np.array([room * size[0], 0.0, 0.0])
-        own_p, own_n = scatter(surfaces, options, own, rng)
-        p = np.concatenate([common_p, own_p]) + shift
-        first_own = len(common_p) + room * own
-        look = np.concatenate([np.arange(len(common_p)), np.arange(first_own, first_own + own)])
-        keep = ~_in_doorway(p, room, options.rooms, size)
-        points.append(p[keep])
-        normals.append(np.concatenate([common_n, own_n])[keep])
-        looks.append(look[keep])
-        boxes.append(furniture + shift)
-    return _world_of_rooms(
-        options, np.concatenate(points), np.concatenate(normals), np.concatenate(looks), boxes
+    distinct_count = round(options.distinct_share * options.landmarks_per_room)
+    common_p, common_n = scatter(
+        surfaces, options, options.landmarks_per_room - distinct_count, rng
     )
+    rooms, looks, begin = [], [], len(common_p)
+    for room in range(options.rooms):
+        if room in options.corridor_rooms:
+            rooms.append(_furnished(room, options, rng))
+            looks.append(begin + np.arange(len(rooms[-1].p_G)))
+            begin += len(rooms[-1].p_G)
+            continue
+        shift = np.array([room * size[0], 0.0, 0.0])
+        distinct_p, distinct_n = scatter(surfaces, options, distinct_count, rng)
+        p = np.concatenate([common_p, distinct_p]) + shift
+        look = np.concatenate([np.arange(len(common_p)), begin + np.arange(distinct_count)])
+        keep = ~_in_doorway(p, room, options.rooms, size)
+        normal = np.concatenate([common_n, distinct_n])
+        rooms.append(_Room(p[keep], normal[keep], furniture + shift))
+        looks.append(look[keep])
+        begin += distinct_count
+    return _world_of_rooms(options, rooms, np.concatenate(looks))
 
 
-def _world_of_rooms(
-    options: WorldOptions, p_G: F64, normal_G: F64, look: I64, boxes: list[F64]
-) -> World:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Room:
+    """Landmarks of a room and what stands in it."""
+
+    p_G: F64  # (L, 3)
+    normal_G: F64  # (L, 3)
+    boxes: F64  # (B, 2, 3)
+
+
+def _furnished(room: int, options: WorldOptions, rng: np.random.Generator) -> _Room:
+    """Return a room with furniture of its own, or an empty corridor."""
+    size = np.asarray(options.room_size_m, dtype=np.float64)
+    low = _corner_of_room(room, size)
+    if room in options.corridor_rooms:
+        side = 0.5 * (size[1] - options.corridor_width_m)
+        inner = np.array([0.0, side, 0.0])
+        surfaces = box_surfaces(low + inner, low + size - inner, inwards=True)
+        boxes = np.array(
+            [
+                [low, low + np.array([size[0], side, size[2]])],
+                [low + np.array([0.0, size[1] - side, 0.0]), low + size],
+            ]
+        )
+    else:
+        boxes = _furniture(options.furniture_per_room, low, size, rng)
+        surfaces = _room_surfaces(low, size, boxes)
+    p, n = scatter(surfaces, options, options.landmarks_per_room, rng)
+    keep = ~_in_doorway(p, room, options.rooms, size)
+    return _Room(p[keep], n[keep], boxes)
+
+
+def _world_of_rooms(options: WorldOptions, rooms: list[_Room], look: I64) -> World:
     size = np.asarray(options.room_size_m, dtype=np.float64)
     walls = [_dividing_walls(room, size) for room in range(1, options.rooms)]
     low = _corner_of_room(0, size)
     high = _corner_of_room(options.rooms - 1, size) + size
+    p_G = np.concatenate([room.p_G for room in rooms])
     return World(
-        p_G, normal_G, look, np.concatenate([*boxes, *walls]), np.stack([low, high]), _standing(p_G)
+        p_G,
+        np.concatenate([room.normal_G for room in rooms]),
+        look,
+        np.concatenate([*(room.boxes for room in rooms), *walls]),
+        np.stack([low, high]),
+        _standing(p_G),
     )
 
 
@@ -167,6 +197,21 @@ def _dividing_walls(room: int, size: F64) -> F64:
     )
 
 
+# -- streets --------------------------------------------------------------------------------------
+
+
+def _city(options: WorldOptions, rng: np.random.Generator) -> World:
+    p_G, normal_G = street_landmarks(options, rng)
+    return World(
+        p_G,
+        normal_G,
+        np.arange(len(p_G)),
+        block_boxes(options),
+        street_bounds(options),
+        _standing(p_G),
+    )
+
+
 # -- corridors ------------------------------------------------------------------------------------
 
 
@@ -180,24 +225,35 @@ def _corridor(options: WorldOptions, rng: np.random.Generator) -> World:
     half, width = 0.5 * size[:2], options.corridor_width_m
     top = options.floors * size[2]
     block = np.array([[*(width - half), 0.0], [*(half - width), top]])
-    points, normals = [], []
+    points, normals, looks = [], [], []
     for floor in range(options.floors):
-        low = np.array([-half[0], -half[1], floor * size[2]])
-        high = np.array([half[0], half[1], (floor + 1) * size[2]])
-        outer = box_surfaces(low, high, inwards=True)
-        inner = box_surfaces(
-            np.array([*block[0, :2], low[2]]), np.array([*block[1, :2], high[2]]), inwards=False
-        )
-        walls = join([outer, _first(inner, 4)])
-        p, n = scatter(walls, options, options.landmarks_per_room, rng)
+        if floor == 0 or not options.identical_floors:
+            surfaces = _floor_surfaces(options, block, floor * size[2])
+            p, n = scatter(surfaces, options, options.landmarks_per_room, rng)
+            look = floor * options.landmarks_per_room + np.arange(len(p))
+        else:
+            p = p + np.array([0.0, 0.0, size[2]])
         keep = ~_in_block(p, block) & ~_in_stairwell(p, n, floor, options)
         points.append(p[keep])
         normals.append(n[keep])
+        looks.append(look[keep])
     p_G = np.concatenate(points)
+    look = np.unique(np.concatenate(looks), return_inverse=True)[1]  # numbered without gaps
     slabs = [_slab(floor * size[2], options) for floor in range(1, options.floors)]
     bounds = np.array([[-half[0], -half[1], 0.0], [half[0], half[1], top]])
     boxes = np.concatenate([block[None], *slabs])
-    return World(p_G, np.concatenate(normals), np.arange(len(p_G)), boxes, bounds, _standing(p_G))
+    return World(p_G, np.concatenate(normals), look, boxes, bounds, _standing(p_G))
+
+
+def _floor_surfaces(options: WorldOptions, block: F64, z_m: float) -> Surfaces:
+    """Return the surfaces of one floor of the corridor, whose ground is at height z."""
+    half = 0.5 * np.asarray(options.room_size_m[:2])
+    low, high = np.append(-half, z_m), np.append(half, z_m + options.room_size_m[2])
+    outer = box_surfaces(low, high, inwards=True)
+    inner = box_surfaces(
+        np.append(block[0, :2], low[2]), np.append(block[1, :2], high[2]), inwards=False
+    )
+    return join([outer, _first(inner, 4)])
 
 
 def _first(surfaces: Surfaces, count: int) -> Surfaces:

@@ -1,1 +1,1 @@
-"""Native map files: reading, writing, atomic saving, resources."""
+"""Native map folders: load, save, resources. `native` is the public entry."""

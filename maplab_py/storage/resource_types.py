@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,3 +56,16 @@ def resource_type(number: int) -> ResourceType:
     if not 0 <= number < len(RESOURCE_TYPES):
         raise MapError(f"resource type {number} is unknown: the format has 0 to {len(_NAMES) - 1}")
     return RESOURCE_TYPES[number]
+
+
+def resource_type_of(text: str, flag: str = "--resource_type") -> ResourceType:
+    """Return the type that a user names by its number or its folder, such as 8 or raw_depth_maps.
+
+    Raises:
+        UserError: The format has no such type; the message lists the types.
+    """
+    for kind in RESOURCE_TYPES:
+        if text.strip() in (str(kind.number), kind.name):
+            return kind
+    known = ", ".join(f"{kind.number} {kind.name}" for kind in RESOURCE_TYPES)
+    raise UserError(f"{flag}={text}: there is no such resource type; choose one of {known}")

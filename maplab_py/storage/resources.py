@@ -1,45 +1,36 @@
-"""Resource files of a map: where they are, loading them with a cache, moving them."""
+"""Resource files of a map: paths, cached loading, copying."""
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.atomic import replaced_file
+from maplab_py.errors import MapError
+from maplab_py.storage.resource_cache import SHARED_CACHE, CacheStatistics, ResourceCache
 from maplab_py.storage.resource_types import resource_type
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.tables import Resources
 
-OWN_FOLDER = -1
+MAP_FOLDER = -1
 _IMAGE_SUFFIXES = (".pgm", ".ppm")
-_DEFAULT_CACHE_BYTES = 512_000_000
-
-
-@dataclasses.dataclass(frozen=True)
-class CacheStatistics:
-    """How the cache has done."""
-
-    hits: int
-    misses: int
-    entries: int
-    bytes: int
 
 
 def resource_path(vi_map: VIMap, row: int, map_folder: Path) -> Path:
-    """Return where the file of a resource (row) is.
+    """Return the path of the file of a resource (row).
 
     Raises:
         MapError: Its type or its folder does not exist in the map.
     """
     table, metadata = vi_map.resources, vi_map.metadata
     index = int(table.folder[row])
-    if index == OWN_FOLDER:
+    if index == MAP_FOLDER:
         root = map_folder / (metadata.map_resource_folder or "resources")
     elif 0 <= index < len(metadata.external_resource_folders):
         root = Path(metadata.external_resource_folders[index])
@@ -52,46 +43,42 @@ def resource_path(vi_map: VIMap, row: int, map_folder: Path) -> Path:
 
 def relative_path(vi_map: VIMap, row: int) -> Path:
     """Return <type name>/<id><suffix> of a resource (row)."""
-    kind = resource_type(int(vi_map.resources.type[row]))
-    return Path(kind.name) / f"{to_hex(vi_map.resources.id[row])}{kind.suffix}"
+    return path_in_folder(vi_map.resources, row)
+
+
+def path_in_folder(table: Resources, row: int) -> Path:
+    """Return <type name>/<id><suffix> of a row of a table of resources."""
+    kind = resource_type(int(table.type[row]))
+    return Path(kind.name) / f"{to_hex(table.id[row])}{kind.suffix}"
 
 
 class ResourceStore:
-    """Loads resources of a map when they are wanted and keeps the latest, up to a size."""
+    """Loads resources of a map on demand and caches the most recently used ones."""
 
-    def __init__(
-        self, vi_map: VIMap, map_folder: Path, *, max_bytes: int = _DEFAULT_CACHE_BYTES
-    ) -> None:
-        """Serve the resources of a map that was loaded from `map_folder`."""
-        self._map, self._folder, self._max_bytes = vi_map, Path(map_folder), max_bytes
-        self._cache: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
-        self._bytes = self._hits = self._misses = 0
+    def __init__(self, vi_map: VIMap, map_folder: Path, *, max_bytes: int | None = None) -> None:
+        """Serve the resources of a map that was loaded from `map_folder`.
+
+        Args:
+            vi_map: Map.
+            map_folder: Its folder.
+            max_bytes: Size of a cache of its own; None = the cache of the process.
+        """
+        self._map, self._folder = vi_map, Path(map_folder)
+        self._cache = SHARED_CACHE if max_bytes is None else ResourceCache(max_bytes)
 
     @property
     def statistics(self) -> CacheStatistics:
-        """How often the cache could serve, and what it holds."""
-        return CacheStatistics(self._hits, self._misses, len(self._cache), self._bytes)
+        """Hits, misses and size of the cache."""
+        return self._cache.statistics()
 
     def load(self, row: int) -> Any:
         """Return a resource: an image (H, W[, 3] BGR), a text, or the file's bytes.
 
         Raises:
-            MapError: The file is missing or cannot be read as what it should be.
+            MapError: The file is missing or cannot be decoded.
         """
         path = resource_path(self._map, row, self._folder)
-        if path in self._cache:
-            self._hits += 1
-            self._cache.move_to_end(path)
-            return self._cache[path][0]
-        self._misses += 1
-        value, size = _read(path)
-        if size <= self._max_bytes:
-            self._cache[path] = value, size
-            self._bytes += size
-            while self._bytes > self._max_bytes:
-                _, (_, dropped) = self._cache.popitem(last=False)
-                self._bytes -= dropped
-        return value
+        return self._cache.load(path, int(self._map.resources.type[row]), _read)
 
 
 def _read(path: Path) -> tuple[Any, int]:
@@ -134,7 +121,7 @@ def in_map_folder(vi_map: VIMap) -> VIMap:
     """Return the map with all resources in its own folder (the files must follow)."""
     table = vi_map.resources
     metadata = dataclasses.replace(vi_map.metadata, map_resource_folder="./resources/")
-    folder = np.full(len(table), OWN_FOLDER, dtype=np.int32)
+    folder = np.full(len(table), MAP_FOLDER, dtype=np.int32)
     return vi_map.replace(resources=table.replace(folder=folder), metadata=metadata)
 
 
@@ -150,11 +137,8 @@ def copied_to_external(vi_map: VIMap, map_folder: Path | None, target: Path) -> 
         destination = target / relative
         if destination.exists() and destination.samefile(source):
             continue
-        try:
-            destination.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(source, destination)
-        except OSError as error:
-            raise UserError(f"{destination}: cannot be written ({error.strerror})") from error
+        with replaced_file(destination) as copy, source.open("rb") as original:
+            shutil.copyfileobj(original, copy)
     known = vi_map.metadata.external_resource_folders
     folders = known if str(target) in known else (*known, str(target))
     index = folders.index(str(target))

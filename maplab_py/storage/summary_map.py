@@ -1,4 +1,4 @@
-"""The summary map: what localisation needs of a map, in one file.
+"""Summary maps: the part of a map that localisation needs, in one file.
 
 The fields that C++ maplab knows are written as it writes them, so that it can read the file.
 It skips `extras`: ids, landmark covariances, sensors, the descriptor projection and a checksum. A
@@ -14,19 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F32, U32, U64
 from maplab_py.errors import MapError
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.files import COPY_AGAIN, read_message
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U32 = NDArray[np.uint32]
-U64 = NDArray[np.uint64]
+from maplab_py.storage.map_files import COPY_AGAIN, read_message
+from maplab_py.storage.message_scan import MemoryBudget
 
 FILE_NAME = "localization_summary_map"
 
@@ -65,7 +61,7 @@ def summary_map_bytes(summary: SummaryMap) -> bytes:
 
 
 def write_summary_map(summary: SummaryMap, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write `localization_summary_map` into a folder; it is there completely or not at all.
+    """Write `localization_summary_map` into a folder atomically.
 
     Raises:
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
@@ -86,7 +82,7 @@ def read_summary_map(path: Path, *, max_size_megabytes: int = 2000) -> SummaryMa
     if file is None:
         raise MapError(f"{path}: there is no file {FILE_NAME}")
     message = pb.LocalizationSummaryMap()
-    read_message(file, message, max_size_megabytes * 1_000_000)
+    read_message(file, message, MemoryBudget(max_size_megabytes * 1_000_000))
     inner = message.uncompressed_map
     summary = SummaryMap(
         p_G=_points(message.p_G_landmark, f"{file}: landmark positions"),
@@ -130,11 +126,11 @@ def _message(summary: SummaryMap) -> Any:
 
 def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
     landmarks, observers = len(summary.p_G), len(summary.p_G_observer)
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     if extras.landmark_ids:
-        found["landmark_id"] = _ids(extras.landmark_ids, landmarks, f"{file}: landmark ids")
+        columns["landmark_id"] = _ids(extras.landmark_ids, landmarks, f"{file}: landmark ids")
     if extras.observer_ids:
-        found["observer_id"] = _ids(extras.observer_ids, observers, f"{file}: observer ids")
+        columns["observer_id"] = _ids(extras.observer_ids, observers, f"{file}: observer ids")
     if len(extras.landmark_covariance):
         flat = np.array(extras.landmark_covariance, dtype=np.float32)
         if len(flat) != 6 * landmarks:
@@ -142,15 +138,15 @@ def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
         full = np.zeros((landmarks, 3, 3), dtype=np.float32)
         full[:, _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]] = flat.reshape(-1, 6)
         full[:, _UPPER_TRIANGLE[1], _UPPER_TRIANGLE[0]] = flat.reshape(-1, 6)
-        found["landmark_covariance"] = full
+        columns["landmark_covariance"] = full
     if extras.HasField("projection"):
         matrix = _matrix(extras.projection, f"{file}: projection")
         if len(matrix) != summary.descriptors.shape[1] or matrix.shape[1] % 8:
             raise MapError(f"{file}: the projection does not fit the descriptors")
-        found["projection"] = np.ascontiguousarray(matrix)
+        columns["projection"] = np.ascontiguousarray(matrix)
     if extras.sensors_yaml:
-        found["sensors"] = parse_sensors(extras.sensors_yaml, f"{file}: sensors")
-    return dataclasses.replace(summary, **found)
+        columns["sensors"] = parse_sensors(extras.sensors_yaml, f"{file}: sensors")
+    return dataclasses.replace(summary, **columns)
 
 
 def _digest(summary: SummaryMap) -> bytes:

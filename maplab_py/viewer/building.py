@@ -1,4 +1,4 @@
-"""From a map to a scene."""
+"""Conversion of a map to a scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_RAYS = 60_000
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """What is to be shown: a map, and what it is held against."""
+    """What to show: a map and the references to compare it with."""
 
     vi_map: VIMap
     title: str = "map"
@@ -37,7 +37,7 @@ class Subject:
     segments: MarkedSegments | None = None
     shows_observers: bool = False
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
-    only_layers: tuple[str, ...] = ()  # visible at first; empty = each layer's own default
+    only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
 
     def replace(self, **changes: object) -> Subject:
         """Return the subject with some of it exchanged."""
@@ -45,7 +45,7 @@ class Subject:
 
 
 def build_scene(subject: Subject) -> Scene:
-    """Return everything that is drawn of a map; layers of what the map has not are left out.
+    """Return everything that is drawn of a map; layers without content are omitted.
 
     Raises:
         UserError: The map has no vertices, or the ground truth does not fit it.

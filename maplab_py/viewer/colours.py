@@ -1,4 +1,4 @@
-"""Colours that read on a dark and on a light ground: (..., 3) of uint8."""
+"""Colours for dark and light backgrounds: (..., 3) of uint8."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import colorsys
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from maplab_py.array_types import F64, U8
 
 
 def from_hex(*codes: str) -> U8:
@@ -90,11 +89,6 @@ def normalised(values: F64, period: float = 0.0, offset: float = 0.0) -> tuple[F
         return np.zeros_like(values), 0.0, 0.0
     low, high = (float(x) for x in np.percentile(finite, [1.0, 99.0]))
     return (values - low) / max(high - low, 1e-12), low, high
-
-
-def css_gradient(stops: U8) -> str:
-    """Return the ramp for a style sheet."""
-    return f"linear-gradient(90deg, {', '.join(hex_codes(stops))})"
 
 
 def hex_codes(colours: U8) -> Sequence[str]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.geometry import so3
 from maplab_py.viewer import colours
 from maplab_py.viewer.options import VisualizationOptions
@@ -16,11 +17,6 @@ from maplab_py.viewer.scene import Extent, Points, Segments
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 _OUTLINE_POINTS = 1500
 _FAR_M = 2000.0
@@ -71,7 +67,7 @@ class Drawing:
         """Length that looks the same in a map of any size.
 
         It goes in steps of a fifth, so that a small change of the map leaves the sizes of all
-        points as they are, and they need not be sent anew.
+        points as they are, and they need not be sent again.
         """
         step = np.round(4.0 * np.log2(self.extent.radius_m)) / 4.0
         return float(2.0**step) * self.options.scale

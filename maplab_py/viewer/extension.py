@@ -7,7 +7,7 @@ Example, the landmarks above a height::
         high = vi_map.p_G[vi_map.p_G[:, 2] > 2.2]
         return LayerPoints(high, colours=(200, 120, 0))
 
-Every drawing of a map then has a checkbox for it; it is built anew whenever the map changes.
+Every drawing of a map then has a checkbox for it; it is rebuilt whenever the map changes.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MaplabError
 from maplab_py.vimap import VIMap
 
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from maplab_py.viewer.drawing import Drawing
     from maplab_py.viewer.scene import Layer, Part
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 Colours = U8 | tuple[int, int, int]
 
 _ORANGE = (230, 120, 20)
@@ -84,7 +81,7 @@ def viewer_layer(
     has nothing to draw. It runs in the viewer's thread, for every value of the map that is shown.
 
     Args:
-        name: A short name of its own: letters, digits and underscores.
+        name: A short unique name: letters, digits and underscores.
         title: Words beside the checkbox; empty = the name.
         is_visible: It is drawn at first; else it waits for its checkbox.
 
@@ -92,7 +89,7 @@ def viewer_layer(
         ValueError: The name has other characters, as those of the viewer's tree of objects.
     """
     if not name.isidentifier():
-        raise ValueError(f"viewer layer '{name}': letters, digits and underscores are wanted")
+        raise ValueError(f"viewer layer '{name}': letters, digits and underscores are expected")
 
     def decorate(function: LayerFunction) -> LayerFunction:
         REGISTERED[name] = ViewerLayer(name, title or name, function, is_visible)

@@ -1,4 +1,4 @@
-"""What the panel says about a vertex, a landmark or a loop closure."""
+"""Facts about a vertex, a landmark or a loop closure for the panel."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.algorithms.loop_closure.listing import describe_closure
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
+from maplab_py.report import counted
 from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.table import ragged_rows
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 Facts = tuple[tuple[str, str], ...]
 """Names and values, in the order in which they are shown."""
@@ -72,7 +71,10 @@ def landmark_facts(vi_map: VIMap, row: int) -> Facts:
         ("landmark", landmark.id),
         ("quality", LandmarkQuality(landmark.quality).name.lower()),
         ("p_G", f"{_vector(landmark.p_G)} m"),
-        ("observations", f"{len(observers)} by {len(np.unique(observers))} vertices"),
+        (
+            "observations",
+            f"{len(observers)} by {counted(len(np.unique(observers)), 'vertex', 'vertices')}",
+        ),
         ("missions", names or "none"),
         ("seen over", seen),
         ("distance", _range_text(distance, "m")),
@@ -105,7 +107,7 @@ def loop_closure_facts(vi_map: VIMap, row: int) -> Facts:
 
 
 def closure_facts(vi_map: VIMap, row: int) -> Facts:
-    """Return what the map remembers of a closure, as lc_report lists it."""
+    """Return the recorded facts of a closure, as lc_report lists them."""
     line = describe_closure(vi_map, row)
     return (
         ("closure", line.id),

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.scene import Layer, Part, Points, Scene, Segments
 from maplab_py.vimap import VIMap
-
-F64 = NDArray[np.float64]
 
 _VERTEX_LAYERS = ("vertices",)
 _PATH_LAYERS = ("trajectories",)

@@ -81,7 +81,7 @@ class VisualizationOptions:
             )
         if self.show_only_landmark_type and not self.show_only_landmark_type.isdigit():
             raise ValueError(
-                f"--vis_show_only_landmark_type={self.show_only_landmark_type}: a number is wanted"
+                f"--vis_show_only_landmark_type={self.show_only_landmark_type}: a number is expected"
             )
 
     @property
@@ -145,7 +145,7 @@ class PointCloudOptions:
     flag_prefix: ClassVar[str] = "vis_pointcloud_"
 
     visualize_every_nth: int = option(1, help="Show every n-th cloud or depth map.")
-    color_random: bool = option(False, help="Give every cloud a colour of its own.")
+    color_random: bool = option(False, help="Give every cloud a different colour.")
     reproject_depth_maps_with_undistorted_camera: bool = option(
         False, help="The depth maps are of undistorted images."
     )

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maplab_py.array_types import F32, F64
 from maplab_py.viewer.scene import Entity, Points, Scene, Segments
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 _CONE_RAD = np.radians(1.2)
 """A click means nothing that is further from its ray than this."""
@@ -67,12 +65,12 @@ def pick(
                 continue
             if not isinstance(part, (Points, Segments)) or not len(part):
                 continue
-            found = _nearest(part, o, d)
-            score = found[0] - _BONUS_RAD[layer.entity]
-            if found[0] <= _CONE_RAD and score < best_score:
+            nearest = _nearest(part, o, d)
+            score = nearest[0] - _BONUS_RAD[layer.entity]
+            if nearest[0] <= _CONE_RAD and score < best_score:
                 best_score = score
-                row = int(part.rows[found[1]])
-                best = Pick(layer.entity, row, found[2], found[0])
+                row = int(part.rows[nearest[1]])
+                best = Pick(layer.entity, row, nearest[2], nearest[0])
     return best
 
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.layers.landmarks import first_observer
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.subsampling import spread_rows
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _RECENT_STEPS = 8
 
@@ -26,7 +23,7 @@ class Timeline:
     vertex_step: I64  # (V,)
     landmark_step: I64  # (L,); `steps` where nothing observes it
     landmarks: I64  # rows that are drawn
-    head: I64  # (steps + 1, M) vertex row that each mission has reached, -1 = not begun
+    head: I64  # (steps + 1, M) vertex row that each mission has reached, -1 = not started
     seconds: F64  # (steps + 1,) time since the start of the longest mission
 
     def recent(self, drawing: Drawing, step: int) -> tuple[I64, F64]:
@@ -34,11 +31,11 @@ class Timeline:
         vi_map = drawing.vi_map
         observer = vi_map.keypoint_vertex[vi_map.observations]
         age = step - self.vertex_step[observer]
-        own = (age >= 0) & (age < _RECENT_STEPS)
-        landmark = vi_map.keypoints.landmark[vi_map.observations[own]]
-        order = np.lexsort((age[own], landmark))
+        is_recent = (age >= 0) & (age < _RECENT_STEPS)
+        landmark = vi_map.keypoints.landmark[vi_map.observations[is_recent]]
+        order = np.lexsort((age[is_recent], landmark))
         rows, first = np.unique(landmark[order], return_index=True)
-        return rows.astype(np.int64), age[own][order][first] / _RECENT_STEPS
+        return rows.astype(np.int64), age[is_recent][order][first] / _RECENT_STEPS
 
 
 def make_timeline(drawing: Drawing, options: PlaybackOptions) -> Timeline:
@@ -68,17 +65,19 @@ def _progress(drawing: Drawing, options: PlaybackOptions) -> tuple[F64, F64]:
     value = np.zeros(len(time_s))
     longest, duration = 0.0, 0.0
     for mission in range(len(vi_map.missions)):
-        own = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
-        if own.start == own.stop:
+        mission_vertices = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
+        if mission_vertices.start == mission_vertices.stop:
             continue
-        travelled = time_s[own] - time_s[own][0]
+        travelled = time_s[mission_vertices] - time_s[mission_vertices][0]
         duration = max(duration, float(travelled[-1]))
         if options.synchronize_missions_on_distance:
-            step = np.linalg.norm(np.diff(vi_map.vertices.T_M_I[own, 4:], axis=0), axis=1)
+            step = np.linalg.norm(
+                np.diff(vi_map.vertices.T_M_I[mission_vertices, 4:], axis=0), axis=1
+            )
             travelled = np.append(0.0, np.cumsum(step))
         if options.synchronize_missions_on_distance_percent:
             travelled = travelled / max(float(travelled[-1]), 1e-12)
-        value[own] = travelled
+        value[mission_vertices] = travelled
         longest = max(longest, float(travelled[-1]))
     seconds = np.linspace(0.0, duration, options.steps + 1)
     return value / max(longest, 1e-12), seconds

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
@@ -24,10 +25,6 @@ from maplab_py.viewer.scene import WHOLE_MAP
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 _MM = 1e-3
 _MAX_DEPTH_PIXELS = 20_000
@@ -140,7 +137,7 @@ def resource_pose(vi_map: VIMap, row: int) -> F64:
     """Return the pose (7,) in G of the frame that a resource's points are in.
 
     Raises:
-        MapError: The owner is gone, or its sensor is not mounted.
+        MapError: The owner does not exist, or its sensor has no extrinsics.
     """
     resources = vi_map.resources
     kind, owner = int(resources.owner_kind[row]), int(resources.owner[row])
@@ -152,10 +149,10 @@ def resource_pose(vi_map: VIMap, row: int) -> F64:
                 return se3.compose(vi_map.T_G_I[vertex], camera.T_I_C)
         raise MapError(f"resource {to_hex(resources.id[row])}: its camera is not in sensors.yaml")
     if kind == ResourceOwner.SENSOR:
-        own = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
-        times = vi_map.vertices.timestamp_ns[own]
+        mission_vertices = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
+        times = vi_map.vertices.timestamp_ns[mission_vertices]
         T_G_I, _ = interpolate_poses(
-            times, vi_map.T_G_I[own], resources.timestamp_ns[row : row + 1]
+            times, vi_map.T_G_I[mission_vertices], resources.timestamp_ns[row : row + 1]
         )
         imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
         T_I_S = vi_map.sensors.T_I_S(imu_id, to_hex(resources.sensor_id[row]))

@@ -13,10 +13,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
+from maplab_py.array_types import F32, F64, I64, U8
 
 WHOLE_MAP = ""
 """Key of parts that belong to no single mission."""

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
+from maplab_py.array_types import F64, I64, U64
 
 _BITS = 16
 """Levels of the octree: voxels of 1 / 65536 of the cloud's width."""

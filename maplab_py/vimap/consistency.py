@@ -1,4 +1,4 @@
-"""Is a map what it must be? Every violation is listed with the ids it concerns."""
+"""Consistency checks of a map; every violation is listed with the affected ids."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.report import Report
+from maplab_py.array_types import Mask
+from maplab_py.report import Report, counted
+from maplab_py.vimap.descriptors import NO_DESCRIPTOR
 from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import has_link, mission_sensor_id
 from maplab_py.vimap.table import Table
-from maplab_py.vimap.tables import MissionSensor, ResourceOwner
+from maplab_py.vimap.tables import (
+    MissionSensor,
+    ResourceOwner,
+    TransformationEdges,
+    TransformationKind,
+)
 from maplab_py.vimap.vi_map import VIMap
 
 _LISTED = 5
@@ -25,12 +32,10 @@ _MAX_SPREAD_PX = 75.0
 _WARN_SPREAD_PX = 10.0
 """... while this is worth a warning."""
 
-Mask = NDArray[np.bool_]
-
 
 @dataclasses.dataclass(frozen=True)
 class Violation:
-    """One broken rule."""
+    """A violated rule."""
 
     rule: str
     count: int
@@ -39,28 +44,50 @@ class Violation:
 
 @dataclasses.dataclass(frozen=True)
 class ConsistencyReport(Report):
-    """All broken rules of a map."""
+    """All violated rules of a map."""
 
     errors: tuple[Violation, ...]
     warnings: tuple[Violation, ...]
 
+    def as_text(self) -> str | None:
+        """Return a sentence if no rule is violated."""
+        is_clean = not self.errors and not self.warnings
+        return "the map is consistent: no rule is violated" if is_clean else None
+
     @property
     def failure(self) -> str:
-        """Say how many rules are broken; empty when the map is consistent."""
+        """Return a summary of the violated rules; empty if the map is consistent."""
         if not self.errors:
             return ""
         first = self.errors[0]
-        broken = f"{len(self.errors)} rules broken, first: {first.rule} ({first.count})"
-        return f"the map is inconsistent: {broken}"
+        rules = counted(len(self.errors), "violated rule")
+        return f"the map is inconsistent: {rules}, first: {first.rule} ({first.count})"
 
 
 class _Findings:
     def __init__(self) -> None:
         self.errors: list[Violation] = []
         self.warnings: list[Violation] = []
+        self.refused: list[Violation] = []
 
-    def check(self, rule: str, broken: NDArray[Any], ids: Any, *, warning: bool = False) -> None:
-        """Note a rule with the rows (mask or numbers) that break it; ids (N, 2) name them."""
+    def check(
+        self,
+        rule: str,
+        broken: NDArray[Any],
+        ids: Any,
+        *,
+        warning: bool = False,
+        refused: bool = False,
+    ) -> None:
+        """Record a rule with the rows (mask or numbers) that violate it.
+
+        Args:
+            rule: Description of the violation.
+            broken: Mask or row numbers.
+            ids: Ids (N, 2) of the rows; None = report row numbers.
+            warning: The map is still consistent.
+            refused: The map cannot be loaded.
+        """
         rows = np.flatnonzero(broken) if broken.dtype == np.bool_ else np.unique(broken)
         if len(rows) == 0:
             return
@@ -68,14 +95,32 @@ class _Findings:
         names = (
             tuple(f"row {row}" for row in some) if ids is None else tuple(to_hex_list(ids[some]))
         )
-        (self.warnings if warning else self.errors).append(Violation(rule, len(rows), names))
+        violation = Violation(rule, len(rows), names)
+        (self.warnings if warning else self.errors).append(violation)
+        if refused:
+            self.refused.append(violation)
 
 
 def check_consistency(vi_map: VIMap) -> ConsistencyReport:
     """Check references, order, numbers, ids, chains, observations and sensors of a map.
 
-    Checks that need valid references are made only when those hold.
+    Checks that need valid references are skipped if references are invalid.
     """
+    findings = _check_all(vi_map)
+    return ConsistencyReport(tuple(findings.errors), tuple(findings.warnings))
+
+
+def check_loaded(vi_map: VIMap) -> tuple[list[Violation], list[Violation]]:
+    """Run the same checks on a map from a file.
+
+    Returns:
+        Violations that prevent loading, and errors that do not.
+    """
+    findings = _check_all(vi_map)
+    return findings.refused, [v for v in findings.errors if v not in findings.refused]
+
+
+def _check_all(vi_map: VIMap) -> _Findings:
     findings = _Findings()
     _check_references(vi_map, findings)
     if not findings.errors:
@@ -86,7 +131,8 @@ def check_consistency(vi_map: VIMap) -> ConsistencyReport:
         _check_edges(vi_map, findings)
         _check_observations(vi_map, findings)
         _check_sensors(vi_map, findings)
-    return ConsistencyReport(tuple(findings.errors), tuple(findings.warnings))
+        _check_resources(vi_map, findings)
+    return findings
 
 
 def _check_references(vi_map: VIMap, findings: _Findings) -> None:
@@ -113,6 +159,13 @@ def _check_references(vi_map: VIMap, findings: _Findings) -> None:
     owned = resources.owner_kind != ResourceOwner.NONE
     outside = owned & ((resources.owner < 0) | (resources.owner >= size))
     findings.check("resource of an owner that is not there", outside, resources.id)
+    described = np.array([sum(b.keypoints for b in frame or ()) for frame in f.descriptor_blocks])
+    has_blocks = np.array([bool(frame) for frame in f.descriptor_blocks], dtype=np.bool_)
+    findings.check(
+        "frame whose descriptors do not fit its keypoints",
+        has_blocks & (described != f.keypoint_count),
+        f.id,
+    )
     counts = (
         ("keypoints", int(f.keypoint_count.sum()), len(vi_map.keypoints), f.keypoint_count, f.id),
         (
@@ -154,7 +207,10 @@ def _check_numbers(vi_map: VIMap, findings: _Findings) -> None:
         for name in names:
             values = columns[name].reshape(len(table), int(np.prod(columns[name].shape[1:])))
             findings.check(
-                f"{noun} with a non-finite {name}", ~np.all(np.isfinite(values), axis=1), ids
+                f"{noun} with a non-finite {name}",
+                ~np.all(np.isfinite(values), axis=1),
+                ids,
+                refused=True,
             )
             if name.startswith("T_"):
                 length = np.linalg.norm(values[:, :4], axis=1)
@@ -163,6 +219,18 @@ def _check_numbers(vi_map: VIMap, findings: _Findings) -> None:
                     np.abs(length - 1.0) > _UNIT_TOLERANCE,
                     ids,
                 )
+    covariances: tuple[tuple[str, Any, NDArray[np.float64]], ...] = (
+        ("base frame", vi_map.baseframes, vi_map.baseframes.T_G_M_covariance),
+        ("landmark", vi_map.landmarks, vi_map.landmarks.covariance),
+        ("relative-pose edge", vi_map.transformation_edges, vi_map.transformation_edges.covariance),
+        ("loop closure edge", vi_map.loop_closure_edges, vi_map.loop_closure_edges.covariance),
+        ("absolute pose", vi_map.absolute_poses, vi_map.absolute_poses.covariance),
+    )
+    for noun, table, values in covariances:
+        flat = values.reshape(len(table), int(np.prod(values.shape[1:])))
+        partly = np.asarray(~np.isfinite(flat).all(axis=1) & ~np.isnan(flat).all(axis=1))
+        rule = f"{noun} whose covariance is no matrix of numbers: it counts as absent"
+        findings.check(rule, partly, table.columns().get("id"))
     loops = vi_map.loop_closure_edges
     outside = (loops.switch_variable < 0.0) | (loops.switch_variable > 1.0)
     findings.check("loop closure edge with a switch variable outside [0, 1]", outside, loops.id)
@@ -186,7 +254,7 @@ def _check_ids(vi_map: VIMap, findings: _Findings) -> None:
         rows = np.flatnonzero(valid)
         order = rows[np.lexsort((ids[rows, 1], ids[rows, 0]))]
         again = np.all(ids[order[1:]] == ids[order[:-1]], axis=1)
-        findings.check(f"{noun} id that is there twice", order[1:][again], ids)
+        findings.check(f"{noun} id that occurs twice", order[1:][again], ids)
 
 
 def _check_order(vi_map: VIMap, findings: _Findings) -> None:
@@ -226,23 +294,52 @@ def _check_edges(vi_map: VIMap, findings: _Findings) -> None:
     mission, time = vi_map.vertices.mission, vi_map.vertices.timestamp_ns
     for noun, edges in _edges(vi_map):
         findings.check(
-            f"{noun} from a vertex to itself", edges.from_vertex == edges.to_vertex, edges.id
+            f"{noun} from a vertex to itself",
+            edges.from_vertex == edges.to_vertex,
+            edges.id,
+            refused=True,
         )
         if noun != "loop closure edge":
             apart = mission[edges.from_vertex] != mission[edges.to_vertex]
-            findings.check(f"{noun} between two missions", apart, edges.id)
+            findings.check(f"{noun} between two missions", apart, edges.id, refused=True)
+    chains = [e for noun, e in _edges(vi_map) if noun != "loop closure edge"]
+    for noun, edges in zip(("IMU edge", "relative-pose edge"), chains, strict=True):
+        circle = _in_circle(vi_map, edges)
+        findings.check(f"{noun} in a circle of edges", circle, edges.id, refused=True)
     imu, samples = vi_map.imu_edges, vi_map.imu_samples
     findings.check(
         "IMU edge with fewer than two samples", imu.sample_count < 2, imu.id, warning=True
     )
     edge = np.repeat(np.arange(len(imu)), imu.sample_count)
     back = (np.diff(samples.timestamp_ns) <= 0) & (edge[1:] == edge[:-1])
-    findings.check("IMU edge whose sample times do not increase", edge[1:][back], imu.id)
+    findings.check(
+        "IMU edge whose sample times do not increase", edge[1:][back], imu.id, refused=True
+    )
     findings.check(
         "IMU edge that leads back in time",
         time[imu.to_vertex] <= time[imu.from_vertex],
         imu.id,
+        refused=True,
     )
+
+
+def _in_circle(vi_map: VIMap, edges: Any) -> Mask:
+    """Return which edges (E,) of a mission's backbone lie on a directed cycle."""
+    chain = np.ones(len(edges), dtype=np.bool_)
+    if isinstance(edges, TransformationEdges):
+        chain = edges.kind != TransformationKind.TRANSFORMATION
+    start, stop = edges.from_vertex[chain], edges.to_vertex[chain]
+    circle = np.zeros(len(edges), dtype=np.bool_)
+    if not np.any(stop <= start):  # rows are in the order of time
+        return circle
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    size = len(vi_map.vertices)
+    graph = coo_array((np.ones(len(start)), (start, stop)), shape=(size, size))
+    _, label = connected_components(graph, directed=True, connection="strong")
+    circle[chain] = label[start] == label[stop]
+    return circle
 
 
 def _check_observations(vi_map: VIMap, findings: _Findings) -> None:
@@ -253,6 +350,14 @@ def _check_observations(vi_map: VIMap, findings: _Findings) -> None:
     begins[1:] = (landmark[1:] != landmark[:-1]) | (frame[1:] != frame[:-1])
     group = np.flatnonzero(begins)
     count = np.diff(np.append(group, len(keypoints)))
+    kind = vi_map.feature_type[keypoints]
+    other = (kind != NO_DESCRIPTOR) & (kind != vi_map.landmarks.feature_type[landmark])
+    findings.check(
+        "landmark of another feature type than a keypoint that observes it",
+        landmark[other],
+        vi_map.landmarks.id,
+        warning=True,
+    )
     several = np.flatnonzero(count > 1)
     if len(several) == 0:
         return
@@ -271,6 +376,13 @@ def _check_observations(vi_map: VIMap, findings: _Findings) -> None:
         ids,
         warning=True,
     )
+
+
+def _check_resources(vi_map: VIMap, findings: _Findings) -> None:
+    resources = vi_map.resources
+    folders = len(vi_map.metadata.external_resource_folders)
+    outside = (resources.folder < -1) | (resources.folder >= folders)
+    findings.check("resource in a folder that `metadata` does not list", outside, resources.id)
 
 
 def _check_sensors(vi_map: VIMap, findings: _Findings) -> None:

@@ -1,21 +1,17 @@
-"""Join the edges of removed vertices: samples are concatenated, relative poses composed."""
+"""Join the edges of removed vertices: concatenate IMU samples, compose relative poses."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import as_keys
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import ImuEdges, TransformationEdges
 from maplab_py.vimap.vi_map import VIMap
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +28,7 @@ class _Chains:
 def join_imu_edges(vi_map: VIMap, vertex_kept: Mask) -> tuple[VIMap, int]:
     """Replace IMU edges by one edge between every two kept neighbours; also return the number lost.
 
-    The sample at an inner boundary is in both edges and taken once.
+    The sample at an inner boundary belongs to both edges and is kept once.
     """
     table = vi_map.imu_edges
     every = np.arange(len(table))

@@ -1,12 +1,13 @@
-"""Edits of a map: every function takes a map and returns another that shares what did not change."""
+"""Edits of a map: functions return a new map that shares all unchanged columns."""
 
 from __future__ import annotations
 
 import hashlib
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import IdArray, is_valid, random_ids
 from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
@@ -27,33 +28,30 @@ __all__ = [
     "with_p_G",
 ]
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 
 def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
     """Remove missions with their vertices, edges, resources and landmarks.
 
-    Landmarks that another mission observes move to their first observer there and keep their
-    place in G. Loop closure edges to the removed missions go.
+    Landmarks that another mission observes are stored in their first observer there and keep their
+    position in G. Loop closure edges to the removed missions are removed.
 
     Args:
         vi_map: The map.
         missions: Mission rows or a mask (M,).
     """
-    gone = as_mask(missions, len(vi_map.missions))
-    vertex_kept = ~gone[vi_map.vertices.mission]
+    removed = as_mask(missions, len(vi_map.missions))
+    vertex_kept = ~removed[vi_map.vertices.mission]
     homeless = np.flatnonzero(~vertex_kept[vi_map.landmarks.vertex])
     store = stores_for(vi_map, homeless, vertex_kept, same_mission=False)
-    found = store >= 0
-    vi_map = move_landmarks(vi_map, homeless[found], store[found])
-    return keep_rows(vi_map, missions=np.flatnonzero(~gone))
+    stored = store >= 0
+    vi_map = move_landmarks(vi_map, homeless[stored], store[stored])
+    return keep_rows(vi_map, missions=np.flatnonzero(~removed))
 
 
 def remove_landmarks(vi_map: VIMap, landmarks: ArrayLike) -> VIMap:
-    """Remove landmarks (rows or a mask (L,)); their keypoints stay and observe nothing."""
-    gone = as_mask(landmarks, len(vi_map.landmarks))
-    return keep_rows(vi_map, landmarks=np.flatnonzero(~gone)) if gone.any() else vi_map
+    """Remove landmarks (rows or a mask (L,)); their keypoints stay without a landmark."""
+    removed = as_mask(landmarks, len(vi_map.landmarks))
+    return keep_rows(vi_map, landmarks=np.flatnonzero(~removed)) if removed.any() else vi_map
 
 
 def remove_observations(vi_map: VIMap, keypoints: ArrayLike) -> VIMap:
@@ -65,18 +63,18 @@ def remove_observations(vi_map: VIMap, keypoints: ArrayLike) -> VIMap:
 
 def remove_loop_closure_edges(vi_map: VIMap, edges: ArrayLike) -> VIMap:
     """Remove loop closure edges (rows or a mask)."""
-    gone = as_mask(edges, len(vi_map.loop_closure_edges))
-    return vi_map.replace(loop_closure_edges=vi_map.loop_closure_edges.take(~gone))
+    removed = as_mask(edges, len(vi_map.loop_closure_edges))
+    return vi_map.replace(loop_closure_edges=vi_map.loop_closure_edges.take(~removed))
 
 
 def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -> VIMap:
-    """Unite landmarks: observations of `from_rows[i]` become those of `into_rows[i]`.
+    """Merge landmarks: observations of `from_rows[i]` become those of `into_rows[i]`.
 
-    Pairs may form chains and trees: everything that hangs together becomes one landmark, the
-    lowest row that is only ever merged into (the lowest of all where there is a ring). It keeps
-    its id, place and quality; the others are removed. When a frame would observe a united
-    landmark twice, the keypoint that observed the surviving landmark before stays, else the one
-    with the lowest row; the other keypoints are detached.
+    Pairs may form chains and trees: every connected component becomes one landmark, the
+    lowest row that is never a source (the lowest of all in a cycle). It keeps its id, position and
+    quality; the others are removed. If a frame would observe a merged landmark twice, the keypoint
+    that observed the surviving landmark before is kept, else the one with the lowest row; the
+    other keypoints are detached.
 
     Args:
         vi_map: The map.
@@ -90,13 +88,13 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
     count = len(vi_map.landmarks)
     as_rows(np.concatenate([source, target]), count)  # range check
     survivor = _survivors(source, target, count)
-    gone = survivor != np.arange(count)
-    if not gone.any():
+    absorbed = survivor != np.arange(count)
+    if not absorbed.any():
         return vi_map
     before = vi_map.keypoints.landmark
     after = np.append(survivor, NO_ROW).astype(np.int32)[before]
     united = np.zeros(count, dtype=np.bool_)
-    united[survivor[gone]] = True
+    united[survivor[absorbed]] = True
     rows = np.flatnonzero((after >= 0) & united[after])
     frame = vi_map.keypoint_frame[rows]
     order = np.lexsort((rows, before[rows] != after[rows], frame, after[rows]))
@@ -105,7 +103,7 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
     again[1:] = (after[rows[1:]] == after[rows[:-1]]) & (frame[1:] == frame[:-1])
     after[rows[again]] = NO_ROW
     merged = vi_map.replace(keypoints=vi_map.keypoints.replace(landmark=after))
-    return keep_rows(merged, landmarks=np.flatnonzero(~gone))
+    return keep_rows(merged, landmarks=np.flatnonzero(~absorbed))
 
 
 def _survivors(source: I64, target: I64, count: int) -> I64:
@@ -141,7 +139,7 @@ def add_landmarks(
         vi_map: The map.
         vertex: Store vertex (N,) of each new landmark.
         p_I: Position (N, 3) in the body frame of that vertex [m].
-        keypoint_rows: Observing keypoints (O,); they leave the landmark they had.
+        keypoint_rows: Observing keypoints (O,); they are detached from their previous landmark.
         keypoint_landmark: For each of them (O,) the new landmark, 0 .. N - 1.
         ids: Ids (N, 2); by default derived from the map's content, so that equal maps get equal ids.
         quality: Quality of all or each (N,).
@@ -169,7 +167,7 @@ def add_landmarks(
 
 
 def with_p_G(vi_map: VIMap, landmarks: ArrayLike, p_G: ArrayLike) -> VIMap:
-    """Place landmarks (rows (N,)) at points (N, 3) of G; each stays in its store vertex."""
+    """Set the positions of landmarks (rows (N,)) to points (N, 3) in G; store vertices stay."""
     rows = np.asarray(landmarks, dtype=np.int64)
     T_I_G = se3.inverse(vi_map.T_G_I[vi_map.landmarks.vertex[rows]])
     p_I = vi_map.landmarks.p_I.copy()
@@ -178,7 +176,7 @@ def with_p_G(vi_map: VIMap, landmarks: ArrayLike, p_G: ArrayLike) -> VIMap:
 
 
 def transform_mission(vi_map: VIMap, mission: int, T_N_M: F64) -> VIMap:
-    """Express a mission's states in another mission frame N (7,); its place in G changes."""
+    """Transform a mission's states to another mission frame N (7,); its pose in G changes."""
     rows = vi_map.vertices.mission == mission
     v = vi_map.vertices
     T_M_I, v_M = v.T_M_I.copy(), v.v_M.copy()
@@ -188,7 +186,7 @@ def transform_mission(vi_map: VIMap, mission: int, T_N_M: F64) -> VIMap:
 
 
 def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap:
-    """Give fresh ids to missions, base frames, vertices, frames, landmarks and edges.
+    """Assign new ids to missions, base frames, vertices, frames, landmarks and edges.
 
     Sensors and resources keep theirs (both name files or entries outside the tables); so does
     everything without an id. By default the ids are derived from the map's present ids: the same
@@ -196,7 +194,7 @@ def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap
 
     Args:
         vi_map: The map.
-        rng: Where to draw ids from.
+        rng: Source of the ids.
     """
     if rng is None:
         rng = content_rng(vi_map, "new ids")
@@ -224,8 +222,8 @@ def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap
 def content_rng(vi_map: VIMap, purpose: str, *others: VIMap) -> np.random.Generator:
     """Return a generator that depends on the ids of the maps and the purpose alone."""
     digest = hashlib.blake2b(purpose.encode(), digest_size=16)
-    for one in (vi_map, *others):
-        for table in (one.missions, one.vertices, one.landmarks):
+    for source in (vi_map, *others):
+        for table in (source.missions, source.vertices, source.landmarks):
             digest.update(np.ascontiguousarray(table.id, dtype="<u8").tobytes())
             digest.update(b"/")
     return np.random.default_rng(int.from_bytes(digest.digest(), "little"))

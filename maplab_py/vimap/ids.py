@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ IdArray = NDArray[np.uint64]
 """Ids as an array (..., 2) of uint64: the first 16 hexadecimal digits, then the last 16."""
 
 HEX_DIGITS = 32
+SHORT_ID_DIGITS = 8
+"""Digits of an id in tables."""
 
 
 def to_hex(id_words: IdArray) -> str:
@@ -33,13 +36,8 @@ def from_hex(text: str) -> IdArray:
     """
     stripped = text.strip().lower()
     if len(stripped) != HEX_DIGITS or any(c not in "0123456789abcdef" for c in stripped):
-        raise UserError(f"'{text}' is not an id: 32 hexadecimal digits are wanted")
+        raise UserError(f"'{text}' is not an id: 32 hexadecimal digits are expected")
     return np.array([int(stripped[:16], 16), int(stripped[16:], 16)], dtype=np.uint64)
-
-
-def invalid(count: int) -> IdArray:
-    """Return `count` invalid (all zero) ids."""
-    return np.zeros((count, 2), dtype=np.uint64)
 
 
 def is_valid(ids: IdArray) -> NDArray[np.bool_]:
@@ -99,3 +97,20 @@ def _mixed(ids: IdArray) -> NDArray[np.uint64]:
     high, low = np.asarray(ids[:, 0]), np.asarray(ids[:, 1])
     mixed = high * np.uint64(0x9E3779B97F4A7C15) + (low ^ (low >> np.uint64(29)))
     return np.asarray((mixed ^ (mixed >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93))
+
+
+def distinct_prefixes(ids: list[str], least: int = 4) -> list[str]:
+    """Return the shortest prefixes of hexadecimal ids that no other of the ids begins with.
+
+    Args:
+        ids: Distinct ids.
+        least: Least number of digits.
+    """
+    ordered = sorted(ids)
+    shared: dict[str, int] = dict.fromkeys(ids, 0)
+    for first, second in pairwise(ordered):
+        differs = (a != b for a, b in zip(first, second, strict=True))
+        common = next((place for place, differ in enumerate(differs) if differ), len(first))
+        shared[first] = max(shared[first], common)
+        shared[second] = max(shared[second], common)
+    return [id_[: max(least, shared[id_] + 1)] for id_ in ids]

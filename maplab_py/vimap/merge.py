@@ -1,4 +1,4 @@
-"""Bring the missions of one map into another."""
+"""Merge the missions of one map into another."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNIQUE_TABLES = {
 
 @dataclasses.dataclass(frozen=True)
 class MergeReport(Report):
-    """What a merge brought in."""
+    """Missions and sensors added by a merge."""
 
     missions_added: tuple[str, ...]  # ids they have now
     vertices_added: int
@@ -43,14 +43,14 @@ def merge_maps(
 ) -> tuple[VIMap, MergeReport]:
     """Return `base` with the missions of `other` added.
 
-    Sensors that both have with equal calibration are shared. Where the calibration differs both
-    are kept: the other map's gets a new id, derived from the two maps' content.
+    Sensors with equal calibration are shared. If the calibrations differ, both sensors are kept and
+    that of the other map gets a new id, derived from the content of both maps.
 
     Args:
-        base: The map that gives metadata and comes first.
+        base: The map whose metadata are kept and whose missions come first.
         other: The map whose missions are added.
-        assign_new_ids: Give everything of `other` fresh ids first, so that a recording can be
-            there twice.
+        assign_new_ids: Assign new ids to `other` first, so that the map can hold a recording
+            twice.
 
     Raises:
         MapError: An id of `other` is in `base` already and `assign_new_ids` is off.

@@ -1,45 +1,64 @@
-"""Questions about a map that several algorithms and commands ask."""
+"""Queries on a map that several algorithms and commands use."""
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
-from maplab_py.vimap.ids import HEX_DIGITS, to_hex_list
+from maplab_py.vimap.ids import SHORT_ID_DIGITS, distinct_prefixes, to_hex_list
 from maplab_py.vimap.tables import MissionSensor
 from maplab_py.vimap.vi_map import VIMap
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+
+def mission_labels(vi_map: VIMap) -> list[str]:
+    """Return what each mission (M) is called: its name, else the beginning of its id.
+
+    A name that several missions have is followed by the beginning of the id.
+    """
+    short = [id_[:SHORT_ID_DIGITS] for id_ in to_hex_list(vi_map.missions.id)]
+    names = list(vi_map.missions.name)
+    counts = Counter(names)
+    return [
+        (name if counts[name] == 1 else f"{name} ({id_})") if name else id_
+        for name, id_ in zip(names, short, strict=True)
+    ]
 
 
 def find_mission(vi_map: VIMap, id_prefix: str) -> int:
-    """Return the row of the mission whose id begins with `id_prefix`.
+    """Return the row of a mission by its name, or by the beginning of its id or name.
 
     Raises:
-        UserError: The prefix is empty, matches no mission or several; the message lists them.
+        UserError: The text is empty, matches no mission or several; the message lists them.
     """
     prefix = id_prefix.strip().lower()
-    known = to_hex_list(vi_map.missions.id)
-    if not known:
+    ids, names = to_hex_list(vi_map.missions.id), list(vi_map.missions.name)
+    if not ids:
         raise UserError("the map has no missions")
-    rows = [row for row, mission_id in enumerate(known) if mission_id.startswith(prefix)]
+    short = distinct_prefixes(ids)
+    known = [
+        f"{name} ({prefix})" if name else id_
+        for id_, prefix, name in zip(ids, short, names, strict=True)
+    ]
+    rows = [row for row, name in enumerate(names) if name and name == id_prefix.strip()]
+    rows = rows or [row for row, id_ in enumerate(ids) if id_.startswith(prefix)]
+    rows = rows or [row for row, name in enumerate(names) if name.lower().startswith(prefix)]
     if prefix and len(rows) == 1:
         return rows[0]
     if not prefix:
         raise UserError(f"--map_mission is empty: choose one of {', '.join(known)}")
-    if len(prefix) > HEX_DIGITS or not rows:
+    if not rows:
         raise UserError(f"no mission begins with '{id_prefix}': the map has {', '.join(known)}")
     candidates = ", ".join(known[row] for row in rows)
     raise UserError(f"'{id_prefix}' is ambiguous: it begins missions {candidates}")
 
 
 def mission_mask(vi_map: VIMap, missions: NDArray[Any] | None) -> Mask:
-    """Return which missions (M,) are meant; None = all."""
+    """Return a mask (M,) of missions; None = all."""
     mask = np.zeros(len(vi_map.missions), dtype=np.bool_)
     mask[slice(None) if missions is None else missions] = True
     return mask
@@ -77,7 +96,7 @@ def coobservation_counts(vi_map: VIMap) -> I64:
 
 
 def mission_clusters(vi_map: VIMap, *, with_loop_closures: bool = True) -> I64:
-    """Label missions (M,) that hang together by shared landmarks or loop closure edges.
+    """Label missions (M,) that shared landmarks or loop closure edges connect.
 
     A landmark binds its store vertex' mission to those of its observers. Labels are the lowest
     mission row of each cluster.
@@ -122,7 +141,7 @@ def mission_time_spans_ns(vi_map: VIMap) -> I64:
 
 
 def has_link(vi_map: VIMap) -> Mask:
-    """Tell for each vertex row (V,) whether an IMU or relative-pose edge leads to the next row.
+    """Return for each vertex row (V,) whether an IMU or relative-pose edge leads to the next row.
 
     False at the last vertex of each mission.
     """
@@ -141,20 +160,3 @@ def mission_sensor_id(vi_map: VIMap, mission: int, kind: MissionSensor) -> str:
     """Return the id (32 hexadecimal digits) of a mission's sensor, empty when it has none."""
     words = vi_map.missions.sensor_id[mission, kind]
     return to_hex_list(words)[0] if words.any() else ""
-
-
-def T_I_C_of_frames(vi_map: VIMap) -> F64:
-    """Return the camera pose (F, 7) on the IMU of every frame.
-
-    Raises:
-        MapError: A mission with frames has no camera rig or IMU in sensors.yaml.
-    """
-    poses = np.zeros((len(vi_map.frames), 7))
-    mission = vi_map.vertices.mission[vi_map.frames.vertex]
-    for row in np.unique(mission).tolist():
-        frames = np.flatnonzero(mission == row)
-        imu_id = mission_sensor_id(vi_map, row, MissionSensor.IMU)
-        rig_id = mission_sensor_id(vi_map, row, MissionSensor.NCAMERA)
-        T_I_C = vi_map.sensors.T_I_C(imu_id, rig_id)
-        poses[frames] = T_I_C[vi_map.frames.camera_index[frames]]
-    return poses

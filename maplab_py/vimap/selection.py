@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maplab_py.array_types import I32, I64
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import NO_ROW, ResourceOwner
 from maplab_py.vimap.vi_map import VIMap
-
-I64 = NDArray[np.int64]
-I32 = NDArray[np.int32]
 
 
 def as_rows(rows_or_mask: ArrayLike, size: int) -> I64:
@@ -54,7 +52,7 @@ def keep_rows(
 ) -> VIMap:
     """Return the map of the given rows, in the given order; None keeps a table as it is.
 
-    Whatever depends on a dropped row is dropped: vertices, base frames and resources of missions;
+    Rows that depend on a dropped row are dropped too: vertices, base frames and resources of missions;
     frames, keypoints, edges, absolute poses and stored landmarks of vertices; observations of
     landmarks. Rows of `vertices` must already respect the order that the table wants.
     """

@@ -16,7 +16,7 @@ from maplab_py.vimap.tables import MissionSensor
 from maplab_py.vimap.vi_map import VIMap
 
 _TEXT_FIELDS = frozenset({"id", "topic", "description", "extra", "camera_extra"})
-"""What does not belong to a calibration."""
+"""Fields that do not belong to the calibration."""
 
 
 def conflicting_sensors(base: SensorSet, other: SensorSet) -> tuple[str, ...]:
@@ -39,7 +39,7 @@ def conflicting_sensors(base: SensorSet, other: SensorSet) -> tuple[str, ...]:
 
 
 def same_calibration(a: Sensor, b: Sensor) -> bool:
-    """Tell whether two sensors measure alike: texts, topics and unknown keys do not count."""
+    """Return whether two calibrations are equal, ignoring texts, topics and unknown keys."""
     if type(a) is not type(b):
         return False
     if isinstance(a, OtherSensor) and isinstance(b, OtherSensor):
@@ -137,7 +137,7 @@ def _with_id(sensor: Sensor, sensor_id: str) -> Sensor:
 
 
 def union(base: SensorSet, other: SensorSet) -> SensorSet:
-    """Return both sets' sensors; where both have an id the base's entry is taken."""
+    """Return the sensors of both sets; the base's entry is used for ids in both."""
     return SensorSet(
         sensors={
             **base.sensors,

@@ -1,12 +1,12 @@
-"""Put the tables of two maps on top of each other."""
+"""Concatenate the tables of two maps."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I32
 from maplab_py.vimap.sensor_merge import union
 from maplab_py.vimap.tables import (
     AbsolutePoses,
@@ -25,13 +25,11 @@ from maplab_py.vimap.tables import (
 )
 from maplab_py.vimap.vi_map import MapMetadata, VIMap
 
-I32 = NDArray[np.int32]
-
 
 def stack(base: VIMap, other: VIMap) -> VIMap:
     """Return a map with the rows of `base`, then those of `other`, references shifted.
 
-    Nothing is united or sorted; base's sensors win where ids are equal.
+    Nothing is merged or sorted; base's sensors are used where ids are equal.
     """
     v, m = len(base.vertices), len(base.missions)
     missions = other.missions.replace(
@@ -94,10 +92,15 @@ def _joined_metadata(base: MapMetadata, other: VIMap) -> tuple[MapMetadata, I32]
     known = list(base.external_resource_folders)
     names = dict(enumerate(other.metadata.external_resource_folders))
     if np.any(folder == -1):
-        own = other.metadata.map_folder.rstrip("/")
-        names[-1] = f"{own}/{other.metadata.map_resource_folder.removeprefix('./')}"
+        other_folder = other.metadata.map_folder.rstrip("/")
+        names[-1] = f"{other_folder}/{other.metadata.map_resource_folder.removeprefix('./')}"
     for index, name in names.items():
         if name not in known:
             known.append(name)
         folder[other.resources.folder == index] = known.index(name)
-    return dataclasses.replace(base, external_resource_folders=tuple(known)), folder
+    staged = base.staged_folders
+    staged += tuple(new for new in other.metadata.staged_folders if new not in staged)
+    metadata = dataclasses.replace(
+        base, external_resource_folders=tuple(known), staged_folders=staged
+    )
+    return metadata, folder

@@ -1,13 +1,14 @@
-"""What is in a map, mission by mission."""
+"""Statistics of the content of a map, by mission."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from maplab_py.report import Report
-from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
+from maplab_py.report import Report, counted
+from maplab_py.vimap.ids import distinct_prefixes, is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import (
     coobservation_counts,
     mission_clusters,
@@ -33,7 +34,7 @@ class CameraStatistics:
 
 @dataclasses.dataclass(frozen=True)
 class MissionStatistics:
-    """One mission."""
+    """Content of a mission."""
 
     id: str
     backbone: str
@@ -53,11 +54,13 @@ class MissionStatistics:
     end_ns: int
     duration_s: float
     resources: int
+    name: str = ""
+    closures: int = 0  # recorded and accepted, with at least one end in the mission
 
 
 @dataclasses.dataclass(frozen=True)
 class MapTotals:
-    """All missions together."""
+    """Content of all missions together."""
 
     missions: int
     vertices: int
@@ -74,6 +77,30 @@ class MapTotals:
 
 
 @dataclasses.dataclass(frozen=True)
+class MissionLine:
+    """One mission as it is shown."""
+
+    mission: str
+    id: str
+    length_m: float | None
+    duration_s: float | None = dataclasses.field(metadata={"title": "time", "unit": "s"})
+    vertices: int
+    good: int
+    bad: int
+    unknown: int | str  # empty: there are none in the map
+    closures: int | None
+    known: str
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionTable:
+    """What is shown of the statistics."""
+
+    missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
+    summary: str = dataclasses.field(metadata={"is_prose": True})
+
+
+@dataclasses.dataclass(frozen=True)
 class MapStatistics(Report):
     """Report of `map_stats`."""
 
@@ -81,10 +108,49 @@ class MapStatistics(Report):
     total: MapTotals | None  # with more than one mission
     memory_megabytes: float
 
+    def display(self) -> Any:
+        """Return one row per mission."""
+        has_unknown = any(mission.landmarks_unknown for mission in self.missions)
+        ids = distinct_prefixes([mission.id for mission in self.missions])
+        lines = [
+            MissionLine(
+                mission.name or mission.id,
+                id_,
+                mission.distance_m,
+                mission.duration_s,
+                mission.vertices,
+                mission.landmarks_good,
+                mission.landmarks_bad,
+                mission.landmarks_unknown if has_unknown else "",
+                mission.closures,
+                "yes" if mission.T_G_M_known else "no",
+            )
+            for mission, id_ in zip(self.missions, ids, strict=True)
+        ]
+        summary = f"{self.memory_megabytes:.1f} MB in memory"
+        if self.total is not None:
+            summary = (
+                f"{counted(self.total.missions, 'mission')}: {self.total.distance_m:.1f} m in "
+                f"{self.total.duration_s:.1f} s, "
+                f"{counted(self.total.vertices, 'vertex', 'vertices')}, landmarks: "
+                f"{self.total.landmarks_good} good, {self.total.landmarks_bad} bad, "
+                f"{self.total.landmarks_unknown} unknown; {summary}"
+            )
+        return MissionTable(tuple(lines), summary)
+
+
+@dataclasses.dataclass(frozen=True)
+class MapDetails(MapStatistics):
+    """Report of `map_stats` with everything that is known of the chosen missions."""
+
+    def display(self) -> MapDetails:
+        """Return all fields."""
+        return self
+
 
 @dataclasses.dataclass(frozen=True)
 class CoobservabilityReport(Report):
-    """Which missions share landmarks."""
+    """Groups of missions that share landmarks."""
 
     missions: tuple[str, ...]
     clusters: tuple[tuple[str, ...], ...]
@@ -92,7 +158,7 @@ class CoobservabilityReport(Report):
 
 
 def map_statistics(vi_map: VIMap) -> MapStatistics:
-    """Count what a map holds."""
+    """Count the entities of a map."""
     distances, spans = mission_distances_m(vi_map), mission_time_spans_ns(vi_map)
     missions = tuple(
         _mission(vi_map, row, float(distances[row]), spans[row, 0], spans[row, 1])
@@ -164,6 +230,7 @@ def _mission(
         end_ns=int(end_ns),
         duration_s=float(end_ns - start_ns) * 1e-9,
         resources=int(np.count_nonzero(owned)),
+        name=str(vi_map.missions.name[row]),
     )
 
 
@@ -182,13 +249,13 @@ def _edge_counts(vi_map: VIMap, row: int) -> dict[str, int]:
 def _cameras(vi_map: VIMap, row: int) -> tuple[CameraStatistics, ...]:
     of_mission = vi_map.vertices.mission[vi_map.frames.vertex] == row
     index = vi_map.frames.camera_index
-    found = []
+    cameras = []
     for camera in np.unique(index[of_mission]).tolist():
         chosen = of_mission & (index == camera)
         landmark = vi_map.keypoints.landmark[chosen[vi_map.keypoint_frame]]
         observing = landmark[landmark >= 0]
         quality = np.bincount(vi_map.landmarks.quality[np.unique(observing)], minlength=3)
-        found.append(
+        cameras.append(
             CameraStatistics(
                 camera_index=camera,
                 frames=int(np.count_nonzero(chosen)),
@@ -199,4 +266,4 @@ def _cameras(vi_map: VIMap, row: int) -> tuple[CameraStatistics, ...]:
                 landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
             )
         )
-    return tuple(found)
+    return tuple(cameras)

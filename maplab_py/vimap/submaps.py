@@ -1,4 +1,4 @@
-"""Append a submap to the mission it is a piece of: neighbours share their boundary vertex."""
+"""Append a submap to its mission; neighbouring submaps share their boundary vertex."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, yaw
 from maplab_py.report import Report
@@ -21,29 +21,27 @@ from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import NO_ROW, AbsolutePoses, ResourceOwner, Resources
 from maplab_py.vimap.vi_map import VIMap
 
-I64 = NDArray[np.int64]
-
 _ALIGNED_M = 1e-9
 """Shared vertices that differ by less [m, rad] need no alignment."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AppendReport(Report):
-    """What appending one or more submaps did."""
+    """Result of appending submaps."""
 
     submaps: int = 0
     vertices_added: int = 0
     vertices_shared: int = 0
     landmarks_added: int = 0
-    landmarks_with_equal_ids: int = 0  # united because both submaps have the id
+    landmarks_with_equal_ids: int = 0  # merged because both submaps have the id
     landmarks_united: int = 0  # different ids on one keypoint of a shared vertex
     observations_united: int = 0  # keypoints of shared vertices that had a landmark in both
-    largest_shift_m: float = 0.0  # applied to lay a submap's boundary vertex on the map's
+    largest_shift_m: float = 0.0  # applied to align a submap's boundary vertex with the map's
     largest_yaw_deg: float = 0.0
 
 
 def append_submaps(submaps: Sequence[VIMap]) -> tuple[VIMap, AppendReport]:
-    """Join submaps in the order of their first vertex' time, whatever order they come in.
+    """Join submaps in the order of the time of their first vertex.
 
     Raises:
         MapError: No submap is given, or neighbours do not share a vertex.
@@ -59,10 +57,10 @@ def append_submaps(submaps: Sequence[VIMap]) -> tuple[VIMap, AppendReport]:
 
 
 def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
-    """Append a submap, before or after what `base` has of the mission.
+    """Append a submap before or after the part of the mission in `base`.
 
     The shared vertex keeps base's pose, velocity and biases; a submap whose copy of it lies
-    elsewhere is moved as a whole (yaw and position). Observations at the shared vertex are united:
+    elsewhere is moved as a whole (yaw and position). Observations at the shared vertex are merged:
     landmarks of equal id become one, and so do two landmarks that the same keypoint observes (the
     one of better quality survives, then the one with more observations, then base's).
 
@@ -132,26 +130,26 @@ def _matching_missions(base: VIMap, submap: VIMap) -> I64:
 
 
 def _row_in_base(base_ids: IdArray, other_ids: IdArray, *, unite: bool) -> I64:
-    """Return the row (B + O,) in the base of each stacked row, its own where the id is new."""
+    """Return the base row (B + O,) of each stacked row, or its row in the stack where the id is new."""
     rows = np.arange(len(base_ids) + len(other_ids))
-    found = IdIndex(base_ids).rows(other_ids)
-    known = (found >= 0) & is_valid(other_ids) & unite
-    rows[len(base_ids) :][known] = found[known]
+    base_rows = IdIndex(base_ids).rows(other_ids)
+    known = (base_rows >= 0) & is_valid(other_ids) & unite
+    rows[len(base_ids) :][known] = base_rows[known]
     return rows
 
 
 def _aligned(base: VIMap, submap: VIMap) -> tuple[VIMap, float, float]:
     """Move each of the submap's missions so that its first shared vertex lies on base's."""
-    found = base.vertex_index.rows(submap.vertices.id)
+    rows = base.vertex_index.rows(submap.vertices.id)
     shift_m, yaw_rad = 0.0, 0.0
     for mission in range(len(submap.missions)):
-        shared = np.flatnonzero((found >= 0) & (submap.vertices.mission == mission))
+        shared = np.flatnonzero((rows >= 0) & (submap.vertices.mission == mission))
         if len(shared) == 0:
             continue
-        T_M_I = base.vertices.T_M_I[found[shared[0]]]
+        T_M_I = base.vertices.T_M_I[rows[shared[0]]]
         T_N_I = submap.vertices.T_M_I[shared[0]]
         T_M_N = yaw.from_pose(se3.compose(T_M_I, se3.inverse(T_N_I)))
-        # roll and pitch stay: turn about the vertex, not about the origin
+        # roll and pitch do not change: rotate about the vertex, not about the origin
         T_M_N[:3] = T_M_I[4:] - yaw.rotate(T_M_N[3], T_N_I[4:])
         shift = float(np.linalg.norm(T_M_I[4:] - T_N_I[4:]))
         if max(shift, abs(T_M_N[3])) > _ALIGNED_M:
@@ -269,7 +267,7 @@ def _first_of_id(ids: IdArray) -> I64:
 def _unite_landmarks(
     stacked: VIMap, equal_from: I64, equal_into: I64, from_rows: I64, into_rows: I64
 ) -> tuple[VIMap, int]:
-    """Unite landmarks of equal id, then those that a keypoint binds; return also the latter's number."""
+    """Merge landmarks of equal id, then those joined by a keypoint; also return the latter count."""
     count = np.diff(stacked.observation_start)
     target = np.arange(len(stacked.landmarks))
     target[equal_from] = equal_into

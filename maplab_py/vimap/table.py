@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -105,6 +106,11 @@ def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
             for array in arrays
         ]
     return np.concatenate(arrays)
+
+
+def object_column(values: Sequence[Any]) -> NDArray[Any]:
+    """Make a column of Python objects (N,), tuples among them."""
+    return np.fromiter(values, dtype=object, count=len(values))
 
 
 def ragged_rows(start: NDArray[np.int64], rows: NDArray[Any]) -> NDArray[np.int64]:

@@ -16,19 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I32, I64, U64
 from maplab_py.vimap.table import Table, column
 
 NO_ROW = -1
 IDENTITY_POSE = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
-
 
 class Backbone(IntEnum):
-    """What chains a mission's vertices (proto values)."""
+    """Kind of edges between consecutive vertices of a mission (proto values)."""
 
     VIWLS = 0
     ODOMETRY = 1
@@ -48,7 +44,7 @@ class MissionSensor(IntEnum):
 
 
 class LandmarkQuality(IntEnum):
-    """Verdict on a landmark (proto values)."""
+    """Quality of a landmark (proto values)."""
 
     UNKNOWN = 0
     BAD = 1
@@ -63,8 +59,15 @@ class TransformationKind(IntEnum):
     WHEEL_ODOMETRY = 7
 
 
+class DescriptorLayout(IntEnum):
+    """Layout of the descriptors of a frame in a map file."""
+
+    LEGACY = 0  # bare bytes: one size, binary
+    BLOCKS = 1  # maplab 2.2: blocks with headers, each of one type
+
+
 class ResourceOwner(IntEnum):
-    """What a resource is attached to."""
+    """Owner of a resource."""
 
     NONE = 0
     FRAME = 1
@@ -85,7 +88,7 @@ class BaseFrames(Table):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Missions(Table):
-    """One recording session each."""
+    """Missions: one recording session each."""
 
     id: U64 = column(np.uint64, 2)
     baseframe: I32 = column(np.int32, fill=NO_ROW)  # row of BaseFrames
@@ -93,6 +96,7 @@ class Missions(Table):
     backbone: NDArray[np.int8] = column(np.int8)
     sensor_id: U64 = column(np.uint64, len(MissionSensor), 2)  # by MissionSensor; zero = none
     unknown: NDArray[Any] = column(object, fill=b"")
+    name: NDArray[Any] = column(object, fill="")  # for people; empty = none
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,9 +128,11 @@ class Frames(Table):
     timestamp_ns: I64 = column(np.int64)
     is_valid: NDArray[np.bool_] = column(np.bool_, fill=True)
     keypoint_count: I32 = column(np.int32)
-    descriptor_size: I32 = column(np.int32)  # bytes per keypoint in this frame, 0 = none
     present: NDArray[np.uint16] = column(np.uint16)  # which optional columns the file had
-    descriptor_types: NDArray[Any] = column(object, fill=None)  # tuple of int or None
+    # tuple of DescriptorBlock in keypoint order, () or None without descriptors; None also means
+    # that the file has no descriptors field
+    descriptor_blocks: NDArray[Any] = column(object, fill=None)
+    descriptor_layout: NDArray[np.int8] = column(np.int8, fill=DescriptorLayout.BLOCKS)
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
@@ -150,14 +156,14 @@ class Keypoints(Table):
     scale: F64 = column(np.float64)
     track_id: I32 = column(np.int32, fill=-1)
     landmark: I32 = column(np.int32, fill=NO_ROW)
-    descriptor: NDArray[np.uint8] = column(np.uint8, -1)  # as wide as the widest frame's
+    descriptor: NDArray[np.uint8] = column(np.uint8, -1)  # as wide as the widest; floats as bytes
     position_3d: F64 = column(np.float64, -1)  # (K, 3) lidar features, (K, 0) when no frame has any
     time_offset_ns: NDArray[np.int32] = column(np.int32, -1)  # (K, 1) or (K, 0), likewise
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Landmarks(Table):
-    """Points. `p_I` is in the body frame of the vertex that STORES the landmark."""
+    """Landmarks. `p_I` is in the body frame of the vertex that stores the landmark."""
 
     id: U64 = column(np.uint64, 2)
     vertex: I32 = column(np.int32, fill=NO_ROW)
@@ -181,7 +187,7 @@ class ImuEdges(Table):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImuSamples(Table):
-    """Raw measurements; an edge's first and last sample lie at its vertices' times."""
+    """IMU measurements; the first and last sample of an edge are at the times of its vertices."""
 
     timestamp_ns: I64 = column(np.int64)
     accel_gyro: F64 = column(np.float64, 6)  # [ax ay az gx gy gz], m/s^2 and rad/s

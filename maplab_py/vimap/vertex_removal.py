@@ -1,4 +1,4 @@
-"""Remove vertices from the middle of missions: edges are joined, landmarks find a new home."""
+"""Remove vertices of missions: edges are joined, landmarks move to other store vertices."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maplab_py.array_types import I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.edge_joining import join_imu_edges, join_transformation_edges
@@ -14,13 +15,10 @@ from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.selection import as_mask, keep_rows
 from maplab_py.vimap.vi_map import VIMap
 
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 
 @dataclasses.dataclass(frozen=True)
 class VertexRemoval:
-    """What went with removed vertices."""
+    """Data removed with vertices."""
 
     vertices: int
     observations: int
@@ -38,13 +36,13 @@ def remove_vertices(vi_map: VIMap, vertices: ArrayLike) -> VIMap:
 
 
 def remove_vertices_counted(vi_map: VIMap, vertices: ArrayLike) -> tuple[VIMap, VertexRemoval]:
-    """Remove vertices and say what went with them.
+    """Remove vertices; also return the data removed with them.
 
     Between two kept neighbours the IMU edges are concatenated and relative-pose edges of one kind
     and sensor composed with their covariances; a kind that one link lacks is dropped there, as in
     maplab. Landmarks stored in a removed vertex move to their first kept observer of the mission,
-    else to the nearest kept vertex, and stay where they are in G. Observations, loop closure
-    edges, absolute poses and resources of removed vertices go.
+    else to the nearest kept vertex, and keep their position in G. Observations, loop closure
+    edges, absolute poses and resources of removed vertices are removed.
 
     Args:
         vi_map: The map.
@@ -53,22 +51,24 @@ def remove_vertices_counted(vi_map: VIMap, vertices: ArrayLike) -> tuple[VIMap, 
     Raises:
         UserError: A mission would lose all its vertices.
     """
-    gone = as_mask(vertices, len(vi_map.vertices))
-    kept_per_mission = np.bincount(vi_map.vertices.mission[~gone], minlength=len(vi_map.missions))
+    removed = as_mask(vertices, len(vi_map.vertices))
+    kept_per_mission = np.bincount(
+        vi_map.vertices.mission[~removed], minlength=len(vi_map.missions)
+    )
     emptied = np.flatnonzero((kept_per_mission == 0) & (np.diff(vi_map.vertex_start) > 0))
     if len(emptied):
         raise UserError(
             f"cannot remove all vertices of mission {to_hex(vi_map.missions.id[emptied[0]])}: "
             "remove the mission"
         )
-    homeless = np.flatnonzero(gone[vi_map.landmarks.vertex])
-    store = stores_for(vi_map, homeless, ~gone, same_mission=True)
+    homeless = np.flatnonzero(removed[vi_map.landmarks.vertex])
+    store = stores_for(vi_map, homeless, ~removed, same_mission=True)
     joined = move_landmarks(vi_map, homeless, store)
-    joined, imu_dropped = join_imu_edges(joined, ~gone)
-    joined, transformation_dropped = join_transformation_edges(joined, ~gone)
-    result = keep_rows(joined, vertices=np.flatnonzero(~gone))
+    joined, imu_dropped = join_imu_edges(joined, ~removed)
+    joined, transformation_dropped = join_transformation_edges(joined, ~removed)
+    result = keep_rows(joined, vertices=np.flatnonzero(~removed))
     report = VertexRemoval(
-        vertices=int(gone.sum()),
+        vertices=int(removed.sum()),
         observations=len(vi_map.observations) - len(result.observations),
         landmarks_moved=len(homeless),
         loop_closure_edges=len(vi_map.loop_closure_edges) - len(result.loop_closure_edges),
@@ -87,8 +87,8 @@ def stores_for(vi_map: VIMap, landmarks: I64, vertex_kept: Mask, *, same_mission
         vi_map: The map.
         landmarks: Landmark rows (N,).
         vertex_kept: Vertices (V,) that may store them.
-        same_mission: Ask for an observer of the landmark's mission and fall back on the nearest
-            kept vertex of it (every mission must have one); else -1 where nothing observes it.
+        same_mission: Use an observer of the landmark's mission, else its nearest kept vertex
+            (every mission must have one); otherwise return -1 without observer.
     """
     mission = vi_map.vertices.mission
     home = mission[vi_map.landmarks.vertex]

@@ -1,4 +1,4 @@
-"""The VI-map itself: one frozen value that holds every table."""
+"""The VI-map: a frozen value that holds all tables."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.geometry import se3
+from maplab_py.report import counted, to_html
 from maplab_py.sensors import SensorSet
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap.descriptors import binary_descriptor_sizes, feature_types
+from maplab_py.vimap.ids import IdIndex, to_hex_list
+from maplab_py.vimap.staged_folder import StagedFolder
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.tables import (
     AbsolutePoses,
@@ -39,18 +42,21 @@ from maplab_py.vimap.views import (
 
 @dataclasses.dataclass(frozen=True)
 class MapMetadata:
-    """What the map folder's `metadata` file says."""
+    """Content of the `metadata` file of a map folder, and resource files that are not saved yet."""
 
     description: str = ""
     map_folder: str = ""
     resource_folder_in_use: int = -1  # -1 = the map's own
     map_resource_folder: str = "./resources/"
     external_resource_folders: tuple[str, ...] = ()
+    # temporary folders among the external ones, not in the file: saving empties them into the
+    # resource folder in use
+    staged_folders: tuple[StagedFolder, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VIMap:
-    """A visual-inertial map. Never written into: edits return a new map that shares columns.
+    """An immutable visual-inertial map. Edits return a new map that shares columns.
 
     Derived look-ups (offsets, observations by landmark, id indices) are computed at first use
     and kept with the value.
@@ -72,6 +78,33 @@ class VIMap:
     loop_closure_edges: LoopClosureEdges = dataclasses.field(default_factory=LoopClosureEdges.empty)
     absolute_poses: AbsolutePoses = dataclasses.field(default_factory=AbsolutePoses.empty)
     resources: Resources = dataclasses.field(default_factory=Resources.empty)
+
+    def __repr__(self) -> str:
+        """Say in one line what the map holds."""
+        numbers = self._contents()
+        nouns = ("mission", "vertex", "landmark", "keypoint", "closure")
+        pairs = zip(numbers.values(), nouns, numbers, strict=True)
+        contents = ", ".join(counted(*pair) for pair in pairs)
+        return f"VIMap({contents})"
+
+    def _repr_html_(self) -> str:
+        """Return the missions and the size of the map as tables, for notebooks."""
+        of_mission = np.bincount(self.vertices.mission, minlength=len(self.missions))
+        words = to_hex_list(self.missions.id)
+        missions = [
+            {"mission": str(name) or word[:8], "id": word[:8], "vertices": int(count)}
+            for name, word, count in zip(self.missions.name, words, of_mission, strict=True)
+        ]
+        return to_html(self._contents()) + (to_html(missions) if missions else "")
+
+    def _contents(self) -> dict[str, int]:
+        return {
+            "missions": len(self.missions),
+            "vertices": len(self.vertices),
+            "landmarks": len(self.landmarks),
+            "keypoints": len(self.keypoints),
+            "closures": len(self.loop_closure_edges),
+        }
 
     def replace(self, **parts: Any) -> Self:
         """Return a map with some tables exchanged and all others shared."""
@@ -111,6 +144,16 @@ class VIMap:
     def keypoint_vertex(self) -> NDArray[np.int32]:
         """Vertex row of every keypoint (K,)."""
         return self.frames.vertex[self.keypoint_frame]
+
+    @cached_property
+    def binary_descriptor_size(self) -> NDArray[np.int32]:
+        """Bytes (K,) of each keypoint's binary descriptor, 0 where it has none."""
+        return binary_descriptor_sizes(self.frames)
+
+    @cached_property
+    def feature_type(self) -> NDArray[np.int32]:
+        """Feature type (K,) of each keypoint's descriptor, -1 where it has none."""
+        return feature_types(self.frames)
 
     @cached_property
     def observations(self) -> NDArray[np.int64]:

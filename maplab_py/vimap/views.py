@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.tables import LandmarkQuality
 
 if TYPE_CHECKING:
     from maplab_py.vimap.vi_map import VIMap
-
-F64 = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

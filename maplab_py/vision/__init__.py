@@ -1,1 +1,1 @@
-"""Recognising places: binary descriptors, their projection and index, and absolute camera pose."""
+"""Place recognition: binary descriptors, their projection and index, and absolute pose."""

@@ -1,10 +1,9 @@
 """Absolute pose of a camera rig from matches of keypoints with points, many queries at once.
 
-Two matches and the direction of gravity give yaw and position (a quadratic), so that few random
-samples suffice even among many wrong matches; where gravity is not known, three matches give the
-whole pose (P3P, and generalised P3P where a rig's cameras have several centres). Every better
-hypothesis is refined with all six degrees of freedom (MSAC with local optimisation: Torr and
-Zisserman 2000, Chum et al. 2003).
+Two matches and the gravity direction determine yaw and position (a quadratic), so that few samples
+suffice even at a high outlier ratio. Without gravity, three matches determine the pose (P3P, or
+generalised P3P for rigs with several camera centres). Every improved hypothesis is refined with all
+six degrees of freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
 """
 
 from __future__ import annotations
@@ -14,13 +13,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 HYPOTHESES = ("gravity", "three_point")
-"""Ways to make hypotheses, and how many matches each takes."""
+"""Minimal solvers and their sample sizes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,7 +28,7 @@ class PoseProblems:
     """
 
     start: I64  # (P + 1,)
-    key: I64  # (P,) names a problem: with the seed it decides its random numbers
+    key: I64  # (P,) determines the random numbers of a problem, together with the seed
     q_M_I: F64  # (P, 4) attitude of the query in a gravity-aligned frame; its yaw does not matter
     origin_I: F64  # (N, 3) camera centres in the query's body frame [m]
     ray_I: F64  # (N, 3) unit rays of the keypoints in the body frame
@@ -42,15 +39,15 @@ class PoseProblems:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseSolutions:
-    """Poses found; a query without solution has no inliers."""
+    """Estimated poses; a query without solution has no inliers."""
 
     T_M_I: F64  # (P, 7)
-    inlier_count: I64  # (P,) keypoints that agree with the pose
+    inlier_count: I64  # (P,) inlier keypoints
     keypoint_count: I64  # (P,) keypoints that had a match
     is_inlier: NDArray[np.bool_]  # (N,) one match at most per keypoint
     rms: F64  # (P,) error of the inliers in units of the tolerance
     covariance: F64  # (P, 6, 6) of [dp, dtheta] in the convention of `se3`, NaN where undetermined
-    tilt_rad: F64  # (P,) angle between gravity as given and as found
+    tilt_rad: F64  # (P,) angle between the given and the estimated gravity
 
 
 def solve_poses(
@@ -61,20 +58,19 @@ def solve_poses(
     tilt_sigma_rad: float = 0.02,
     hypotheses: str = "gravity",
 ) -> PoseSolutions:
-    """Find the pose of every query. Deterministic in the seed, for any thread count.
+    """Estimate the pose of every query. Deterministic in the seed, for any number of threads.
 
     Args:
         problems: The matches.
         seed: Seed of the random samples.
-        max_iterations: Most samples per query; fewer are drawn when inliers abound.
+        max_iterations: Maximum number of samples per query; a high inlier ratio needs fewer.
         tilt_sigma_rad: Standard deviation of the given roll and pitch.
-        hypotheses: One of HYPOTHESES: "gravity", or "three_point", which makes no use of the
-            given attitude: it only tells the tilt.
+        hypotheses: One of HYPOTHESES: "gravity", or "three_point", which ignores the given yaw.
     """
     count, matches = len(problems.key), len(problems.keypoint)
     of_match = np.repeat(np.arange(count), np.diff(problems.start))
     q_W_I = problems.q_M_I  # W: the frame of the attitude, with its origin at the body
-    found = search_level(
+    solved = search_level(
         LevelProblems(
             start=problems.start,
             key=problems.key,
@@ -94,21 +90,21 @@ def solve_poses(
         problems.keypoint[1:] != problems.keypoint[:-1]
     )
     keypoints = np.bincount(of_match[is_first], minlength=count)
-    inlier_cost = np.maximum(found.cost - (keypoints - found.inlier_count), 0.0)
+    inlier_cost = np.maximum(solved.cost - (keypoints - solved.inlier_count), 0.0)
     return PoseSolutions(
-        T_M_I=found.poses(q_W_I),
-        inlier_count=found.inlier_count,
+        T_M_I=solved.poses(q_W_I),
+        inlier_count=solved.inlier_count,
         keypoint_count=keypoints,
-        is_inlier=found.is_inlier,
-        rms=np.sqrt(inlier_cost / np.maximum(found.inlier_count, 1)),
-        covariance=found.covariances(q_W_I),
-        tilt_rad=found.tilt_rad,
+        is_inlier=solved.is_inlier,
+        rms=np.sqrt(inlier_cost / np.maximum(solved.inlier_count, 1)),
+        covariance=solved.covariances(q_W_I),
+        tilt_rad=solved.tilt_rad,
     )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LevelProblems:
-    """Like PoseProblems, with what belongs to the query turned to W: level, at the body."""
+    """PoseProblems with query data rotated to W, the level frame at the body."""
 
     start: I64  # (P + 1,)
     key: I64  # (P,)
@@ -121,7 +117,7 @@ class LevelProblems:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LevelSolutions:
-    """Poses T_M_W as found; what takes time to derive from them is asked for."""
+    """Estimated poses T_M_W; expensive derived quantities are computed on request."""
 
     R_M_W: F64  # (P, 3, 3)
     p_M_W: F64  # (P, 3)
@@ -132,7 +128,7 @@ class LevelSolutions:
 
     @property
     def tilt_rad(self) -> F64:
-        """Angle (P,) between gravity as given and as found."""
+        """Angle (P,) between the given and the estimated gravity."""
         return np.asarray(np.arccos(np.clip(self.R_M_W[:, 2, 2], -1.0, 1.0)))
 
     def poses(self, q_W_I: F64) -> F64:
@@ -153,24 +149,35 @@ def search_level(
     tilt_sigma_rad: float = 0.02,
     hypotheses: str = "gravity",
 ) -> LevelSolutions:
-    """Find poses, see `solve_poses`, for those who turn their queries to W once and search often."""
-    from maplab_py.vision.pose_kernels import search_poses
+    """Estimate poses as `solve_poses` does, for queries already rotated to W."""
+    from maplab_py.vision.pose_kernels import (
+        MatchColumns,
+        PoseColumns,
+        SearchSettings,
+        search_poses,
+    )
 
-    count, matches = len(problems.key), len(problems.keypoint)
-    R, t, H = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.empty((count, 6, 6))
-    cost, inliers = np.empty(count), np.empty(count, dtype=np.int64)
-    is_inlier = np.zeros(matches, dtype=np.bool_)
-    inverse_tilt = 1.0 / tilt_sigma_rad if hypotheses == "gravity" else 0.0
-    search_poses(
-        None if hypotheses == "gravity" else True, problems.start, _mixed_seeds(problems.key, seed),
-        (
-            problems.origin_W, problems.ray_W, problems.point_M, problems.keypoint,
-            1.0 / problems.tolerance,
-        ),
-        (max_iterations, inverse_tilt), R, t, H,
-        (cost, inliers, np.empty(count, dtype=np.int64)), is_inlier,
-    )  # fmt: skip
-    return LevelSolutions(R, t, H, cost, inliers, is_inlier)
+    count, uses_gravity = len(problems.key), hypotheses == "gravity"
+    matches = MatchColumns(
+        problems.start,
+        _mixed_seeds(problems.key, seed),
+        problems.origin_W,
+        problems.ray_W,
+        problems.point_M,
+        problems.keypoint,
+        1.0 / problems.tolerance,
+    )
+    poses = PoseColumns(
+        R_M_W=np.tile(np.eye(3), (count, 1, 1)),
+        p_M_W=np.zeros((count, 3)),
+        information=np.empty((count, 6, 6)),
+        cost=np.empty(count),
+        inlier_count=np.empty(count, dtype=np.int64),
+        is_inlier=np.zeros(len(problems.keypoint), dtype=np.bool_),
+    )
+    settings = SearchSettings(max_iterations, 1.0 / tilt_sigma_rad if uses_gravity else 0.0)
+    search_poses(None if uses_gravity else True, matches, settings, poses)
+    return LevelSolutions(*poses)
 
 
 def _covariances(H: F64, q_W_I: F64) -> F64:
@@ -197,3 +204,20 @@ def _mixed_seeds(key: I64, seed: int) -> NDArray[np.uint64]:
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         return np.asarray(z ^ (z >> np.uint64(31)))
+
+
+def compile_kernels(hypotheses: str) -> None:
+    """Compile the search by one kind of hypotheses on one query."""
+    points = 8
+    point = np.random.default_rng(0).uniform(1.0, 5.0, (points, 3))
+    problems = PoseProblems(
+        start=np.array([0, points]),
+        key=np.zeros(1, dtype=np.int64),
+        q_M_I=so3.identity(1),
+        origin_I=np.zeros((points, 3)),
+        ray_I=point / np.linalg.norm(point, axis=1, keepdims=True),
+        point_M=se3.transform(se3.identity(), point),
+        keypoint=np.arange(points),
+        tolerance=np.full(points, 0.01),
+    )
+    solve_poses(problems, hypotheses=hypotheses, max_iterations=2)

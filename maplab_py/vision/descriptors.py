@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
-I64 = NDArray[np.int64]
+from maplab_py.array_types import I64, U8, U64
 
 
 def pack_words(descriptors: U8) -> U64:
@@ -40,3 +38,9 @@ def hamming(words_a: U64, rows_a: I64, words_b: U64, rows_b: I64) -> NDArray[np.
     distance = np.empty(len(rows_a), dtype=np.int32)
     bits_between(words_a, rows_a, words_b, rows_b, distance)
     return distance
+
+
+def compile_kernels() -> None:
+    """Compile Hamming distances on one descriptor."""
+    words, rows = np.zeros((1, 1), dtype=np.uint64), np.zeros(1, dtype=np.int64)
+    hamming(words, rows, words, rows)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F32, I32
 from maplab_py.compilation import compiled, prange
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 
 MAX_TRAINING_POINTS = 20_000
 ITERATIONS = 12

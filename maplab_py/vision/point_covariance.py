@@ -1,21 +1,41 @@
-"""How well a point is known by the rays that cross in it, and whether two such points are one.
+"""Covariance of points from their rays, and the Mahalanobis distance of two points.
 
-Every keypoint weighs the point's position across its ray by the inverse square of what its error
-covers at that distance; along a ray nothing is known.
+Every keypoint contributes information across its ray, with the inverse square of its error at that
+distance, and none along the ray.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _FARTHEST_M = 100.0
-"""Standard deviation of a point of which nothing is known."""
+"""Standard deviation of an unknown point."""
+
+
+class LandmarkPairs(NamedTuple):
+    """Landmarks that a query sees (sources) and those of places that were matched with them."""
+
+    gap_M: F64  # (N, 3) source less target [m]
+    p_I: F64  # (N, 3) source in the query's body frame [m]
+    drift_m: F64  # (N,) standard deviation of what neither landmark nor pose account for
+    closure: I64  # (N,) row of `ClosurePoses`
+    source: I64  # (N,) row of the landmarks' covariances
+    target: I64  # (N,)
+
+
+class ClosurePoses(NamedTuple):
+    """Poses of queries as their closures say, M the mission of the place."""
+
+    R_M_Gq: F64  # (C, 3, 3) takes coordinates in G to M as the closure says
+    R_M_G: F64  # (C, 3, 3) the same as the base frames say
+    R_M_I: F64  # (C, 3, 3) attitude of the query
+    covariance: F64  # (C, 6, 6) of [position in M, angle in I]
 
 
 def covariance_by_rays(
@@ -51,46 +71,38 @@ def _add_rays(to_point, sigma_rad, seen, owner, information):  # type: ignore[no
 
 
 @compiled()
-def squared_sigmas(  # type: ignore[no-untyped-def]
-    gap, p_I, drift, closure, source, target, covariance, R_M_Gq, R_M_G, R_M_I, pose
-):
+def squared_sigmas(pairs: LandmarkPairs, covariance: F64, closures: ClosurePoses) -> F64:
     """Return gap^T C^-1 gap (N,), C from both landmarks, the closure's pose and drift.
 
     Args:
-        gap: Source less target (N, 3), in M.
-        p_I: Source (N, 3) as the query sees it.
-        drift: Standard deviation (N,) of the rest.
-        closure: Row (N,) of the last four.
-        source: Row (N,) of covariances.
-        target: Row (N,) of covariances.
+        pairs: Matched landmarks.
         covariance: Of landmarks (L, 3, 3), in G.
-        R_M_Gq: Rotation (C, 3, 3) that takes G to M as the closure says.
-        R_M_G: The same as the base frames say.
-        R_M_I: Attitude (C, 3, 3) of the query.
-        pose: Covariance (C, 6, 6) of [position in M, angle in I].
+        closures: Poses of the queries.
     """
-    J, C, result = np.zeros((3, 6)), np.empty((3, 3)), np.empty(len(gap))
+    J, C, result = np.zeros((3, 6)), np.empty((3, 3)), np.empty(len(pairs.gap_M))
     for i in range(3):
         J[i, i] = 1.0
-    for row in range(len(gap)):
-        c = closure[row]
-        A, B, R, x = R_M_Gq[c], R_M_G[c], R_M_I[c], p_I[row]
+    for row in range(len(pairs.gap_M)):
+        c = pairs.closure[row]
+        A, B, R, x = closures.R_M_Gq[c], closures.R_M_G[c], closures.R_M_I[c], pairs.p_I[row]
+        source, target = covariance[pairs.source[row]], covariance[pairs.target[row]]
+        pose, drift = closures.covariance[c], pairs.drift_m[row]
         for i in range(3):  # -R [x]_x: turning the query by w moves the point by R (w x p_I)
             J[i, 3] = R[i, 2] * x[1] - R[i, 1] * x[2]
             J[i, 4] = R[i, 0] * x[2] - R[i, 2] * x[0]
             J[i, 5] = R[i, 1] * x[0] - R[i, 0] * x[1]
         for i in range(3):
             for j in range(3):
-                total = drift[row] * drift[row] if i == j else 0.0
+                total = drift * drift if i == j else 0.0
                 for k in range(3):
                     for m in range(3):
-                        total += A[i, k] * covariance[source[row], k, m] * A[j, m]
-                        total += B[i, k] * covariance[target[row], k, m] * B[j, m]
+                        total += A[i, k] * source[k, m] * A[j, m]
+                        total += B[i, k] * target[k, m] * B[j, m]
                 for k in range(6):
                     for m in range(6):
-                        total += J[i, k] * pose[c, k, m] * J[j, m]
+                        total += J[i, k] * pose[k, m] * J[j, m]
                 C[i, j] = total
-        result[row] = _quadratic(C, gap[row])
+        result[row] = _quadratic(C, pairs.gap_M[row])
     return result
 
 
@@ -108,3 +120,11 @@ def _quadratic(C, x):  # type: ignore[no-untyped-def]
     y1 = b * x[0] + d * x[1] + e * x[2]
     y2 = c * x[0] + e * x[1] + f * x[2]
     return (x[0] * y0 + x[1] * y1 + x[2] * y2) / determinant
+
+
+def compile_kernels() -> None:
+    """Compile covariance and distance on one landmark."""
+    row, x, sigma, R = np.zeros(1, dtype=np.int64), np.ones((1, 3)), np.ones(1), np.eye(3)[None]
+    covariance = covariance_by_rays(x, sigma, sigma > 0.0, row, 1)
+    pairs = LandmarkPairs(x, x, sigma, row, row, row)
+    squared_sigmas(pairs, covariance, ClosurePoses(R, R, R, np.eye(6)[None]))

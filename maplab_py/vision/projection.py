@@ -3,7 +3,7 @@
 Within a track descriptors vary by noise; between tracks they vary by content. The projection
 keeps the directions along which the two differ most, scaled so that the squared Euclidean
 distance is (up to a constant) the log likelihood ratio of "different" against "same".
-Source: Lynen et al., Get Out of My Lab, RSS 2015, section IV; Bosse and Zlot 2013.
+Source: Lynen 2015, section IV; Bosse and Zlot 2013.
 """
 
 from __future__ import annotations
@@ -12,15 +12,10 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.compilation import compiled, prange
 from maplab_py.errors import EstimationError
-
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 DIMENSIONS = 10
 MIN_TRACK_LENGTH = 5
@@ -58,7 +53,7 @@ class DescriptorProjection:
 
     @cached_property
     def _table(self) -> F32:
-        """What a byte adds: (bytes, 256, dimensions), the sum over its 8 bits for all its values."""
+        """Look-up table (bytes, 256, dimensions): contribution of each value of each byte."""
         values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
         by_byte = self.matrix.T.reshape(self.descriptor_size, 8, len(self.matrix))
         table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False)
@@ -116,7 +111,7 @@ def _likelihood_ratio_metric(within: F64, overall: F64, dimensions: int) -> F32:
         best = np.argsort(-D, kind="stable")[:dimensions]
         ratio = np.sqrt(np.maximum(1.0 - 1.0 / D[best], 0.0))
         A = ratio[:, None] * (U[:, best].T @ whiten)
-    # eigenvectors have no sign of their own
+    # the sign of eigenvectors is arbitrary
     A *= np.sign(A[np.arange(len(A)), np.argmax(np.abs(A), axis=1)])[:, None]
     return np.ascontiguousarray(A, dtype=np.float32)
 

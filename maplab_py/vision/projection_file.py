@@ -8,8 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.errors import UserError
+from maplab_py.input_files import read_npz
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.vision.projection import DescriptorProjection
+
+_MAX_BYTES = 64_000_000
+"""Maximum size: a thousand dimensions of descriptors of 2000 bytes."""
 
 
 def save_projection(
@@ -27,17 +31,16 @@ def save_projection(
 
 
 def load_projection(path: Path) -> DescriptorProjection:
-    """Read what `save_projection` has written.
+    """Read a projection written by `save_projection`.
 
     Raises:
-        UserError: The file cannot be read or is no such file.
+        UserError: The file cannot be read, is too large, or is not a projection file.
     """
     try:
-        with np.load(path, allow_pickle=False) as content:
-            matrix = np.ascontiguousarray(content["matrix"], dtype=np.float32)
+        matrix = np.ascontiguousarray(read_npz(path, _MAX_BYTES)["matrix"], dtype=np.float32)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, AttributeError):
+    except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is not a projection: train_projection_matrix writes one") from None
     if matrix.ndim != 2 or matrix.shape[1] % 8 or not np.isfinite(matrix).all():
         raise UserError(f"{path}: the matrix is not (dimensions, 8 * bytes of a descriptor)")

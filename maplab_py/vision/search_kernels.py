@@ -1,14 +1,27 @@
 """Compiled kernels that compare descriptors: Hamming distances and the searches of the indices.
 
-Queries and database descriptors come with label, session and time: equal labels and, within a
-session, near times are no match. A search keeps the k nearest of distinct labels.
+Queries and database descriptors are `index.DescriptorColumns`: equal labels and, within a session,
+near times are no match. A search keeps the k nearest of distinct labels.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from maplab_py.array_types import F32, I64
 from maplab_py.compilation import compiled, prange
+
+
+class Cells(NamedTuple):
+    """Cells of a multi-index, and how a query walks them."""
+
+    first_centres: F32  # (A, dimensions / 2) words of the even dimensions
+    second_centres: F32  # (B, dimensions / 2) words of the odd dimensions
+    start: I64  # (A B + 1,) offsets of the cells' descriptors
+    per_query: int  # cells that a query visits
+    rank_by_bits: bool  # whether distances are bits, else squared distances in projected space
 
 
 @compiled(forceinline=True)
@@ -54,28 +67,26 @@ def _insert(row, distance, labels, candidate, label, value):  # type: ignore[no-
 
 
 @compiled(forceinline=True)
-def _allowed(q_label, q_session, q_time, d_label, d_session, d_time, min_time, others_only):  # type: ignore[no-untyped-def]
-    if d_label == q_label and q_label >= 0:
+def _allowed(queries, q, database, d, rule):  # type: ignore[no-untyped-def]
+    label = queries.label[q]
+    if database.label[d] == label and label >= 0:
         return False
-    return d_session != q_session or not (others_only or abs(d_time - q_time) < min_time)
+    if database.session[d] != queries.session[q]:
+        return True
+    near = abs(database.time_ns[d] - queries.time_ns[q]) < rule.min_time_ns
+    return not (rule.other_sessions_only or near)
 
 
 @compiled(parallel=True)
-def search_all(  # type: ignore[no-untyped-def]
-    q_words, q_label, q_session, q_time, d_words, d_label, d_session, d_time,
-    min_time, others_only, row, distance,
-):  # fmt: skip
+def search_all(queries, database, rule, row, distance):  # type: ignore[no-untyped-def]
     """Compare every query with every database descriptor; distances are bits."""
     k = row.shape[1]
-    for q in prange(len(q_words)):
+    for q in prange(len(queries.words)):
         labels = np.full(k, -1, dtype=np.int64)
-        for d in range(len(d_words)):
-            value = np.float32(_different_bits(q_words, q, d_words, d))
-            if value < distance[q, k - 1] and _allowed(
-                q_label[q], q_session[q], q_time[q],
-                d_label[d], d_session[d], d_time[d], min_time, others_only,
-            ):  # fmt: skip
-                _insert(row[q], distance[q], labels, d, d_label[d], value)
+        for d in range(len(database.words)):
+            value = np.float32(_different_bits(queries.words, q, database.words, d))
+            if value < distance[q, k - 1] and _allowed(queries, q, database, d, rule):
+                _insert(row[q], distance[q], labels, d, database.label[d], value)
 
 
 @compiled()
@@ -136,28 +147,26 @@ def _squared_distance(a, i, b, j, limit):  # type: ignore[no-untyped-def]
 
 @compiled(parallel=True)
 def search_cells(  # type: ignore[no-untyped-def]
-    q_points, q_words, q_label, q_session, q_time, centres_a, centres_b, start,
-    d_points, d_words, d_label, d_session, d_time,
-    cells_per_query, rank_by_bits, min_time, others_only, row, distance,
-):  # fmt: skip
+    query_points, queries, cells, points, database, rule, row, distance
+):
     """Walk the nearest cells of a multi-index; compare inside by bits or in projected space.
 
     `distance` comes filled with a bound that neighbours must stay below.
     """
-    words_a, words_b, k = len(centres_a), len(centres_b), row.shape[1]
-    for q in prange(len(q_points)):
+    words_a, words_b, k = len(cells.first_centres), len(cells.second_centres), row.shape[1]
+    for q in prange(len(query_points)):
         distance_a = np.empty(words_a, dtype=np.float32)
         distance_b = np.empty(words_b, dtype=np.float32)
-        _word_distances(q_points[q], 0, centres_a, distance_a)
-        _word_distances(q_points[q], 1, centres_b, distance_b)
-        order_a = np.empty(min(cells_per_query, words_a), dtype=np.int64)
-        order_b = np.empty(min(cells_per_query, words_b), dtype=np.int64)
+        _word_distances(query_points[q], 0, cells.first_centres, distance_a)
+        _word_distances(query_points[q], 1, cells.second_centres, distance_b)
+        order_a = np.empty(min(cells.per_query, words_a), dtype=np.int64)
+        order_b = np.empty(min(cells.per_query, words_b), dtype=np.int64)
         _nearest_first(distance_a, order_a)
         _nearest_first(distance_b, order_b)
         next_b = np.zeros(words_a, dtype=np.int32)
         reach = 1
         labels = np.full(k, -1, dtype=np.int64)
-        for _ in range(cells_per_query):
+        for _ in range(cells.per_query):
             best = _next_cell(distance_a, order_a, distance_b, order_b, next_b, reach)
             if best < 0:
                 break
@@ -165,13 +174,10 @@ def search_cells(  # type: ignore[no-untyped-def]
             next_b[best] += 1
             if best == reach - 1 and reach < len(order_a):
                 reach += 1
-            for d in range(start[cell], start[cell + 1]):
-                if rank_by_bits:
-                    value = np.float32(_different_bits(q_words, q, d_words, d))
+            for d in range(cells.start[cell], cells.start[cell + 1]):
+                if cells.rank_by_bits:
+                    value = np.float32(_different_bits(queries.words, q, database.words, d))
                 else:
-                    value = _squared_distance(q_points, q, d_points, d, distance[q, k - 1])
-                if value < distance[q, k - 1] and _allowed(
-                    q_label[q], q_session[q], q_time[q],
-                    d_label[d], d_session[d], d_time[d], min_time, others_only,
-                ):  # fmt: skip
-                    _insert(row[q], distance[q], labels, d, d_label[d], value)
+                    value = _squared_distance(query_points, q, points, d, distance[q, k - 1])
+                if value < distance[q, k - 1] and _allowed(queries, q, database, d, rule):
+                    _insert(row[q], distance[q], labels, d, database.label[d], value)

@@ -1,22 +1,21 @@
-"""Unite tracks pair by pair, as long as no image would hold two keypoints of one track."""
+"""Merge pairs of tracks unless an image would contain two keypoints of one track."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.compilation import compiled
-
-I64 = NDArray[np.int64]
 
 
 def unite_tracks(
     first: I64, second: I64, start: I64, image: I64, image_count: int
 ) -> NDArray[np.bool_]:
-    """Tell which pairs of tracks can be united, taken one after the other.
+    """Return which pairs of tracks can be merged, processed in order.
 
-    A pair is refused when both sides, with all that was united to them before, have a keypoint in
-    the same image: two points seen at once are two points.
+    A pair is rejected if both merged tracks have a keypoint in the same image, because two points
+    observed in one image are distinct.
 
     Args:
         first: Track of each pair (N,), best pairs first.
@@ -26,7 +25,7 @@ def unite_tracks(
         image_count: Number of images.
 
     Returns:
-        Accepted pairs (N,); a pair whose tracks are one already is accepted.
+        Accepted pairs (N,); pairs whose tracks are merged already are accepted.
     """
     accepted = np.zeros(len(first), dtype=np.bool_)
     _unite(first, second, start, image, np.full(image_count, -1, dtype=np.int64), accepted)
@@ -71,3 +70,9 @@ def _unite(first, second, start, image, stamp, accepted):  # type: ignore[no-unt
         parent[b] = a
         following[last[a]] = b
         last[a] = last[b]
+
+
+def compile_kernels() -> None:
+    """Compile the union on two tracks."""
+    track = np.arange(2)
+    unite_tracks(track[:1], track[1:], np.arange(3), track, 2)

@@ -7,27 +7,18 @@ from numpy.typing import NDArray
 
 from maplab_py.vision.index import DescriptorSet, MatchRule, Neighbours
 
-I64 = NDArray[np.int64]
-
 _FIRST_LOOK, _LAST_LOOK = 8, 512
-"""Neighbours looked at per wanted one; more, up to the last, where the rule leaves too few."""
+"""Initial number of candidates per wanted neighbour; increased while the rule leaves too few."""
 
 
 class TreeIndex:
-    """Looks at as many neighbours as it takes to find k that the rule allows."""
+    """Searches neighbours until k are found that the rule allows."""
 
-    def __init__(self, database: DescriptorSet, rows: I64 | None = None) -> None:
-        """Build the tree.
-
-        Args:
-            database: What to search in.
-            rows: Number (N,) that each descriptor has in results; None = 0, 1, 2 and so on.
-        """
+    def __init__(self, database: DescriptorSet) -> None:
+        """Build the tree."""
         from scipy.spatial import cKDTree
 
         self._database = database
-        self._rows = np.arange(len(database)) if rows is None else rows
-        self._next = int(self._rows.max(initial=-1)) + 1
         self._tree = cKDTree(database.projected)
 
     def nearest(self, queries: DescriptorSet, k: int, rule: MatchRule) -> Neighbours:
@@ -48,10 +39,10 @@ class TreeIndex:
         self, queries: DescriptorSet, k: int, look: int, rule: MatchRule
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         d = self._database
-        gap, found = self._tree.query(queries.projected, k=np.arange(1, look + 1))
-        label = d.label[found]
-        session = d.session[found]
-        apart = np.abs(d.time_ns[found] - queries.time_ns[:, None]) >= rule.min_time_ns
+        gap, nearest = self._tree.query(queries.projected, k=np.arange(1, look + 1))
+        label = d.label[nearest]
+        session = d.session[nearest]
+        apart = np.abs(d.time_ns[nearest] - queries.time_ns[:, None]) >= rule.min_time_ns
         other = session != queries.session[:, None]
         allowed = other | (apart & (not rule.other_sessions_only))
         allowed &= (label != queries.label[:, None]) | (label < 0)
@@ -68,18 +59,6 @@ class TreeIndex:
         row = np.full((len(queries), k), -1, dtype=np.int32)
         distance = np.full((len(queries), k), np.inf, dtype=np.float32)
         place = rank[query, column]
-        row[query, place] = self._rows[found[query, column]]
+        row[query, place] = nearest[query, column]
         distance[query, place] = gap[query, column] ** 2
         return row, distance
-
-    def added(self, more: DescriptorSet) -> TreeIndex:
-        """Return an index that holds more descriptors; the tree is built anew."""
-        rows = np.concatenate([self._rows, self._next + np.arange(len(more))])
-        return TreeIndex(DescriptorSet.concatenate(self._database, more), rows)
-
-    def without_session(self, session: int) -> TreeIndex:
-        """Return an index that holds no descriptor of a session any more."""
-        kept = np.flatnonzero(self._database.session != session)
-        index = TreeIndex(self._database.take(kept), self._rows[kept])
-        index._next = self._next
-        return index

@@ -1,11 +1,14 @@
-"""Commands that place missions of unknown base frame among the known ones."""
+"""Commands that anchor missions of unknown base frame to the known ones."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.anchoring.options import AnchoringOptions, AnchoringReport
+from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.algorithms.anchoring.reports import AnchoringReport
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.array_types import F64
+from maplab_py.errors import UserError
 from maplab_py.plugin import CommandContext, command
 
 _ANCHORING = AnchoringOptions()
@@ -24,7 +27,10 @@ def anchor_all_missions(
     options: AnchoringOptions = _ANCHORING,
     loop_options: LoopClosureOptions = _LOOPS,
 ) -> AnchoringReport:
-    """Anchor every mission of unknown base frame to the known ones, directly or over others."""
+    """Anchor every mission of unknown base frame to the known ones, directly or through other missions.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
+    """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 
     result, report = anchor_missions(
@@ -41,17 +47,52 @@ def anchor_mission(
     options: AnchoringOptions = _ANCHORING,
     loop_options: LoopClosureOptions = _LOOPS,
     map_mission: str = "",
+    to: str = "",
+    T_G_M: str = "",
 ) -> AnchoringReport:
     """Anchor one mission of unknown base frame to the known ones.
 
+    Places are recognised by binary descriptors; keypoints with others are left out. With --T_G_M a
+    person decides where the mission is: the pose is taken as it is, or with --to as an approximate
+    one that selects the alignment with another mission.
+
     Args:
-        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        to: Known mission; of the alignments with it the one near --T_G_M is used.
+        T_G_M: Pose of the mission's frame in the global frame: x y z [m] and yaw [deg], "1 2 0 90".
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+    from maplab_py.algorithms.anchoring.by_hand import choice_near, place_mission
 
-    missions = np.array([context.mission_row(map_mission)])
+    row = context.mission_row(map_mission)
+    choice = None
+    if to and not T_G_M:
+        raise UserError('--to: give the approximate pose, too: --T_G_M="x y z yaw_deg"')
+    if T_G_M:
+        pose = _yaw_and_position(T_G_M)
+        if not to:
+            result, report = place_mission(context.vi_map, row, pose)
+            context.commit(result)
+            return report
+        choice = choice_near(context.vi_map, row, context.mission_row(to), pose)
     result, report = anchor_missions(
-        context.vi_map, options, loop_options, missions=missions, progress=context.progress
+        context.vi_map,
+        options,
+        loop_options,
+        missions=np.array([row]),
+        choice=choice,
+        progress=context.progress,
     )
     context.commit(result)
     return report
+
+
+def _yaw_and_position(text: str) -> F64:
+    """Read x y z [m] and yaw [deg]; return position and yaw [rad] (4,)."""
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != 4 or not np.isfinite(values).all():
+        raise UserError(f'--T_G_M={text}: four numbers are expected, "x y z yaw_deg"')
+    return np.append(values[:3], np.radians(values[3]))

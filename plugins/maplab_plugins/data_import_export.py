@@ -1,14 +1,20 @@
-"""Commands that write parts of a map for other tools."""
+"""Commands that write parts of a map for other tools, and look at recordings."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from maplab_py.interop.csv_dataset import CsvExportOptions, CsvExportReport
+from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
+if TYPE_CHECKING:
+    from maplab_py.interop.recordings.summary import RecordingReport
+
+_SOURCE = SourceOptions()
+_STREAM = StreamOptions()
 _ONLY_VERTICES = CsvExportOptions(
     imu_data=False,
     tracks_and_keypoints=False,
@@ -199,7 +205,38 @@ def export_mission_info(
     return WrittenFiles((path,), sum(len(missions) for missions in info.values()))
 
 
+@command(
+    "recording_info",
+    example="recording_info MH_01_easy --check_images",
+    see_also=("simulate",),
+    needs_map=False,
+)
+def recording_info(
+    context: CommandContext,
+    recording: Path,
+    *,
+    source: SourceOptions = _SOURCE,
+    stream: StreamOptions = _STREAM,
+    check_images: bool = False,
+) -> RecordingReport:
+    """Show what is in a recording: rates, durations, gaps, and what would be left out.
+
+    Args:
+        recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
+        check_images: Check size and completeness of all images.
+    """
+    from maplab_py.interop.recordings.opening import open_recording
+    from maplab_py.interop.recordings.summary import summarise
+
+    return summarise(
+        open_recording(recording, source),
+        stream,
+        check_images=check_images,
+        progress=context.progress,
+    )
+
+
 def _given(path: Path | None, flag: str) -> Path:
     if path is None:
-        raise UserError(f"no place to write to: give --{flag}=...")
+        raise UserError(f"no destination: give --{flag}=...")
     return path

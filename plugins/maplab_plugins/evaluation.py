@@ -1,49 +1,147 @@
-"""Commands that measure how good a map is."""
+"""Commands that measure the accuracy of a map."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.evaluation.options import (
-    TrajectoryEvaluationOptions,
+from maplab_py.algorithms.evaluation.comparison_reports import MapComparisonReport
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.reports import (
+    LocalizationEvaluationReport,
     TrajectoryEvaluationReport,
 )
-from maplab_py.plugin import CommandContext, command
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
 
 
 @command(
     "evaluate_trajectory",
     example="evaluate_trajectory --ground_truth=V1_01_easy.csv --alignment=se3",
     see_also=("export_trajectory_to_csv",),
+    completes={"baseline": "snapshot"},
 )
 def evaluate_trajectory(
     context: CommandContext,
-    *,
     ground_truth: Path,
+    *,
     options: TrajectoryEvaluationOptions = TrajectoryEvaluationOptions(),  # noqa: B008
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
+    baseline: str = "",
 ) -> TrajectoryEvaluationReport:
     """Compare the vertices with a ground-truth trajectory: APE, Sim(3) APE and scale, RPE.
 
+    The RMSE of the last evaluation of this map in the session, against the same ground truth with
+    the same options, is subtracted.
+
     Args:
         ground_truth: TUM, EuRoC or CSV file with stamped poses, or the truth.npz of `simulate`.
-        map_mission: Mission id or unambiguous prefix; empty = all missions together.
-        map_mission_list: Several missions, separated by commas.
+        baseline: Snapshot of the map to subtract the errors of; empty = the last evaluation.
     """
     from maplab_py.algorithms.evaluation import trajectory_evaluation
     from maplab_py.interop.trajectories import read_trajectory
 
+    reference = context.snapshot(baseline) if baseline else None
     if ground_truth.suffix == ".npz":
         from maplab_py.simulation.truth import Truth
 
         truth = Truth.load(ground_truth).trajectory(str(ground_truth))
     else:
         truth = read_trajectory(ground_truth)
-    return trajectory_evaluation.evaluate_trajectory(
-        context.vi_map,
-        truth,
-        options,
-        missions=context.mission_rows(map_mission, map_mission_list),
-        progress=context.progress,
+
+    def errors_of(vi_map: VIMap) -> TrajectoryEvaluationReport:
+        missions = chosen.rows(vi_map)
+        return trajectory_evaluation.evaluate_trajectory(
+            vi_map, truth, options, missions=missions, progress=context.progress
+        )
+
+    report = errors_of(context.vi_map)
+    key = ("evaluate_trajectory", context.map_key, str(ground_truth), options, chosen)
+    before = context.session.results.get(key)
+    context.session.results[key] = report
+    if reference is not None:
+        errors = errors_of(reference).as_baseline(f"snapshot '{baseline}'")
+    elif isinstance(before, TrajectoryEvaluationReport):
+        errors = before.as_baseline("the last evaluation")
+    else:
+        return report
+    return dataclasses.replace(report, baseline=errors)
+
+
+@command(
+    "compare_maps",
+    example="compare_maps before_optvi",
+    see_also=("import_colmap", "evaluate_trajectory"),
+)
+def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport:
+    """Tell how the selected map and another one differ; rows belong together by their ids.
+
+    Poses and landmarks are compared in G. An observation is a keypoint with its landmark.
+
+    Args:
+        other_map: Key of a map in memory, or folder of a map.
+    """
+    from maplab_py.algorithms.evaluation import map_comparison
+    from maplab_py.storage.native import is_map_folder, load_map
+
+    if other_map in context.maps:
+        other = context.maps.get(other_map).vi_map
+    elif is_map_folder(Path(other_map)):
+        other, _ = load_map(Path(other_map))
+    else:
+        known = ", ".join(context.maps.keys)
+        raise UserError(
+            f"'{other_map}' is neither a map in memory ({known}) nor the folder of a map: name one of them"
+        )
+    return map_comparison.compare_maps(context.vi_map, other)
+
+
+@command(
+    "evaluate_localization",
+    example="evaluate_localization --localization_csv=vil.csv --ground_truth=V1_01_easy.csv",
+    needs_map=False,
+    see_also=("rovioli", "localize", "evaluate_trajectory"),
+)
+def evaluate_localization(
+    context: CommandContext,  # noqa: ARG001
+    *,
+    localization_csv: str = "",
+    ground_truth: Path,
+    map_folder: Path | None = None,
+    map_ground_truth: Path | None = None,
+) -> LocalizationEvaluationReport:
+    """Compare poses in a map with ground truth, without aligning them.
+
+    Poses are taken to be in the frame of the ground truth. When --map_folder is given, that map is
+    aligned with the ground truth first, by its own vertices.
+
+    Args:
+        localization_csv: Files of rovioli --export_localized_poses_to_csv, or other trajectories,
+            separated by commas.
+        ground_truth: TUM, EuRoC or CSV file with stamped poses of the recording.
+        map_folder: The map in which the recording was localised.
+        map_ground_truth: Ground truth of the map's recordings, in the same frame; empty =
+            --ground_truth.
+    """
+    from maplab_py.algorithms.evaluation import localization_evaluation as evaluation
+    from maplab_py.geometry import se3
+    from maplab_py.interop.trajectories import read_trajectory
+    from maplab_py.storage.native import load_map
+
+    names = [name.strip() for name in localization_csv.split(",") if name.strip()]
+    if not names:
+        raise UserError("no poses: give --localization_csv=FILE, the file of rovioli")
+    truth = read_trajectory(ground_truth)
+    T_R_G, alignment = se3.identity(), "none: the map has the frame of the ground truth"
+    if map_folder is not None:
+        of_map = truth if map_ground_truth is None else read_trajectory(map_ground_truth)
+        vi_map, _ = load_map(map_folder)
+        T_R_G, alignment = evaluation.alignment_of_map(vi_map, of_map), "vertices of the map"
+    files = tuple(
+        evaluation.localization_errors(evaluation.read_localized(Path(name)), truth, T_R_G)
+        for name in names
     )
+    return LocalizationEvaluationReport(str(ground_truth), alignment, files)

@@ -1,19 +1,23 @@
-"""Commands on landmarks: triangulate, judge, remove, and repair their observations."""
+"""Commands on landmarks: triangulate, evaluate, remove, and repair their observations."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.landmarks.options import (
     InvalidObservationOptions,
     LandmarkQualityOptions,
 )
-from maplab_py.algorithms.landmarks.reports import (
-    InvalidObservationReport,
-    LandmarkQualityReport,
-    RemovalReport,
-    RetriangulationReport,
-    TrackReport,
-)
-from maplab_py.plugin import CommandContext, command
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.landmarks.reports import (
+        InvalidObservationReport,
+        LandmarkQualityReport,
+        LandmarkRemovalReport,
+        RetriangulationReport,
+        TrackReport,
+    )
 
 _QUALITY = LandmarkQualityOptions()
 _INVALID = InvalidObservationOptions()
@@ -24,18 +28,12 @@ def retriangulate_landmarks(
     context: CommandContext,
     *,
     options: LandmarkQualityOptions = _QUALITY,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> RetriangulationReport:
-    """Triangulate all landmarks from their observations and evaluate their quality.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Triangulate all landmarks from their observations and evaluate their quality."""
     from maplab_py.algorithms.landmarks.triangulation import retriangulate
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = retriangulate(
         context.vi_map, options, missions=missions, progress=context.progress
     )
@@ -48,18 +46,12 @@ def init_track_landmarks(
     context: CommandContext,
     *,
     options: LandmarkQualityOptions = _QUALITY,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> TrackReport:
-    """Make landmarks from feature tracks that have none, then triangulate all.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Create landmarks for feature tracks that have none, then triangulate all."""
     from maplab_py.algorithms.landmarks.tracks import init_tracks
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = init_tracks(
         context.vi_map, options, missions=missions, progress=context.progress
     )
@@ -72,18 +64,12 @@ def evaluate_landmark_quality(
     context: CommandContext,
     *,
     options: LandmarkQualityOptions = _QUALITY,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> LandmarkQualityReport:
-    """Judge every landmark: good or bad.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Classify every landmark as good or bad."""
     from maplab_py.algorithms.landmarks.quality import evaluate_quality
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = evaluate_quality(
         context.vi_map, options, missions=missions, progress=context.progress
     )
@@ -93,17 +79,12 @@ def evaluate_landmark_quality(
 
 @command("reset_landmark_quality", "rlq", example="rlq")
 def reset_landmark_quality(
-    context: CommandContext, *, map_mission: str = "", map_mission_list: str = ""
+    context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
 ) -> LandmarkQualityReport:
-    """Set the quality of all landmarks to unknown.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Set the quality of all landmarks to unknown."""
     from maplab_py.algorithms.landmarks.quality import reset_quality
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = reset_quality(context.vi_map, missions=missions, progress=context.progress)
     context.commit(result)
     return report
@@ -111,17 +92,12 @@ def reset_landmark_quality(
 
 @command("remove_bad_landmarks", "rbl", example="rbl")
 def remove_bad_landmarks(
-    context: CommandContext, *, map_mission: str = "", map_mission_list: str = ""
-) -> RemovalReport:
-    """Remove all landmarks of quality bad; their keypoints stay.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
+) -> LandmarkRemovalReport:
+    """Remove all landmarks of quality bad; their keypoints stay."""
     from maplab_py.algorithms.landmarks.removal import remove_bad
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = remove_bad(context.vi_map, missions=missions, progress=context.progress)
     context.commit(result)
     return report
@@ -132,18 +108,12 @@ def remove_invalid_observations(
     context: CommandContext,
     *,
     options: InvalidObservationOptions = _INVALID,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> InvalidObservationReport:
-    """Detach observations that contradict their landmark and make new landmarks from their tracks.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Detach observations that contradict their landmark and create new landmarks from their tracks."""
     from maplab_py.algorithms.landmarks import removal
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = removal.remove_invalid_observations(
         context.vi_map, options, missions=missions, progress=context.progress
     )

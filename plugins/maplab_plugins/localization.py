@@ -9,15 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.localization.report import LocalizationReport
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.input_files import SizeOptions
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.localization.database import LocalizationMap
     from maplab_py.algorithms.localization.localization import Localizations, Reference
+    from maplab_py.algorithms.localization.reports import LocalizationReport
+    from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
 
 _OPTIONS = LocalizationOptions()
+_SIZE = SizeOptions()
+
+
+def map_values(session: Session) -> list[tuple[str, str]]:
+    """Return the maps in memory other than the selected one, and the map folders at hand."""
+    from maplab_py.storage.native import is_map_folder
+
+    keys = [
+        (entry.key, "map in memory")
+        for entry in session.maps
+        if entry.key != session.maps.selected_key
+    ]
+    folders = sorted(path for path in Path().iterdir() if path.is_dir() and is_map_folder(path))
+    return keys + [(str(path), "map folder") for path in folders]
 
 
 @command(
@@ -25,14 +41,14 @@ _OPTIONS = LocalizationOptions()
     example="localize --localization_map=office_summary --localization_csv=poses.csv",
     see_also=("generate_summary_map_and_save_to_disk", "landmark_sparsify"),
     writes_files=True,
+    completes={"localization_map": map_values},
 )
 def localize(
     context: CommandContext,
-    *,
     localization_map: str = "",
+    *,
     options: LocalizationOptions = _OPTIONS,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
     sequence_length: int = 1,
     success_error_m: float = 0.5,
     ground_truth: Path | None = None,
@@ -40,16 +56,17 @@ def localize(
     localization_csv: Path | None = None,
     localization_json: Path | None = None,
     overwrite: bool = False,
+    size: SizeOptions = _SIZE,
 ) -> LocalizationReport:
     """Localise the images of the selected map in another map, one by one; no map is changed.
+
+    Only binary descriptors are matched; keypoints with others are left out.
 
     Errors are against --ground_truth or --truth, else against the poses that the selected map has.
 
     Args:
         localization_map: Where to localise: key of a map in memory, folder of a map, or a summary
             map; empty = the other missions of the selected map.
-        map_mission: Mission id or unambiguous prefix of the queries; empty = all missions.
-        map_mission_list: Several missions of queries, separated by commas.
         sequence_length: Vertices whose images make up one query, placed by their relative poses.
         success_error_m: Position error in metres below which an answer counts as success.
         ground_truth: TUM, EuRoC or CSV file with stamped poses of the queries.
@@ -58,9 +75,9 @@ def localize(
         localization_json: File that gets the report.
         overwrite: Replace files that exist.
     """
-    import json
 
     from maplab_py.algorithms.localization.localization import describe, localize_missions
+    from maplab_py.algorithms.localization.result_file import csv_lines
     from maplab_py.output_files import check_writable, write_text
 
     if sequence_length < 1:
@@ -71,9 +88,9 @@ def localize(
         if path is not None:
             check_writable(path, overwrite=overwrite)
     query = context.vi_map
-    missions = context.mission_rows(map_mission, map_mission_list)
-    database, searched = _database(context, localization_map, missions)
-    found = localize_missions(
+    missions = chosen.rows(context.vi_map)
+    database, searched = _database(context, localization_map, missions, size)
+    localizations = localize_missions(
         database,
         query,
         options,
@@ -81,21 +98,24 @@ def localize(
         sequence_length=sequence_length,
         progress=context.progress,
     )
-    reference, T_R_G = _reference(query, found, database, searched, ground_truth, truth)
+    reference, T_R_G = _reference(query, localizations, database, searched, ground_truth, truth)
     report = describe(
-        database, found, reference=reference, T_R_G=T_R_G, success_error_m=success_error_m
+        database, localizations, reference=reference, T_R_G=T_R_G, success_error_m=success_error_m
     )
     if localization_csv is not None:
-        lines = _lines(query, found, reference, T_R_G)
+        lines = csv_lines(query, localizations, reference, T_R_G)
         write_text(localization_csv, lines, overwrite=overwrite)
     if localization_json is not None:
-        text = json.dumps(report.as_json(), indent=2) + "\n"
+        text = report.as_json(indent=2) + "\n"
         write_text(localization_json, [text], overwrite=overwrite)
     return report
 
 
 def _database(
-    context: CommandContext, name: str, queries: NDArray[np.int64] | None
+    context: CommandContext,
+    name: str,
+    queries: NDArray[np.int64] | None,
+    size: SizeOptions,
 ) -> tuple[LocalizationMap, VIMap | None]:
     """Return what to search in, and the full map if it is one."""
     from maplab_py.algorithms.localization.database import database_of_map, database_of_summary
@@ -103,23 +123,25 @@ def _database(
     from maplab_py.storage.summary_map import read_summary_map, summary_map_file
 
     if not name:
-        own = context.vi_map
-        others = np.setdiff1d(np.arange(len(own.missions)), [] if queries is None else queries)
+        session_map = context.vi_map
+        others = np.setdiff1d(
+            np.arange(len(session_map.missions)), [] if queries is None else queries
+        )
         if queries is None or len(others) == 0:
             raise UserError(
                 "say where to localise, --localization_map=..., or which of the map's missions are "
                 "the queries, --map_mission=..."
             )
-        return database_of_map(own, missions=others), own
+        return database_of_map(session_map, missions=others), session_map
     if name in context.maps:
         vi_map = context.maps.get(name).vi_map
         return database_of_map(vi_map), vi_map
-    path = Path(name)
+    path, megabytes = Path(name), size.proto_max_size_megabytes
     if is_map_folder(path):
-        vi_map, _ = load_map(path, progress=context.progress)
+        vi_map, _ = load_map(path, max_size_megabytes=megabytes, progress=context.progress)
         return database_of_map(vi_map), vi_map
     if summary_map_file(path) is not None:
-        return database_of_summary(read_summary_map(path)), None
+        return database_of_summary(read_summary_map(path, max_size_megabytes=megabytes)), None
     raise UserError(
         f"--localization_map={name} is neither a map in memory nor a map folder nor a summary map"
     )
@@ -127,7 +149,7 @@ def _database(
 
 def _reference(
     query: VIMap,
-    found: Localizations,
+    localizations: Localizations,
     database: LocalizationMap,
     searched: VIMap | None,
     ground_truth: Path | None,
@@ -135,70 +157,13 @@ def _reference(
 ) -> tuple[Reference, NDArray[np.float64] | None]:
     from maplab_py.algorithms.localization import reference
     from maplab_py.interop.trajectories import read_trajectory
+    from maplab_py.simulation.localization_truth import true_poses
 
     if truth is not None:
-        return _simulated(query, found, database, truth)
+        return true_poses(query, localizations, database, truth)
     if ground_truth is None:
-        return reference.own_trajectory(query, found)
+        return reference.trajectory_of_queries(query, localizations)
     recorded = read_trajectory(ground_truth)
     return reference.ground_truth(
-        str(ground_truth), recorded.times_ns, recorded.T_R_B, query, found, searched
+        str(ground_truth), recorded.times_ns, recorded.T_R_B, query, localizations, searched
     )
-
-
-def _simulated(
-    query: VIMap, found: Localizations, database: LocalizationMap, path: Path
-) -> tuple[Reference, NDArray[np.float64] | None]:
-    """Look poses of queries and of the map's observers up in the truth, by id."""
-    from maplab_py.algorithms.localization.localization import Reference
-    from maplab_py.geometry.alignment import umeyama
-    from maplab_py.simulation.truth import Truth
-    from maplab_py.vimap.ids import IdIndex
-
-    truth = Truth.load(path)
-    index = IdIndex(truth.vertex_id)
-    row = index.rows(query.vertices.id[found.vertex])
-    if not (row >= 0).any():
-        raise UserError(f"{path} is of another data set: it knows none of the queries")
-    reference = Reference(str(path), truth.T_G_I[row], row >= 0)
-    if database.observer_id is None:
-        raise UserError("the summary map has no ids: its place in the truth is not known")
-    observer = index.rows(database.observer_id)
-    known = observer >= 0
-    if known.sum() < 3:
-        raise UserError(f"{path} is of another data set: it knows none of the map's vertices")
-    T_R_G, _ = umeyama(truth.T_G_I[observer[known], 4:], database.p_G_observer[known])
-    return reference, T_R_G
-
-
-def _lines(
-    query: VIMap,
-    found: Localizations,
-    reference: Reference,
-    T_R_G: NDArray[np.float64] | None,
-) -> list[str]:
-    """Return the lines of the CSV file, one per query."""
-    from maplab_py.algorithms.localization.localization import pose_errors
-    from maplab_py.vimap.ids import to_hex_list
-
-    nan = np.full(len(found.vertex), np.nan)
-    position, orientation = (nan, nan) if T_R_G is None else pose_errors(found, reference, T_R_G)
-    lines = [
-        "vertex,timestamp_ns,outcome,keypoints,matches,inliers,"
-        "q_x,q_y,q_z,q_w,p_x,p_y,p_z,position_error_m,orientation_error_deg,matching_ms,ransac_ms\n"
-    ]
-    names = to_hex_list(query.vertices.id[found.vertex])
-    times = query.vertices.timestamp_ns[found.vertex].tolist()
-    for row, answer in enumerate(found.answers):
-        pose = (
-            ",".join(f"{value:.9g}" for value in answer.T_G_I)
-            if found.is_localized[row]
-            else ",,,,,,"
-        )
-        errors = f"{position[row]:.6g},{orientation[row]:.6g}" if position[row] >= 0.0 else ","
-        spent = f"{1e3 * answer.matching_s:.3f},{1e3 * answer.ransac_s:.3f}"
-        counts = f"{answer.keypoints},{answer.matches},{answer.inliers}"
-        lines.append(
-            f"{names[row]},{times[row]},{answer.outcome.value},{counts},{pose},{errors},{spent}\n"
-        )
-    return lines

@@ -1,23 +1,27 @@
-"""Commands on loops: find and close them, relax the trajectories over them, remove edges."""
+"""Commands on loop closures: detect, merge, relax, list, remove."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closure_report import (
-    ClosureReport,
-    RemovalReport,
-    TrainingReport,
-)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.report import LoopClosureReport
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.plugin import CommandContext, Message, Report, command
+from maplab_py.report import counted
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.loop_closure.reports import (
+        ClosureRemovalReport,
+        ClosureReport,
+        LoopClosureReport,
+        TrainingReport,
+    )
+    from maplab_py.console.session.session import Session
 
 _LOOPS = LoopClosureOptions()
 _RELAXATION = RelaxationOptions()
@@ -25,7 +29,7 @@ _RELAXATION = RelaxationOptions()
 
 @dataclasses.dataclass(frozen=True)
 class RelaxReport(Report):
-    """Loop closures that were found, what the relaxation made of them, and merged landmarks."""
+    """Detected loop closures, the result of the relaxation, and merged landmarks."""
 
     loop_closures: LoopClosureReport
     relaxation: RelaxationReport
@@ -33,10 +37,10 @@ class RelaxReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say why nothing was relaxed."""
+        """Return why nothing was relaxed."""
         relaxed = self.relaxation.failure
-        found = self.loop_closures.failure
-        return f"{relaxed}; {found}" if relaxed and found else relaxed
+        search_failure = self.loop_closures.failure
+        return f"{relaxed}; {search_failure}" if relaxed and search_failure else relaxed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +51,7 @@ class RelaxMissionsReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say why nothing was relaxed, when no mission was."""
+        """Return why nothing was relaxed; empty if any mission was."""
         failures = [f"{name}: {report.failure}" for name, report in self.missions.items()]
         if any(not report.failure for report in self.missions.values()):
             return ""
@@ -67,10 +71,12 @@ def loopclosure_all_missions(
     lc_insert_lc_edge_instead_of_merging: bool = False,
     map_mission_list: str = "",
 ) -> LoopClosureReport:
-    """Find places that were seen more than once, in any mission, and merge their landmarks.
+    """Detect loop closures within and between missions and merge their landmarks.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
 
     Args:
-        lc_insert_lc_edge_instead_of_merging: Add loop closure edges; leave the landmarks as they are.
+        lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
         map_mission_list: Missions to close loops in and between, separated by commas; empty = all.
     """
     missions = context.mission_rows("", map_mission_list)
@@ -85,11 +91,13 @@ def loopclosure_one_mission(
     lc_insert_lc_edge_instead_of_merging: bool = False,
     map_mission: str = "",
 ) -> LoopClosureReport:
-    """Find places that one mission saw more than once, and merge their landmarks.
+    """Detect loop closures within one mission and merge their landmarks.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
 
     Args:
-        lc_insert_lc_edge_instead_of_merging: Add loop closure edges; leave the landmarks as they are.
-        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
+        lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     missions = np.array([context.mission_row(map_mission)])
     return _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
@@ -102,7 +110,7 @@ def delete_loopclosure_edges(context: CommandContext) -> Message:
 
     count = len(context.vi_map.loop_closure_edges)
     context.commit(remove_loop_closure_edges(context.vi_map, np.ones(count, dtype=np.bool_)))
-    return Message(f"removed {count} loop closure edges")
+    return Message(f"removed {counted(count, 'loop closure edge')}")
 
 
 @command(
@@ -119,10 +127,12 @@ def train_projection_matrix(
     map_mission_list: str = "",
     overwrite: bool = False,
 ) -> TrainingReport:
-    """Learn from the map's tracks which differences between descriptors matter, and write that.
+    """Train the projection of descriptors on the feature tracks of the map and write it.
+
+    Only binary descriptors are used.
 
     Args:
-        file: File to write; --lc_projection_matrix_filename takes it.
+        file: File to write; to be given as --lc_projection_matrix_filename.
         lc_target_dimensionality: Dimensions of the projected descriptors.
         map_mission_list: Missions to learn from, separated by commas; empty = all.
         overwrite: Replace the file if it exists.
@@ -139,26 +149,31 @@ def train_projection_matrix(
 @command(
     "lc_report",
     example="lc_report --sort_by=gap --limit=10",
-    see_also=("remove_loopclosure", "loopclosure_all_missions"),
+    see_also=("why", "remove_loopclosure", "loopclosure_all_missions"),
 )
 def lc_report(
     context: CommandContext,
     *,
     which: Literal["accepted", "refused", "all"] = "accepted",
-    sort_by: Literal["time", "gap", "correction", "inliers"] = "time",
+    sort_by: Literal["time", "gap", "correction", "inliers", "near_miss"] = "time",
+    reason: str = "",
+    descending: bool = False,
     limit: int = 50,
     file: Path | None = None,
     map_mission_list: str = "",
     overwrite: bool = False,
 ) -> ClosureReport:
-    """List the loop closures that the map remembers, with verdicts and the reasons for refusals.
+    """List the recorded loop closures with their verdicts and the reasons for refusals.
 
     Args:
-        which: accepted, refused or all of them.
+        which: Which closures to list.
         sort_by: time of the query; gap = distance of the map's present poses from the closure,
-            largest first; correction = what it wanted to move the query by when it was found,
-            largest first; inliers, fewest first.
-        limit: Most closures to list; 0 = all.
+            largest first; correction = change of the query's position at detection time,
+            largest first; inliers, fewest first; near_miss: refused closures that fail the fewest
+            gates by least first (see: why).
+        reason: Only refused closures whose verdict contains this text, such as "another place".
+        descending: Reverse the order.
+        limit: Largest number of closures to list; 0 = all.
         file: Write all chosen closures to this file, JSON or CSV by its ending.
         map_mission_list: Only closures with an end in these missions, separated by commas.
         overwrite: Replace the file if it exists.
@@ -166,7 +181,14 @@ def lc_report(
     from maplab_py.algorithms.loop_closure.listing import list_closures, write_closures
 
     missions = context.mission_rows("", map_mission_list)
-    report = list_closures(context.vi_map, which=which, missions=missions, sort_by=sort_by)
+    report = list_closures(
+        context.vi_map,
+        which="refused" if reason or sort_by == "near_miss" else which,
+        missions=missions,
+        sort_by=sort_by,
+        reason=reason,
+        descending=descending,
+    )
     if file is not None:
         write_closures(report, file, overwrite=overwrite)
     lines = report.closures if limit <= 0 else report.closures[:limit]
@@ -175,22 +197,30 @@ def lc_report(
     )
 
 
+def closure_values(session: Session) -> list[tuple[str, str]]:
+    """Return the ids of the recorded closures with what was decided on them."""
+    from maplab_py.algorithms.loop_closure.listing import described_ids
+
+    return described_ids(session.vi_map)
+
+
 @command(
     "remove_loopclosure",
     "rlc",
     example="remove_loopclosure 59f0a1b2 --neighbors_s=2",
     see_also=("lc_report", "delete_loopclosure_edges"),
+    completes={"closures": closure_values},
 )
 def remove_loopclosure(
     context: CommandContext, closures: str, *, neighbors_s: float = 0.0
-) -> RemovalReport:
-    """Take back loop closures: their edges, and merges that too few others speak for.
+) -> ClosureRemovalReport:
+    """Remove loop closures: their edges, and merges that too few others support.
 
     Later searches refuse them, until the record is dropped.
 
     Args:
         closures: Beginnings of the closures' ids as lc_report shows them, separated by commas.
-        neighbors_s: Also take back accepted closures both of whose ends are as near in time.
+        neighbors_s: Also remove accepted closures both of whose ends are within this time.
     """
     from maplab_py.algorithms.loop_closure.listing import find_closures
     from maplab_py.algorithms.loop_closure.removal import remove_closures
@@ -203,11 +233,11 @@ def remove_loopclosure(
 
 @command("delete_loopclosure_record", example="delete_loopclosure_record")
 def delete_loopclosure_record(context: CommandContext) -> Message:
-    """Forget all recorded loop closures; landmarks, edges and poses stay as they are."""
-    from maplab_py.algorithms.loop_closure.record import drop_record
+    """Delete the record of loop closures; landmarks, edges and poses stay as they are."""
+    from maplab_py.algorithms.loop_closure.closure_record import drop_record
 
     context.commit(drop_record(context.vi_map))
-    return Message("the record of loop closures is empty")
+    return Message("deleted the record of loop closures")
 
 
 @command(
@@ -223,7 +253,9 @@ def relax(
     lc_relax_merge_landmarks: bool = False,
     map_mission_list: str = "",
 ) -> RelaxReport:
-    """Find loop closures and bend the trajectories until they fit; edges of the map count too.
+    """Find loop closures and relax the pose graph over them and over the map's loop closure edges.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
 
     Args:
         lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.
@@ -242,7 +274,9 @@ def relax_missions_independently(
     lc_relax_merge_landmarks: bool = False,
     map_mission_list: str = "",
 ) -> RelaxMissionsReport:
-    """Relax every mission over its own loop closures only.
+    """Relax every mission over its internal loop closures only.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
 
     Args:
         lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.
@@ -268,7 +302,7 @@ def _close(
     *,
     as_edges: bool,
 ) -> LoopClosureReport:
-    from maplab_py.algorithms.loop_closure.closing import close_loops, insert_edges
+    from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
 
     run = insert_edges if as_edges else close_loops
     result, report = run(context.vi_map, options, missions=missions, progress=context.progress)
@@ -284,10 +318,10 @@ def _relax(
     *,
     merge: bool,
 ) -> RelaxReport:
-    from maplab_py.algorithms.loop_closure.closing import close_loops
+    from maplab_py.algorithms.loop_closure.workflow import close_loops
     from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 
-    result, found, relaxed = relax_over_loops(
+    result, search_report, relaxed = relax_over_loops(
         context.vi_map, options, loop_options, missions=missions, progress=context.progress
     )
     merging = None
@@ -296,4 +330,4 @@ def _relax(
             result, loop_options, missions=missions, progress=context.progress
         )
     context.commit(result)
-    return RelaxReport(found, relaxed, merging)
+    return RelaxReport(search_report, relaxed, merging)

@@ -1,12 +1,14 @@
-"""Commands that thin out a map."""
+"""Commands that sparsify a map."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.algorithms.keyframing.options import KeyframingOptions, KeyframingReport
-from maplab_py.algorithms.sparsification.options import SparsificationOptions, SparsificationReport
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.keyframing.reports import KeyframingReport
+from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.reports import SparsificationReport
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 _KEYFRAMING = KeyframingOptions()
 _SPARSIFICATION = SparsificationOptions()
@@ -17,25 +19,14 @@ def keyframe_heuristic(
     context: CommandContext,
     *,
     options: KeyframingOptions = _KEYFRAMING,
-    map_mission: str = "",
-    map_mission_list: str = "",
-    dry_run: bool = False,
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> KeyframingReport:
-    """Keep keyframes and remove the vertices between them; IMU and odometry edges are joined.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-        dry_run: Only report what would go; the map stays as it is.
-    """
+    """Keep keyframes and remove the vertices between them; IMU and odometry edges are joined."""
     from maplab_py.algorithms.keyframing.heuristic import keyframe
 
-    missions = context.mission_rows(map_mission, map_mission_list)
-    result, report = keyframe(
-        context.vi_map, options, missions=missions, progress=context.progress, dry_run=dry_run
-    )
-    if not dry_run:
-        context.commit(result)
+    missions = chosen.rows(context.vi_map)
+    result, report = keyframe(context.vi_map, options, missions=missions, progress=context.progress)
+    context.commit(result)
     return report
 
 
@@ -52,22 +43,22 @@ def landmark_sparsify(
     options: SparsificationOptions = _SPARSIFICATION,
     coverage_csv: Path | None = None,
     overwrite: bool = False,
-    dry_run: bool = False,
 ) -> SparsificationReport:
     """Keep the landmarks that localisation needs most and remove all others.
 
     Args:
-        num_landmarks_to_keep: How many good landmarks stay; bad ones go in any case.
+        num_landmarks_to_keep: Number of good landmarks to keep; bad landmarks are always removed.
         coverage_csv: File that gets the landmarks every keyframe sees before and after.
         overwrite: Replace the file if it exists.
-        dry_run: Only report what would go; the map stays as it is.
     """
     from maplab_py.algorithms.sparsification.sparsify import sparsify
     from maplab_py.output_files import check_writable, write_text
     from maplab_py.vimap.ids import to_hex_list
 
     if num_landmarks_to_keep <= 0:
-        raise UserError("say how many landmarks shall stay: --num_landmarks_to_keep=N, N > 0")
+        raise UserError(
+            "the number of landmarks to keep is missing: give --num_landmarks_to_keep=N, N > 0"
+        )
     if coverage_csv is not None:
         check_writable(coverage_csv, overwrite=overwrite)
     result, report, coverage = sparsify(
@@ -79,6 +70,5 @@ def landmark_sparsify(
         rows = zip(names, *(column.tolist() for column in columns), strict=True)
         lines = [",".join(map(str, row)) + "\n" for row in rows]
         write_text(coverage_csv, ["vertex,before,after,wanted\n", *lines], overwrite=overwrite)
-    if not dry_run:
-        context.commit(result)
+    context.commit(result)
     return report

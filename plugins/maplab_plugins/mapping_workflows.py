@@ -13,7 +13,7 @@ from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.plugin import CommandContext, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.summary.workflow import WorkflowReport
+    from maplab_py.algorithms.summary.reports import WorkflowReport
 
 _KEYFRAMING = KeyframingOptions()
 _LOOPS = LoopClosureOptions()
@@ -39,13 +39,15 @@ def create_localization_summary_map(
     summary_map_save_path: Path | None = None,
     overwrite: bool = False,
 ) -> WorkflowReport:
-    """Make a localisation map of raw sessions: tracks, keyframes, optimisation, anchors, loops.
+    """Create a localisation map from raw sessions: tracks, keyframes, optimisation, anchors, loops.
+
+    Places are recognised by binary descriptors; keypoints with others are left out.
 
     Runs itl, rtl, kfh, elq with two observers, optvi, aam when there are several missions, relax,
     lc, optvi and elq, then lsparsify and summary_map if asked to.
 
     Args:
-        num_landmarks_to_keep: Sparsify to so many landmarks at the end; 0 = keep all.
+        num_landmarks_to_keep: Number of landmarks to keep at the end; 0 = all.
         summary_map_save_path: Folder that gets the summary map; empty = write none.
         overwrite: Replace the summary map if it exists.
     """

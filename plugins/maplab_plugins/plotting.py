@@ -37,9 +37,9 @@ def plot_trajectory(
     """Draw the missions from above, with their landmarks.
 
     Args:
-        plot_file: File to write; its suffix says which kind.
-        plot_landmarks: Draw the landmarks too, those judged bad apart.
-        ground_truth: Draw this trajectory too (TUM, EuRoC or CSV), laid on the vertices.
+        plot_file: File to write; the suffix gives the format.
+        plot_landmarks: Draw the landmarks too, bad landmarks in another colour.
+        ground_truth: Draw this trajectory too (TUM, EuRoC or CSV), aligned with the vertices.
         map_mission_list: Missions to draw, separated by commas; empty = all.
         overwrite: Replace the file if it exists.
     """
@@ -77,7 +77,7 @@ def plot_errors(
 
     Args:
         ground_truth: TUM, EuRoC or CSV file with stamped poses.
-        plot_file: File to write; its suffix says which kind.
+        plot_file: File to write; the suffix gives the format.
         map_mission_list: Missions to draw, separated by commas; empty = all.
         overwrite: Replace the file if it exists.
     """
@@ -103,10 +103,10 @@ def plot_landmarks(
     map_mission_list: str = "",
     overwrite: bool = False,
 ) -> Plot:
-    """Draw how often landmarks are observed, how far they are, and how they were judged.
+    """Draw observation counts, distances and quality of the landmarks.
 
     Args:
-        plot_file: File to write; its suffix says which kind.
+        plot_file: File to write; the suffix gives the format.
         map_mission_list: Missions whose landmarks count, separated by commas; empty = all.
         overwrite: Replace the file if it exists.
     """
@@ -133,7 +133,7 @@ def plot_coobservability(
     """Draw how many landmarks each pair of missions shares.
 
     Args:
-        plot_file: File to write; its suffix says which kind.
+        plot_file: File to write; the suffix gives the format.
         overwrite: Replace the file if it exists.
     """
     from maplab_py.plotting import figure, maps
@@ -159,8 +159,8 @@ def plot_vi_states_of_mission(
     """Draw position, velocity and biases of a mission over time.
 
     Args:
-        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
-        plot_file: File to write; its suffix says which kind.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        plot_file: File to write; the suffix gives the format.
         overwrite: Replace the file if it exists.
     """
     from maplab_py.plotting import figure, time_series

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.plugin import CommandContext, Message, UserError, command
+from maplab_py.report import counted
 
 _RELAXATION = RelaxationOptions()
 
@@ -23,7 +24,7 @@ def relax_external(
     relax_external_loop_closures_file: Path | None = None,
     map_mission_list: str = "",
 ) -> RelaxationReport:
-    """Bend the trajectories until loop closures from a file fit; edges of the map count too.
+    """Relax the trajectories over loop closures from a file and the edges of the map.
 
     Args:
         relax_external_loop_closures_file: YAML list of loop closures as maplab reads it: times and
@@ -34,7 +35,7 @@ def relax_external(
     from maplab_py.interop.external_closures import read_external_closures
 
     if relax_external_loop_closures_file is None:
-        raise UserError("which closures? give --relax_external_loop_closures_file=FILE.yaml")
+        raise UserError("no loop closures: give --relax_external_loop_closures_file=FILE.yaml")
     edges, notes = read_external_closures(context.vi_map, relax_external_loop_closures_file)
     result, report = relax(
         context.vi_map,
@@ -52,19 +53,28 @@ def import_g2o(context: CommandContext, file: Path, *, map_key: str = "") -> Mes
     """Make a map of a pose graph: odometry along each robot, every other edge a loop closure.
 
     Args:
-        file: Text file in g2o's format, with SE(3) or planar poses and edges.
+        file: Text file in g2o's format, with SE(3) or planar poses and edges, compressed with gzip or
+            not. A file of edges alone starts from the poses along the odometry.
         map_key: Name of the map in memory; by default the file's name.
     """
-    from maplab_py.algorithms.relaxation.graph import map_of_graph
+    from maplab_py.algorithms.relaxation.graph_files import map_of_graph
     from maplab_py.interop.g2o import read_g2o
 
-    vi_map = map_of_graph(read_g2o(file))
-    key = map_key or file.stem
+    graph = read_g2o(file)
+    vi_map = map_of_graph(graph)
+    key = map_key or Path(file.name.removesuffix(".gz")).stem
+    repaired = ""
+    if graph.num_repaired:
+        edges = counted(graph.num_repaired, "edge")
+        repaired = (
+            f"; {edges} without a positive definite information: raised its smallest eigenvalues"
+        )
     context.maps.add(key, vi_map)
     return Message(
-        f"map '{key}': {len(vi_map.missions)} missions, {len(vi_map.vertices)} vertices, "
-        f"{len(vi_map.transformation_edges)} odometry and {len(vi_map.loop_closure_edges)} loop "
-        "closure edges"
+        f"map '{key}': {counted(len(vi_map.missions), 'mission')}, "
+        f"{counted(len(vi_map.vertices), 'vertex', 'vertices')}, "
+        f"{counted(len(vi_map.transformation_edges), 'odometry edge')}, "
+        f"{counted(len(vi_map.loop_closure_edges), 'loop closure edge')}{repaired}"
     )
 
 
@@ -87,9 +97,11 @@ def export_g2o(
         file: Text file to write.
         overwrite: Replace the file if it exists.
     """
-    from maplab_py.algorithms.relaxation.graph import graph_of_map
+    from maplab_py.algorithms.relaxation.graph_files import graph_of_map
     from maplab_py.interop.g2o import write_g2o
 
     graph = graph_of_map(context.vi_map, options)
     write_g2o(graph, file, overwrite=overwrite)
-    return Message(f"{file}: {len(graph.id)} poses and {len(graph.first)} edges")
+    return Message(
+        f"wrote {counted(len(graph.id), 'pose')} and {counted(len(graph.first), 'edge')} to {file}"
+    )

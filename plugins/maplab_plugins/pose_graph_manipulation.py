@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from maplab_py.algorithms.pose_graph.disturbance import DisturbanceOptions, DisturbanceReport
-from maplab_py.algorithms.pose_graph.edges import EdgeType
-from maplab_py.plugin import CommandContext, Message, command
+from maplab_py.algorithms.pose_graph_manipulation.disturbance import (
+    DisturbanceOptions,
+    DisturbanceReport,
+)
+from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, Message, MissionChoice, command
+from maplab_py.report import counted
 
 _DISTURBANCE = DisturbanceOptions()
 
@@ -30,7 +34,7 @@ def assign_edge_uncertainties(
         orientation_std_dev_degrees: Standard deviation of the orientation about each axis in
             degrees.
     """
-    from maplab_py.algorithms.pose_graph.edges import assign_covariance
+    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_covariance
 
     result, count = assign_covariance(
         context.vi_map,
@@ -39,7 +43,7 @@ def assign_edge_uncertainties(
         orientation_sigma_deg=orientation_std_dev_degrees,
     )
     context.commit(result)
-    return Message(f"{count} {edge_type.value} edges have the new covariance")
+    return Message(f"set the covariance of {counted(count, f'{edge_type.value} edge')}")
 
 
 @command(
@@ -54,13 +58,15 @@ def assign_switch_variable_values(
     """Set the switch variable of all loop closure edges.
 
     Args:
-        lc_switch_variable_value: Value between 0 (the edge is off) and 1 (it is trusted).
+        lc_switch_variable_value: Value between 0 (the edge has no effect) and 1 (full effect).
     """
-    from maplab_py.algorithms.pose_graph.edges import assign_switch_variables
+    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_switch_variables
 
     result, count = assign_switch_variables(context.vi_map, value=lc_switch_variable_value)
     context.commit(result)
-    return Message(f"{count} loop closure edges have switch variable {lc_switch_variable_value:g}")
+    return Message(
+        f"set the switch variable of {counted(count, 'loop closure edge')} to {lc_switch_variable_value:g}"
+    )
 
 
 @command(
@@ -72,16 +78,18 @@ def assign_switch_variable_values(
 def assign_switch_variable_uncertainties(
     context: CommandContext, *, lc_switch_variable_variance: float = 1e-8
 ) -> Message:
-    """Set the variance of the prior that holds the switch variables of loop closure edges.
+    """Set the variance of the prior on the switch variables of loop closure edges.
 
     Args:
-        lc_switch_variable_variance: The variance.
+        lc_switch_variable_variance: Variance of the prior.
     """
-    from maplab_py.algorithms.pose_graph.edges import assign_switch_variables
+    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_switch_variables
 
     result, count = assign_switch_variables(context.vi_map, variance=lc_switch_variable_variance)
     context.commit(result)
-    return Message(f"{count} loop closure edges have variance {lc_switch_variable_variance:g}")
+    return Message(
+        f"set the switch variance of {counted(count, 'loop closure edge')} to {lc_switch_variable_variance:g}"
+    )
 
 
 @command("artificially_disturb_vertices", example="artificially_disturb_vertices")
@@ -89,18 +97,12 @@ def artificially_disturb_vertices(
     context: CommandContext,
     *,
     options: DisturbanceOptions = _DISTURBANCE,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
 ) -> DisturbanceReport:
-    """Let all vertices drift by a random walk, to see what mends them again.
+    """Disturb all vertices by a random walk, to test what corrects it."""
+    from maplab_py.algorithms.pose_graph_manipulation.disturbance import disturb_vertices
 
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
-    from maplab_py.algorithms.pose_graph.disturbance import disturb_vertices
-
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     result, report = disturb_vertices(context.vi_map, options, missions=missions)
     context.commit(result)
     return report

@@ -1,4 +1,4 @@
-"""Commands that calibrate a device from its own maps, on their most informative pieces."""
+"""Commands that calibrate a device from informative segments of its own maps."""
 
 from __future__ import annotations
 
@@ -6,39 +6,34 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from maplab_py.algorithms.self_calibration.database_reports import (
-    DatabaseParameter,
-    DatabaseReport,
-    DatabaseTable,
-    PrunedSegment,
-    PruneReport,
-)
-from maplab_py.algorithms.self_calibration.limits import checked
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import (
-    CalibrationComparison,
-    CollectionReport,
-    InformationReport,
-    SelfCalibrationReport,
-)
+from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import (
+    ALL_MISSIONS,
     CommandContext,
     Message,
+    MissionChoice,
     Report,
     UserError,
     check_writable,
     command,
     write_text,
 )
+from maplab_py.report import counted
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from maplab_py.algorithms.self_calibration.database import SegmentDatabase
-    from maplab_py.sensors import SensorSet
+    from maplab_py.algorithms.self_calibration.reports import (
+        CalibrationComparison,
+        CollectionReport,
+        DatabaseReport,
+        InformationReport,
+        PruneReport,
+        SelfCalibrationReport,
+    )
+    from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 
 _OPTIONS = SelfCalibrationOptions()
+_SIZE = SizeOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +48,7 @@ class ExportedFiles(Report):
     "self-calibrate",
     example="self_calibrate --database=device.segments --dry_run",
     see_also=("collect_segments", "apply_calibration", "optimize_visual_inertial"),
+    writes_files=True,
 )
 def self_calibrate(
     context: CommandContext,
@@ -63,105 +59,91 @@ def self_calibrate(
     joint_ekf: bool = False,
     max_camera_shift_m: float = 0.025,
     parts: int = 0,
-    dry_run: bool = False,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
+    size: SizeOptions = _SIZE,
 ) -> SelfCalibrationReport:
     """Calibrate cameras and IMU on the most informative segments of the map and of a database.
 
     Args:
-        database: Segment database: segments of earlier sessions take part, the map's are added.
+        database: Segment database: its segments are used too, and the map's are added to it.
         batch: Use all data of the missions instead of segments.
-        joint_ekf: For comparison: estimate IMU and mounting by a Kalman filter that runs along the
-            missions; camera intrinsics are held.
-        max_camera_shift_m: When the data would move a camera on the IMU farther than this, its
-            position is kept and the rest calibrated again; 0 = believe the data.
-        parts: Calibrate on so many parts of the data too; deviations are then at least what the
-            spread of the results says, and errors of the model show. 0 = formal deviations.
-        dry_run: Only report; neither the map nor the database changes.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
+        joint_ekf: For comparison: estimate IMU and camera poses on the IMU by a Kalman filter along
+            the missions; camera intrinsics are fixed.
+        max_camera_shift_m: If the data would move a camera on the IMU farther than this, keep its
+            position and calibrate the rest again; 0 = no limit.
+        parts: Calibrate on so many parts of the data too; reported deviations are then at least the
+            spread of the results, which contains errors of the models. 0 = none.
     """
-    from maplab_py.algorithms.self_calibration.database_file import save_database
-    from maplab_py.algorithms.self_calibration.plausibility import calibrate_plausibly
-
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     if (batch or joint_ekf) and database is not None:
-        raise UserError("--database goes with segments, neither with --batch nor with --joint_ekf")
+        raise UserError(
+            "--database needs segments: it cannot be combined with --batch or --joint_ekf"
+        )
     if batch and joint_ekf:
-        raise UserError("choose one of --batch and --joint_ekf")
+        raise UserError("--batch and --joint_ekf cannot be combined")
     if not max_camera_shift_m >= 0.0:
-        raise UserError(f"--max_camera_shift_m={max_camera_shift_m:g}: wants 0 or more")
+        raise UserError(f"--max_camera_shift_m={max_camera_shift_m:g}: must be 0 or more")
     if joint_ekf:
-        return _filter(context, checked(options), missions, dry_run=dry_run)
-    sensors, collected, report = calibrate_plausibly(
+        from maplab_py.research.joint_ekf import filter_jointly
+
+        filtered = filter_jointly(
+            context.vi_map, options.checked(), missions=missions, progress=context.progress
+        )
+        context.commit(context.vi_map.replace(sensors=filtered.sensors))
+        return filtered.report()
+
+    from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
+    from maplab_py.algorithms.self_calibration.segments.file import save_database
+    from maplab_py.research.information_gain import select_by_gain
+
+    sensors, collected, report = calibrate_with_checks(
         context.vi_map,
-        checked(options),
+        options.checked(),
         max_camera_shift_m=max_camera_shift_m,
         parts=parts,
-        database=_existing(database),
+        database=_existing(database, size),
         missions=missions,
         batch=batch,
+        selector=select_by_gain if options.selection == "information_gain" else None,
         progress=context.progress,
     )
-    if not dry_run:
-        context.commit(context.vi_map.replace(sensors=sensors))
-        if database is not None and collected is not None:
-            save_database(collected, database)
+    context.progress.check()
+    context.commit(context.vi_map.replace(sensors=sensors))
+    if database is not None and collected is not None:
+        save_database(collected, database)
     return report
-
-
-def _filter(
-    context: CommandContext,
-    options: SelfCalibrationOptions,
-    missions: NDArray[np.int64] | None,
-    *,
-    dry_run: bool,
-) -> SelfCalibrationReport:
-    from maplab_py.algorithms.self_calibration.ekf_report import report_of
-    from maplab_py.algorithms.self_calibration.joint_ekf import filter_jointly
-
-    result = filter_jointly(context.vi_map, options, missions=missions, progress=context.progress)
-    if not dry_run:
-        context.commit(context.vi_map.replace(sensors=result.sensors))
-    return report_of(result)
 
 
 @command(
     "collect_segments",
     example="collect_segments --database=device.segments",
     see_also=("segment_database_stats", "self_calibrate"),
-    acts_outside=True,
+    writes_files=True,
 )
 def collect_segments(
     context: CommandContext,
     *,
     database: Path,
     options: SelfCalibrationOptions = _OPTIONS,
-    dry_run: bool = False,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
+    size: SizeOptions = _SIZE,
 ) -> CollectionReport:
-    """Add the map's most informative segments to a database file, which is made when it is missing.
+    """Add the most informative segments of the map to a database file; it is created if missing.
 
     Args:
         database: Segment database.
-        dry_run: Only report; the database stays as it is.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
     """
-    from maplab_py.algorithms.self_calibration.collection import collect
-    from maplab_py.algorithms.self_calibration.database_file import save_database
+    from maplab_py.algorithms.self_calibration.segments.file import save_database
+    from maplab_py.algorithms.self_calibration.segments.selection import collect
 
     collected, report = collect(
         context.vi_map,
-        checked(options),
-        _existing(database),
-        missions=context.mission_rows(map_mission, map_mission_list),
+        options.checked(),
+        _existing(database, size),
+        missions=chosen.rows(context.vi_map),
         progress=context.progress,
     )
-    if not dry_run:
-        save_database(collected, database)
+    save_database(collected, database)
     return report
 
 
@@ -170,41 +152,21 @@ def collect_segments(
     example="segment_database_stats --database=device.segments",
     needs_map=False,
 )
-def segment_database_stats(context: CommandContext, *, database: Path) -> DatabaseReport:  # noqa: ARG001
-    """Show what a segment database holds: tables, scores, parameters, segments.
+def segment_database_stats(
+    context: CommandContext,  # noqa: ARG001
+    *,
+    database: Path,
+    size: SizeOptions = _SIZE,
+) -> DatabaseReport:
+    """Show tables, scores, parameters and segments of a segment database.
 
     Args:
         database: Segment database.
     """
-    import numpy as np
+    from maplab_py.algorithms.self_calibration.segments.file import load_database
+    from maplab_py.algorithms.self_calibration.segments.selection import describe_database
 
-    from maplab_py.algorithms.self_calibration.collection import kept_segments
-    from maplab_py.algorithms.self_calibration.database_file import load_database
-
-    found = load_database(database)
-    tables = []
-    for name in found.tables:
-        scores = [one.scores[name] for one in found.ranked(name)] or [float("nan")]
-        tables.append(DatabaseTable(name, len(found.ranked(name)), min(scores), max(scores)))
-    sigma = np.array([one.sigma for one in found.records]).reshape(len(found), -1)
-    best = sigma.min(axis=0) if len(found) else np.full(len(found.parameter_names), np.nan)
-    parameters = tuple(
-        DatabaseParameter(name, float(usual), float(least))
-        for name, usual, least in zip(found.parameter_names, found.sigma_ref, best, strict=True)
-    )
-    return DatabaseReport(
-        file=database,
-        metric=found.metric,
-        selection=found.selection,
-        capacity=found.capacity,
-        sessions=len(found.vi_map.missions),
-        keyframes=len(found.vi_map.vertices),
-        landmarks=len(found.vi_map.landmarks),
-        imu_samples=len(found.vi_map.imu_samples),
-        tables=tuple(tables),
-        parameters=parameters,
-        segments=kept_segments(found),
-    )
+    return describe_database(load_database(database, size.max_bytes), database)
 
 
 @command(
@@ -212,7 +174,7 @@ def segment_database_stats(context: CommandContext, *, database: Path) -> Databa
     example="prune_segments --database=device.segments --outdated --dry_run",
     needs_map=False,
     see_also=("segment_database_stats",),
-    acts_outside=True,
+    writes_files=True,
 )
 def prune_segments(
     context: CommandContext,
@@ -224,60 +186,42 @@ def prune_segments(
     outdated: bool = False,
     calibration: Path | None = None,
     probability: float = 0.999,
-    dry_run: bool = False,
+    size: SizeOptions = _SIZE,
 ) -> PruneReport:
-    """Remove segments: beyond a capacity, of some missions, or that no longer fit the calibration.
+    """Remove segments: beyond a capacity, of some missions, or that contradict the calibration.
 
     Args:
         database: Segment database.
-        segments_per_group: Keep so many per group; 0 = as many as it has.
+        segments_per_group: Number of segments to keep per group; 0 = all.
         missions: Remove the segments of missions whose ids begin so, separated by commas.
         outdated: Remove segments whose measurements contradict the calibration.
-        calibration: Test against this sensors.yaml or map folder; empty = against the calibration
-            that all segments make together.
-        probability: Of calling a segment good that is.
-        dry_run: Only report; the database stays as it is.
+        calibration: Test against this sensors.yaml or map folder; empty = against the joint
+            calibration of all segments.
+        probability: Of accepting a segment if the calibration is right.
     """
-    from maplab_py.algorithms.self_calibration.database_file import load_database, save_database
-    from maplab_py.algorithms.self_calibration.outdated import fits, fits_together
+    from maplab_py.algorithms.self_calibration.pruning import prune
+    from maplab_py.algorithms.self_calibration.segments.file import (
+        load_database,
+        read_calibration,
+        save_database,
+    )
 
     if not 0.0 < probability < 1.0:
-        raise UserError(f"--probability={probability:g}: wants a number between 0 and 1")
-    before = load_database(database)
-    result, tested = before, []
-    prefixes = tuple(filter(None, (part.strip() for part in missions.split(","))))
-    if prefixes:
-        gone = {one.mission for one in before.records if one.mission.startswith(prefixes)}
-        if not gone:
-            raise UserError(f"--missions: the database has no segment of {missions}")
-        result = result.without_missions(gone)
-    if outdated:
-        if calibration is None:
-            tested = fits_together(result, checked(options), probability, context.progress)
-        else:
-            now = _sensors_of(calibration)
-            tested = fits(result, now, checked(options), probability, context.progress)
-        bad = {one.first_vertex for one in tested if one.is_outdated}
-        result = result.without({r.key for r in result.records if r.first_vertex in bad})
-    if segments_per_group:
-        result = result.pruned(segments_per_group)
-    if not dry_run:
-        save_database(result, database)
-    return PruneReport(
-        len(before),
-        len(result),
-        tuple(
-            PrunedSegment(
-                one.mission,
-                one.first_vertex[:8],
-                one.distance,
-                one.limit,
-                one.chi_square_per_freedom,
-                one.is_outdated,
-            )
-            for one in tested
-        ),
+        raise UserError(f"--probability={probability:g}: must be between 0 and 1")
+    result, report = prune(
+        load_database(database, size.max_bytes),
+        options.checked(),
+        missions=[part.strip() for part in missions.split(",") if part.strip()],
+        outdated=outdated,
+        calibration=read_calibration(calibration, size.max_bytes)
+        if outdated and calibration
+        else None,
+        probability=probability,
+        capacity=segments_per_group,
+        progress=context.progress,
     )
+    save_database(result, database)
+    return report
 
 
 @command(
@@ -285,23 +229,30 @@ def prune_segments(
     example="export_segments --database=device.segments --map_folder=segments",
     needs_map=False,
     acts_outside=True,
+    guards_effects=True,
 )
 def export_segments(
-    context: CommandContext, *, database: Path, map_folder: Path, overwrite: bool = False
+    context: CommandContext,
+    *,
+    database: Path,
+    map_folder: Path,
+    overwrite: bool = False,
+    size: SizeOptions = _SIZE,
 ) -> Message:
     """Write the segments of a database as a map that can be loaded, looked at and optimised.
 
     Args:
         database: Segment database.
-        map_folder: Where to.
+        map_folder: Destination folder.
         overwrite: Replace a map that is there.
     """
-    from maplab_py.algorithms.self_calibration.database_file import load_database
+    from maplab_py.algorithms.self_calibration.segments.file import load_database
     from maplab_py.storage.native import save_map
 
-    found = load_database(database)
-    save_map(found.vi_map, map_folder, overwrite=overwrite, progress=context.progress)
-    return Message(f"{len(found)} segments of {len(found.vi_map.missions)} missions: {map_folder}")
+    segments = load_database(database, size.max_bytes)
+    save_map(segments.vi_map, map_folder, overwrite=overwrite, progress=context.progress)
+    missions = counted(len(segments.vi_map.missions), "mission")
+    return Message(f"wrote {counted(len(segments), 'segment')} of {missions} to {map_folder}")
 
 
 @command(
@@ -317,44 +268,37 @@ def evaluate_segment_information(
     group: Literal["imu", "camera", "extrinsics"] = "imu",
     plot: Path | None = None,
     csv: Path | None = None,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
 ) -> InformationReport:
-    """Say how informative every segment is for each group of parameters; less is more.
+    """Show the information of every segment for each group of parameters; smaller is better.
 
     Args:
         group: Group that the plot and the file show.
         plot: Write the trajectory from above, coloured by information, to this SVG file.
         csv: Write segments with their information to this file, which the viewer reads.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
         overwrite: Replace files that exist.
     """
-    import numpy as np
-
-    from maplab_py.algorithms.self_calibration import drawing, workflow
+    from maplab_py.algorithms.self_calibration import drawing
+    from maplab_py.algorithms.self_calibration.segments.selection import segment_information
 
     for file in (plot, csv):
         if file is not None:
             check_writable(file, overwrite=overwrite)
-    report, segments = workflow.segment_information(
+    report, segments = segment_information(
         context.vi_map,
-        checked(options),
-        missions=context.mission_rows(map_mission, map_mission_list),
+        options.checked(),
+        missions=chosen.rows(context.vi_map),
         progress=context.progress,
     )
-    values = np.array([getattr(one, group) for one in report.segments])
+    scores = [float(getattr(segment, group)) for segment in report.segments]
     if plot is not None:
         title = f"information about {group} ({options.metric.replace('_', '-')})"
-        write_text(
-            plot, [drawing.draw(context.vi_map, segments, values, title)], overwrite=overwrite
-        )
+        picture = drawing.draw(context.vi_map, segments, scores, title)
+        write_text(plot, [picture], overwrite=overwrite)
     if csv is not None:
-        rows = [
-            (one.mission, one.start_ns, one.end_ns, getattr(one, group)) for one in report.segments
-        ]
-        write_text(csv, [drawing.as_csv(rows)], overwrite=overwrite)
+        rows = [(segment.mission, segment.start_ns, segment.end_ns) for segment in report.segments]
+        write_text(csv, [drawing.as_csv(rows, scores)], overwrite=overwrite)
     return report
 
 
@@ -367,24 +311,26 @@ def apply_calibration(
     context: CommandContext,
     *,
     calibration: Path,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
+    size: SizeOptions = _SIZE,
 ) -> CalibrationComparison:
-    """Give the map's device the calibration of a sensors.yaml or of another map; poses stay.
+    """Apply the calibration of a sensors.yaml or of another map to the device; poses are unchanged.
 
     Args:
         calibration: sensors.yaml, map folder, or segment database.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
     """
-    from maplab_py.algorithms.self_calibration import comparison, database, workflow
+    from maplab_py.algorithms.self_calibration.comparison import compare
+    from maplab_py.algorithms.self_calibration.device import device_of, transfer_calibration
+    from maplab_py.algorithms.self_calibration.segments.file import read_calibration
 
-    missions = context.mission_rows(map_mission, map_mission_list)
+    missions = chosen.rows(context.vi_map)
     before = context.vi_map
-    after = workflow.applied(before, _sensors_of(calibration), missions=missions)
+    after = transfer_calibration(
+        before, read_calibration(calibration, size.max_bytes), missions=missions
+    )
     context.commit(after)
-    ids = database.device_of(before, missions)
-    return comparison.compare(before.sensors, ids, after.sensors, ids)
+    device = device_of(before, missions)
+    return compare(before.sensors, device, after.sensors, device)
 
 
 @command(
@@ -398,29 +344,22 @@ def export_calibration(
     *,
     folder: Path,
     format: Literal["maplab", "kalibr", "openvins", "basalt"] = "maplab",
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
 ) -> ExportedFiles:
     """Write the calibration of the map's device for maplab, kalibr, OpenVINS or Basalt.
 
     Args:
-        folder: Where to; made when it is missing.
-        format: Whose format.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
+        folder: Destination folder; created if missing.
+        format: File format.
         overwrite: Replace files that exist.
     """
-    import numpy as np
-
-    from maplab_py.algorithms.self_calibration import database, export
+    from maplab_py.algorithms.self_calibration.device import device_of, imu_rate_hz
+    from maplab_py.interop.calibration_export import exported
 
     vi_map = context.vi_map
-    ids = database.device_of(vi_map, context.mission_rows(map_mission, map_mission_list))
-    steps = np.diff(vi_map.imu_samples.timestamp_ns)
-    steps = steps[(steps > 0) & (steps < 1e9)]
-    rate = round(1e9 / float(np.median(steps)), 3) if len(steps) else 200.0
-    contents = export.exported(vi_map.sensors, *ids, format, imu_rate_hz=rate)
+    device = device_of(vi_map, chosen.rows(context.vi_map))
+    contents = exported(vi_map.sensors, *device, format, imu_rate_hz=imu_rate_hz(vi_map))
     for name in contents:
         check_writable(folder / name, overwrite=overwrite)
     for name, text in contents.items():
@@ -437,41 +376,27 @@ def compare_calibrations(
     context: CommandContext,
     *,
     calibration: Path,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
+    size: SizeOptions = _SIZE,
 ) -> CalibrationComparison:
     """Compare the calibration of the map's device with another, parameter by parameter.
 
     Args:
         calibration: sensors.yaml, map folder, or segment database.
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
     """
-    from maplab_py.algorithms.self_calibration import comparison, database, workflow
+    from maplab_py.algorithms.self_calibration.comparison import compare
+    from maplab_py.algorithms.self_calibration.device import device_of
+    from maplab_py.algorithms.self_calibration.segments.file import read_calibration
+    from maplab_py.sensors.calibration_transfer import corresponding_device
 
-    vi_map, other = context.vi_map, _sensors_of(calibration)
-    ids = database.device_of(vi_map, context.mission_rows(map_mission, map_mission_list))
-    known = all(sensor_id in other.sensors for sensor_id in ids)
-    other_ids = ids if known else workflow.only_device(other)
-    return comparison.compare(vi_map.sensors, ids, other, other_ids)
-
-
-def _existing(path: Path | None) -> SegmentDatabase | None:
-    from maplab_py.algorithms.self_calibration.database_file import load_database
-
-    return load_database(path) if path is not None and path.exists() else None
+    sensors, other = context.vi_map.sensors, read_calibration(calibration, size.max_bytes)
+    device = device_of(context.vi_map, chosen.rows(context.vi_map))
+    return compare(sensors, device, other, corresponding_device(other, device))
 
 
-def _sensors_of(path: Path) -> SensorSet:
-    """Read the sensors of a sensors.yaml, a map folder or a segment database."""
-    from maplab_py.algorithms.self_calibration.database_file import load_database
-    from maplab_py.sensors.sensors_yaml import read_sensors
+def _existing(path: Path | None, size: SizeOptions) -> SegmentDatabase | None:
+    from maplab_py.algorithms.self_calibration.segments.file import load_database
 
-    for file in (path / "vi_map" / "sensors.yaml", path / "sensors.yaml"):
-        if path.is_dir() and file.is_file():
-            return read_sensors(file)
-    if path.is_file() and path.suffix not in (".yaml", ".yml"):
-        return load_database(path).vi_map.sensors
-    if not path.is_file():
-        raise UserError(f"{path}: there is no such calibration (sensors.yaml or map folder)")
-    return read_sensors(path)
+    if path is None or not path.exists():
+        return None
+    return load_database(path, size.max_bytes)

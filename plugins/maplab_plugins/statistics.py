@@ -1,4 +1,4 @@
-"""What the selected map consists of: distributions and bytes."""
+"""Distributions and size of the selected map."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.plugin import CommandContext, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.statistics.distributions import MapStatistics
+    from maplab_py.algorithms.statistics.distributions import MapDistributions
     from maplab_py.algorithms.statistics.size import MapSize
 
 _KEYFRAMING = KeyframingOptions()
 
 
 @command("statistics", "stat", example="statistics", see_also=("map_stats", "map_size"))
-def statistics(context: CommandContext) -> MapStatistics:
+def statistics(context: CommandContext) -> MapDistributions:
     """Show how tracks, landmarks, distances and samples of the selected map are distributed."""
     from maplab_py.algorithms.statistics.distributions import map_distributions
 
@@ -28,7 +28,7 @@ def statistics(context: CommandContext) -> MapStatistics:
     see_also=("keyframe_heuristic", "landmark_sparsify", "generate_summary_map_and_save_to_disk"),
 )
 def map_size(context: CommandContext, *, keyframing: KeyframingOptions = _KEYFRAMING) -> MapSize:
-    """Show what the map's bytes are spent on and what each maintenance command would save."""
+    """Show the size of each part of the map and what each maintenance command would save."""
     from maplab_py.algorithms.statistics.size import map_size as measure
 
     return measure(

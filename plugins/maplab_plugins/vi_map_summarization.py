@@ -1,17 +1,16 @@
-"""Summary maps: what localisation needs of a map, in one small file."""
+"""Summary maps: the content of a map that localisation needs, in one small file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.algorithms.summary.options import (
-    SummaryMapContent,
-    SummaryMapOptions,
-    SummaryMapReport,
-)
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.reports import SummaryMapContent, SummaryMapReport
+from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
 
 _SUMMARY = SummaryMapOptions()
+_SIZE = SizeOptions()
 
 
 @command(
@@ -30,6 +29,8 @@ def generate_summary_map_and_save_to_disk(
 ) -> SummaryMapReport:
     """Write the good landmarks of the selected map and their descriptors to a summary map.
 
+    Only binary descriptors are projected; observations with others are left out.
+
     Args:
         summary_map_save_path: Folder that gets the file localization_summary_map.
         overwrite: Replace the file if it exists.
@@ -38,7 +39,7 @@ def generate_summary_map_and_save_to_disk(
     from maplab_py.storage.summary_map import FILE_NAME, summary_map_bytes
 
     if summary_map_save_path is None:
-        raise UserError("no place to write to: give --summary_map_save_path=FOLDER")
+        raise UserError("no destination: give --summary_map_save_path=FOLDER")
     file = summary_map_save_path / FILE_NAME
     check_writable(file, overwrite=overwrite)
     summary = make_summary_map(context.vi_map, options, progress=context.progress)
@@ -60,41 +61,19 @@ def generate_summary_map_and_save_to_disk(
     needs_map=False,
     see_also=("generate_summary_map_and_save_to_disk",),
 )
-def print_summary_map(context: CommandContext, summary_map: Path) -> SummaryMapContent:  # noqa: ARG001
-    """Check a summary map and say what is in it.
+def print_summary_map(
+    context: CommandContext,  # noqa: ARG001
+    summary_map: Path,
+    *,
+    size: SizeOptions = _SIZE,
+) -> SummaryMapContent:
+    """Check a summary map and show its content.
 
     Args:
         summary_map: The file, or the folder that holds it.
     """
-    import numpy as np
-
+    from maplab_py.algorithms.summary.description import describe
     from maplab_py.storage.summary_map import read_summary_map, summary_map_file
 
-    summary = read_summary_map(summary_map)
-    file = summary_map_file(summary_map) or summary_map
-    sigma = None
-    if summary.landmark_covariance is not None and len(summary.p_G):
-        variance = np.trace(summary.landmark_covariance, axis1=1, axis2=2)
-        sigma = float(np.sqrt(np.median(variance)))
-    extent = np.ptp(summary.p_G_observer, axis=0) if len(summary.p_G_observer) else np.zeros(3)
-    return SummaryMapContent(
-        landmarks=len(summary.p_G),
-        observations=len(summary.descriptors),
-        observers=len(summary.p_G_observer),
-        descriptor_dimensions=summary.descriptors.shape[1],
-        has_ids=summary.landmark_id is not None,
-        has_projection=summary.projection is not None,
-        cameras=_camera_count(summary.sensors),
-        median_position_sigma_m=sigma,
-        extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
-        megabytes=file.stat().st_size * 1e-6,
-    )
-
-
-def _camera_count(sensors: object) -> int:
-    from maplab_py.sensors import CameraRig, SensorSet
-
-    if not isinstance(sensors, SensorSet):
-        return 0
-    rigs = [s for s in sensors.sensors.values() if isinstance(s, CameraRig)]
-    return sum(len(rig.cameras) for rig in rigs)
+    summary = read_summary_map(summary_map, max_size_megabytes=size.proto_max_size_megabytes)
+    return describe(summary, summary_map_file(summary_map) or summary_map)

@@ -11,16 +11,17 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from maplab_py.algorithms import warmup
-from maplab_py.algorithms.relaxation import kernels
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.pose_graph import RelativePoses
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
 from maplab_py.algorithms.warmup import CompilationAhead
 from maplab_py.compilation import compiled, is_missing_on_disk
 from maplab_py.errors import Cancelled
-from maplab_py.estimation import relative_pose_kernels
-from maplab_py.estimation.linear import multifrontal
+from maplab_py.estimation.codegen.kernels import pose_graph_kernels
+from maplab_py.estimation.kernels.connected_parts import connected_parts
+from maplab_py.estimation.linear import selected_inverse, supernodal
+from maplab_py.estimation.symbolic.sources import PoseError
+from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, SilentProgress
 from tests.algorithms.relaxation.loops import simulate
@@ -28,15 +29,16 @@ from tests.algorithms.relaxation.loops import simulate
 
 def test_a_relaxation_compiles_nothing_after_the_warmup():
     compile_relaxation()
+    kernels = pose_graph_kernels(PoseError.SPLIT)
     used = (
-        kernels.moved,
+        connected_parts,
+        kernels.normal_equations,
+        kernels.cost,
         kernels.add_tilt,
-        kernels.connected_parts,
-        relative_pose_kernels.normal_equations,
-        relative_pose_kernels.robust_cost,
-        relative_pose_kernels.relative_pose_jacobians,
-        multifrontal.factorise,
-        multifrontal.invert_panels,
+        kernels.linearize,
+        kernels.moved,
+        supernodal.factorise,
+        selected_inverse.invert_panels,
     )
     before = [list(kernel.signatures) for kernel in used]
     assert all(before)
@@ -49,15 +51,16 @@ def test_edges_that_cannot_be_written_to_compile_nothing_again():
     measured = se3.identity(1)
     rows, weight, poses = np.zeros(1, dtype=np.int64), np.eye(6)[None], se3.identity(1)
     errors = RelativePoses(rows, rows, measured.copy(), weight).errors(poses)
-    before = list(relative_pose_kernels.relative_pose_errors.signatures)
+    kernel = pose_graph_kernels(PoseError.SPLIT).linearize
+    before = list(kernel.signatures)
     measured.flags.writeable = False
     assert_array_equal(RelativePoses(rows, rows, measured, weight).errors(poses), errors)
-    assert list(relative_pose_kernels.relative_pose_errors.signatures) == before
+    assert list(kernel.signatures) == before
 
 
 def test_the_disk_knows_what_was_compiled():
     compile_relaxation()
-    assert not is_missing_on_disk(kernels.moved)
+    assert not is_missing_on_disk(connected_parts)
 
     @compiled()
     def never_called(x):  # type: ignore[no-untyped-def]

@@ -1,7 +1,8 @@
 """Speed and memory against peers: `python -m tests.benchmarks [what ...] [--json FILE]`.
 
-visual: bundle adjustment against Ceres. inertial: visual-inertial against GTSAM. tango: optvi on
-the recorded Tango map. start: the first optvi on a machine and in a process. See docs/benchmarks.md.
+visual: bundle adjustment against Ceres. inertial: visual-inertial against GTSAM. sessions: four
+sessions in one room, conjugate gradients against Ceres' ITERATIVE_SCHUR. tango: optvi on the recorded
+Tango map. start: the first optvi on a machine and in a process. See docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _HEADINGS = (
 def main() -> None:
     """Run what is asked for; print tables, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    everything = ("visual", "inertial", "tango", "start")
+    everything = ("visual", "inertial", "sessions", "tango", "start")
     parser.add_argument("what", nargs="*", default=[], metavar="|".join(everything))
     parser.add_argument("--sizes", nargs="+", default=["small", "medium", "large"])
     parser.add_argument("--repeats", type=int, default=3, help="runs, of which the best counts")
@@ -37,6 +38,8 @@ def main() -> None:
     for kind in ("visual", "inertial"):
         if kind in wanted:
             results[kind] = _compare_sizes(kind, arguments.sizes, arguments.repeats)
+    if "sessions" in wanted:
+        results["sessions"] = _compare_sizes("sessions", ["small", "room"], arguments.repeats)
     if "tango" in wanted:
         results["tango"] = _told(measure_tango(arguments.repeats))
     if "start" in wanted:

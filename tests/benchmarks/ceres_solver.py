@@ -21,7 +21,7 @@ _CAMERA = 1
 
 
 def solve_visual(problem: VisualProblem, rule: StoppingRule) -> tuple[Solution, Effort]:
-    """Minimise the reprojection errors by sparse Schur elimination, as COLMAP does.
+    """Minimise the reprojection errors by Schur elimination, sparse as COLMAP does or iterative.
 
     Filling pycolmap's reconstruction does not count as effort: it is the form of the input.
     """
@@ -55,6 +55,10 @@ def _options(rule: StoppingRule) -> Any:
     options.ceres.min_num_residuals_for_cpu_multi_threading = 0
     solver = options.ceres.solver_options
     solver.linear_solver_type = type(solver.linear_solver_type).SPARSE_SCHUR
+    if rule.forcing:
+        solver.linear_solver_type = type(solver.linear_solver_type).ITERATIVE_SCHUR
+        solver.preconditioner_type = type(solver.preconditioner_type).SCHUR_JACOBI
+        solver.eta = rule.forcing
     solver.num_threads = NUM_THREADS
     solver.max_num_iterations = rule.max_iterations
     solver.initial_trust_region_radius = 1.0 / rule.initial_damping

@@ -13,8 +13,14 @@ from collections.abc import Callable
 from typing import Any
 
 from tests.benchmarks.problems import SIZES, make_inertial, make_visual
-from tests.benchmarks.solution import Effort, Solution, StoppingRule
+from tests.benchmarks.sessions import SECONDS, make_sessions
+from tests.benchmarks.solution import SAME_STEPS, Effort, Solution, StoppingRule
 
+_MAKE: dict[str, Callable[[str], Any]] = {
+    "visual": make_visual,
+    "inertial": make_inertial,
+    "sessions": make_sessions,
+}
 Solve = Callable[[Any, StoppingRule], tuple[Solution, Effort]]
 
 
@@ -23,8 +29,8 @@ def solver_of(kind: str, name: str) -> Solve:
     if name == "maplab":
         from tests.benchmarks import maplab_solver
 
-        return maplab_solver.solve_visual if kind == "visual" else maplab_solver.solve_inertial
-    if (kind, name) == ("visual", "ceres"):
+        return maplab_solver.solve_inertial if kind == "inertial" else maplab_solver.solve_visual
+    if kind != "inertial" and name == "ceres":
         from tests.benchmarks.ceres_solver import solve_visual
 
         return solve_visual
@@ -38,19 +44,20 @@ def solver_of(kind: str, name: str) -> Solve:
 def main() -> None:
     """Solve and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=("visual", "inertial"))
+    parser.add_argument("kind", choices=tuple(_MAKE))
     parser.add_argument("solver", choices=("maplab", "ceres", "gtsam"))
-    parser.add_argument("size", choices=tuple(SIZES))
+    parser.add_argument("size", choices=tuple({**SIZES, **SECONDS}))
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    make = make_visual if arguments.kind == "visual" else make_inertial
-    solve, rule = solver_of(arguments.kind, arguments.solver), StoppingRule()
+    make = _MAKE[arguments.kind]
+    solve = solver_of(arguments.kind, arguments.solver)
+    rule = SAME_STEPS if arguments.kind == "sessions" else StoppingRule()
     solve(make("tiny"), rule)  # loads libraries and compiled kernels
     problem = make(arguments.size)
     runs = [solve(problem, rule) for _ in range(arguments.repeats)]
     solution, first = runs[0]
     fastest = min((spent for _, spent in runs), key=lambda spent: spent.user_s + spent.system_s)
-    visual = problem if arguments.kind == "visual" else problem.visual
+    visual = problem.visual if arguments.kind == "inertial" else problem
     result = {
         **dataclasses.asdict(fastest),
         "wall_s": min(spent.wall_s for _, spent in runs),

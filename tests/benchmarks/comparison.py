@@ -6,15 +6,14 @@ import dataclasses
 import json
 import os
 import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 
-from tests.support.data import REPOSITORY
+from tests.support.programs import module_of_tests
 
 NUM_THREADS = 2
-PEER = {"visual": "ceres", "inertial": "gtsam"}
+PEER = {"visual": "ceres", "inertial": "gtsam", "sessions": "ceres"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +64,8 @@ def module_output(command: list[str], **variables: str) -> str:
     for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "TBB_NUM_THREADS"):
         environment[name] = str(NUM_THREADS)
     finished = subprocess.run(
-        [sys.executable, "-m", *command], cwd=REPOSITORY, env=environment, check=False,
-        capture_output=True, text=True, preexec_fn=_use_two_processors,
+        [*module_of_tests(command[0]), *command[1:]], env=environment,
+        check=False, capture_output=True, text=True, preexec_fn=_use_two_processors,
     )  # fmt: skip
     if finished.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{finished.stderr}")

@@ -81,7 +81,7 @@ def _preintegrated(problem: InertialProblem) -> Iterator[Any]:
     GTSAM takes values that are constant during an interval. It is given those that change the
     velocity as both ends do: with turn E between them, (f_0 + E f_1) / 2 in the frame of the first.
     The position then lacks (f_0 - E f_1) / 12 dt^2 in each interval (see
-    `maplab_py.estimation.imu.kernels`); a little more force in the first interval of an edge, and
+    `maplab_py.estimation.kernels.imu`); a little more force in the first interval of an edge, and
     as much less in its last, makes up for the sum.
     """
     import gtsam

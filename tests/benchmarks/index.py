@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule, make_index
+from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule
+from maplab_py.vision.index_engines import make_index
 from maplab_py.vision.multi_index import InvertedMultiIndex
 from tests.support.machine import slowness
 from tests.vision.synthetic import descriptor_set, tracks

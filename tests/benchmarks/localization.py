@@ -24,6 +24,7 @@ from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.merge import merge_maps
 from tests.support.machine import slowness
+from tests.support.noiseless import without_noise
 
 LANDMARKS, QUERIES, REPEATS = 30_000, 60, 4
 
@@ -40,7 +41,7 @@ def maps() -> tuple[VIMap, VIMap]:
             SessionOptions(kind="loop", duration_s=20.0, turns=0.4, start_turn=0.2),
         ),
     )
-    scenario = dataclasses.replace(scenario, drift=scenario.without_noise().drift)
+    scenario = dataclasses.replace(scenario, drift=without_noise(scenario).drift)
     data = simulate(scenario)
     placed = [
         m.replace(baseframes=m.baseframes.replace(T_G_M=data.truth.T_G_M[row][None]))

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.estimation import gauge
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.factor_terms import FactorTerm
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.estimation.inertial_terms import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem import Problem
-from maplab_py.estimation.solver import SolverOptions, optimize_states
+from maplab_py.estimation.problem import gauge
+from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.states import States
 from maplab_py.estimation.symbolic.sources import inertial
-from maplab_py.estimation.visual_terms import Cameras, Observations, VisualTerms
+from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
+from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Imu, Projection
@@ -24,6 +26,7 @@ from tests.benchmarks.problems import (
     F64,
     FOCAL_PX,
     GRAVITY_MPS2,
+    I64,
     NUM_KNOWN_POSES,
     InertialProblem,
     VisualProblem,
@@ -45,9 +48,16 @@ def solve_inertial(problem: InertialProblem, rule: StoppingRule) -> tuple[Soluti
     observed, data = _observations(problem.visual), _inertial_data(problem)
     states = _initial_states(problem.visual, problem)
     with effort() as spent:
-        factors = _inertial_terms(data)
+        factors = _inertial_terms(data, problem.first_keyframe)
         solution = _solve(states, _visual_terms(problem.visual, observed), factors, rule)
     return solution, spent
+
+
+def inertial_parts(problem: InertialProblem) -> tuple[States, VisualTerms, list[FactorTerm]]:
+    """Return initial states and terms of a problem."""
+    visual = _visual_terms(problem.visual, _observations(problem.visual))
+    factors = _inertial_terms(_inertial_data(problem), problem.first_keyframe)
+    return _initial_states(problem.visual, problem), visual, factors
 
 
 def cost_of(problem: VisualProblem | InertialProblem, solution: Solution) -> float:
@@ -58,7 +68,7 @@ def cost_of(problem: VisualProblem | InertialProblem, solution: Solution) -> flo
     nothing = np.zeros((count, 3))
     v_G, gyro_bias, accel_bias = nothing, nothing, nothing
     if isinstance(problem, InertialProblem):
-        factors = _inertial_terms(_inertial_data(problem))
+        factors = _inertial_terms(_inertial_data(problem), problem.first_keyframe)
         assert solution.v_G is not None
         assert solution.gyro_bias is not None
         assert solution.accel_bias is not None
@@ -71,7 +81,11 @@ def cost_of(problem: VisualProblem | InertialProblem, solution: Solution) -> flo
 def _solve(
     states: States, visual: VisualTerms, factors: list[FactorTerm], rule: StoppingRule
 ) -> Solution:
-    problem = Problem(states, visual, factors)
+    if rule.forcing:
+        forcing = IterativeOptions(forcing=rule.forcing)
+        problem: Problem = IterativeProblem(states, visual, factors, None, forcing)
+    else:
+        problem = Problem(states, visual, factors)
     gauge.fix_pose(problem, np.arange(NUM_KNOWN_POSES))
     if not factors:
         every = np.arange(problem.num_nodes)
@@ -129,8 +143,7 @@ def _inertial_data(problem: InertialProblem) -> InertialData:
     )
 
 
-def _inertial_terms(data: InertialData) -> list[FactorTerm]:
-    first = np.arange(len(data), dtype=np.int64)
+def _inertial_terms(data: InertialData, first: I64) -> list[FactorTerm]:
     kernel = residual_kernel("inertial", inertial)
     gravity = np.tile([0.0, 0.0, -GRAVITY_MPS2], (len(data), 1))
     walk = integrate(data, np.zeros(3), np.zeros(3))

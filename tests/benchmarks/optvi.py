@@ -49,7 +49,7 @@ def _in_process(repeats: int, **variables: str) -> dict[str, Any]:
 def _measure(folder: Path, repeats: int) -> dict[str, Any]:
     """Optimise the map for 10 iterations: the process' first time, then warm."""
     from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-    from maplab_py.storage.loading import load_map
+    from maplab_py.storage.map_loading import load_map
 
     vi_map, _ = load_map(folder)
     options = VIOptimizationOptions(num_iterations=10, function_tolerance=0.0)

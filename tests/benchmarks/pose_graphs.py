@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maplab_py.algorithms.relaxation.graph import optimize_graph
+from maplab_py.algorithms.relaxation.graph_files import optimize_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.interop.g2o import PoseGraph, read_g2o
 from tests.support.data import shared_data

@@ -84,8 +84,9 @@ class InertialProblem:
 
     visual: VisualProblem
     noise: ImuNoise
-    timestamp_ns: I64  # (V - 1, S + 1) of the samples of each interval, both ends included
-    accel_gyro: F64  # (V - 1, S + 1, 6)
+    first_keyframe: I64  # (E,) where each interval begins; it ends at the next keyframe
+    timestamp_ns: I64  # (E, S + 1) of the samples of each interval, both ends included
+    accel_gyro: F64  # (E, S + 1, 6)
     gyro_bias: F64  # (3,) true, constant
     accel_bias: F64
     initial_v_G: F64  # (V, 3)
@@ -105,6 +106,21 @@ def make_visual(name: str, seed: int = 0) -> VisualProblem:
     size, rng = SIZES[name], np.random.default_rng(seed)
     T_G_I = _drive(size)
     p_G, keyframe, landmark = _tracks(size, T_G_I, rng)
+    return disturbed_problem(T_G_I, p_G, keyframe, landmark, rng)
+
+
+def disturbed_problem(
+    T_G_I: F64, p_G: F64, keyframe: I64, landmark: I64, rng: np.random.Generator
+) -> VisualProblem:
+    """Return a problem with noisy pixels and drifted initial values.
+
+    Args:
+        T_G_I: True poses (V, 7).
+        p_G: True landmarks (L, 3).
+        keyframe: Keyframe (O,) of every observation, ascending within a landmark.
+        landmark: Landmark (O,), ascending.
+        rng: Random numbers.
+    """
     start = np.searchsorted(landmark, np.arange(len(p_G) + 1))
     uv_px = project(T_G_I[keyframe], p_G[landmark])[0] + rng.normal(0.0, 1.0, (len(keyframe), 2))
     initial_T_G_I = _drifted(T_G_I, rng)
@@ -117,36 +133,58 @@ def make_visual(name: str, seed: int = 0) -> VisualProblem:
 
 def make_inertial(name: str, seed: int = 0) -> InertialProblem:
     """Make the visual-inertial problem of a size; the same every time."""
-    visual, noise, rng = make_visual(name, seed), ImuNoise(), np.random.default_rng(seed + 1)
-    keyframe_s = np.arange(len(visual.T_G_I)) * _KEYFRAME_INTERVAL_S
+    visual = make_visual(name, seed)
+    return with_inertial_samples(visual, len(visual.T_G_I), np.random.default_rng(seed + 1))
+
+
+def with_inertial_samples(
+    visual: VisualProblem, session_length: int, rng: np.random.Generator
+) -> InertialProblem:
+    """Return the problem with inertial samples between neighbouring keyframes of each session."""
+    noise, count = ImuNoise(), len(visual.T_G_I)
+    gyro_bias, accel_bias = np.array([0.010, -0.020, 0.015]), np.array([0.05, -0.08, 0.03])
+    first, timestamp_ns, samples, v_G = [], [], [], []
+    for begin in range(0, count, session_length):
+        session = slice(begin, begin + session_length)
+        times, readings = _inertial_samples(visual.T_G_I[session], noise, rng)
+        first.append(begin + np.arange(len(times)))
+        timestamp_ns.append(times)
+        samples.append(readings + np.concatenate([accel_bias, gyro_bias]))
+        v_G.append(np.gradient(visual.initial_T_G_I[session, 4:], _KEYFRAME_INTERVAL_S, axis=0))
+    return InertialProblem(
+        visual=visual,
+        noise=noise,
+        first_keyframe=np.concatenate(first),
+        timestamp_ns=np.concatenate(timestamp_ns),
+        accel_gyro=np.concatenate(samples),
+        gyro_bias=gyro_bias,
+        accel_bias=accel_bias,
+        initial_v_G=np.concatenate(v_G),
+        initial_gyro_bias=gyro_bias + np.array([3e-4, -2e-4, 2e-4]),
+        initial_accel_bias=accel_bias + np.array([-4e-3, 3e-3, 2e-3]),
+    )
+
+
+def _inertial_samples(T_G_I: F64, noise: ImuNoise, rng: np.random.Generator) -> tuple[I64, F64]:
+    """Return times (V - 1, S + 1) and noisy readings (V - 1, S + 1, 6) without biases."""
+    keyframe_s = np.arange(len(T_G_I)) * _KEYFRAME_INTERVAL_S
     step_s = _KEYFRAME_INTERVAL_S / _SAMPLES_PER_INTERVAL
     sample_s = np.arange((len(keyframe_s) - 1) * _SAMPLES_PER_INTERVAL + 1) * step_s
-    position = CubicSpline(keyframe_s, visual.T_G_I[:, 4:])
-    orientation = RotationSpline(keyframe_s, Rotation.from_quat(visual.T_G_I[:, :4]))
+    position = CubicSpline(keyframe_s, T_G_I[:, 4:])
+    orientation = RotationSpline(keyframe_s, Rotation.from_quat(T_G_I[:, :4]))
     force_G = position(sample_s, 2) + np.array([0.0, 0.0, GRAVITY_MPS2])
     accel = orientation(sample_s).inv().apply(force_G)
     gyro = orientation(sample_s, 1)
-    gyro_bias, accel_bias = np.array([0.010, -0.020, 0.015]), np.array([0.05, -0.08, 0.03])
     measured = np.concatenate(
         [
-            accel + accel_bias + rng.normal(0.0, noise.accel / np.sqrt(step_s), accel.shape),
-            gyro + gyro_bias + rng.normal(0.0, noise.gyro / np.sqrt(step_s), gyro.shape),
+            accel + rng.normal(0.0, noise.accel / np.sqrt(step_s), accel.shape),
+            gyro + rng.normal(0.0, noise.gyro / np.sqrt(step_s), gyro.shape),
         ],
         axis=1,
     )
     first = np.arange(len(keyframe_s) - 1)[:, None] * _SAMPLES_PER_INTERVAL
     rows = first + np.arange(_SAMPLES_PER_INTERVAL + 1)
-    return InertialProblem(
-        visual=visual,
-        noise=noise,
-        timestamp_ns=np.round(sample_s[rows] * 1e9).astype(np.int64),
-        accel_gyro=measured[rows],
-        gyro_bias=gyro_bias,
-        accel_bias=accel_bias,
-        initial_v_G=np.gradient(visual.initial_T_G_I[:, 4:], keyframe_s, axis=0),
-        initial_gyro_bias=gyro_bias + np.array([3e-4, -2e-4, 2e-4]),
-        initial_accel_bias=accel_bias + np.array([-4e-3, 3e-3, 2e-3]),
-    )
+    return np.round(sample_s[rows] * 1e9).astype(np.int64), measured[rows]
 
 
 def _drive(size: Size) -> F64:

@@ -18,10 +18,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
-from maplab_py.algorithms.self_calibration.collection import collect
-from maplab_py.algorithms.self_calibration.information_gain import select_by_gain
-from maplab_py.algorithms.self_calibration.joint_ekf import filter_jointly
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.segments.selection import collect
+from maplab_py.research.information_gain import select_by_gain
+from maplab_py.research.joint_ekf import filter_jointly
 from maplab_py.simulation.scenario import MotionOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
@@ -85,7 +85,7 @@ def measure(length_s: float, *, with_gain: bool) -> Times:
     gain_kept = 0
     if with_gain:
         began = time.process_time()
-        gain_kept = len(select_by_gain(vi_map, OPTIONS).kept)
+        gain_kept = len(select_by_gain(vi_map, OPTIONS))
         gain_s = time.process_time() - began
         count = len(database)
         gain_same_s = processor_s(lambda: select_by_gain(vi_map, OPTIONS, max_segments=count))

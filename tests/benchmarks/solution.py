@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.trust_region import Schedule
+from maplab_py.estimation.problem.trust_region import Schedule
 
 F64 = NDArray[np.float64]
 
@@ -29,6 +29,11 @@ class StoppingRule:
     max_iterations: int = 50
     initial_damping: float = 1e-5  # 1 / initial radius of the trust region
     schedule: Schedule = Schedule.STEP_QUALITY  # of this project; the others have their own
+    forcing: float = 0.0  # of an iterative linear solver; 0 = a factorisation
+
+
+SAME_STEPS = StoppingRule(0.0, 6, schedule=Schedule.CERES, forcing=0.01)
+"""Six steps of an iterative solver, with the schedule of Ceres."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -23,6 +23,15 @@ def test_equal_cost_in_less_time_and_memory(kind: str) -> None:
     assert comparison.ratio("peak_growth_mb") <= 0.6
 
 
+@pytest.mark.slow
+def test_conjugate_gradients_against_those_of_ceres() -> None:
+    pytest.importorskip("pycolmap", reason="a peer of the extra [bench] is not there")
+    comparison = compare("sessions", "small", repeats=2)
+    assert abs(comparison.cost_difference) <= 1e-5
+    assert comparison.cpu_ratio <= 0.8
+    assert comparison.ratio("peak_growth_mb") <= 0.8
+
+
 def test_exponent_is_that_of_a_power_law() -> None:
     measured = [
         {"observations": n, "user_s": 4 * 2e-6 * n**1.1, "system_s": 0.0, "iterations": 4}

@@ -15,7 +15,7 @@ import numpy as np
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.console.session import open_map
+from maplab_py.console.session.session import open_map
 from maplab_py.geometry import se3, so3
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.display.viewer import Viewer
@@ -33,7 +33,7 @@ from maplab_py.vimap import (
     VIMap,
 )
 from maplab_py.vimap.ids import random_ids
-from tests.viewer.browsing import Page, chromium, is_blank
+from tests.viewer.display.browsing import Page, chromium, is_blank
 
 PAIRS = 5
 

@@ -10,8 +10,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from maplab_py.console.registry import Plugin, Registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import Plugin, Registry
+from maplab_py.console.session.session import Session
 from maplab_py.plugin import (
     CommandContext,
     EstimationError,

@@ -115,8 +115,8 @@ def test_its_importer_makes_a_map(installed: Path, tmp_path: Path) -> None:
     [
         ("import_positions nowhere.csv", "nowhere.csv: no such file or folder"),
         ("import_positions bad.csv", "bad.csv: could not convert string"),
-        ("import_positions two.csv", "two.csv: two or more rows of three numbers are wanted"),
-        ("import_positions good.csv --map_key=a/b", "'a/b' is no map key"),
+        ("import_positions two.csv", "two.csv: two or more rows of three numbers are expected"),
+        ("import_positions good.csv --map_key=a/b", "'a/b' cannot be a map key"),
         ("import_positions good.csv --period=1", "--period_s"),
     ],
 )

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.plugin_template import plugin_files
-from maplab_py.console.session import Session
+from maplab_py.console.commands.plugin_template import plugin_files
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from tests.support.data import REPOSITORY
 
@@ -32,7 +32,7 @@ def test_names() -> None:
     }
     assert "$" not in "".join(files.values()).replace("$ ", "")
     for name in ("Upper", "1st", "a b", "../x", ""):
-        with pytest.raises(UserError, match="no name"):
+        with pytest.raises(UserError, match="cannot be a name"):
             plugin_files(name, "1.2")
 
 
@@ -40,7 +40,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     session = Session()
     with pytest.raises(UserError, match="exists"):
         session.run("new_plugin", "path_lengths", folder=tmp_path)
-    with pytest.raises(UserError, match="is a command already"):
+    with pytest.raises(UserError, match="is already a command"):
         session.run("new_plugin", "load", folder=tmp_path / "x")
     session.run("new_plugin", "path_lengths", folder=tmp_path / "x", dry_run=True)
     assert list(tmp_path.iterdir()) == []

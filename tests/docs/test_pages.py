@@ -8,9 +8,9 @@ from types import ModuleType
 
 import pytest
 
-from maplab_py.console.lines import split_commands
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.lines import split_commands
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.simulation.scenario_file import parse_scenario
 from tests.docs.markdown import blocks, links
 from tests.support.data import REPOSITORY
@@ -41,10 +41,11 @@ def test_command_pages_are_those_of_the_registry() -> None:
 def test_generated_pages_are_up_to_date() -> None:
     migration = _script("generate_migration_page").page(load_registry())
     assert (DOCS / "migration.md").read_text() == migration, "run generate_migration_page.py"
-    decisions = _script("generate_command_pages").decisions()
-    assert (DOCS / "decisions" / "index.md").read_text() == decisions, (
-        "run docs/scripts/generate_command_pages.py"
-    )
+    script = _script("generate_command_pages")
+    for folder, expected in (("decisions", script.decisions()), ("studies", script.studies())):
+        assert (DOCS / folder / "index.md").read_text() == expected, (
+            "run docs/scripts/generate_command_pages.py"
+        )
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
@@ -109,11 +110,22 @@ def test_python_blocks_compile() -> None:
     assert compiled >= 5
 
 
-def test_decisions_have_their_three_parts() -> None:
+def test_decisions_have_three_parts_and_fit_on_a_page() -> None:
     decisions = sorted((DOCS / "decisions").glob("0*.md"))
     numbers = [int(path.name[:4]) for path in decisions]
-    assert len(numbers) == len(set(numbers)) >= 9
-    for path in decisions:
+    assert numbers == list(range(1, len(decisions) + 1))
+    for number, path in zip(numbers, decisions, strict=True):
         text = path.read_text()
+        assert text.startswith(f"# {number}. "), f"{path.name} has another number in its title"
         for part in ("**Context.**", "**Decision.**", "**Consequences.**"):
             assert part in text, f"{path.name} lacks {part}"
+        assert len(text.split()) <= 450, f"{path.name} is longer than a page"
+
+
+def test_studies_begin_with_question_answer_and_limits() -> None:
+    studies = [path for path in (DOCS / "studies").glob("*.md") if path.name != "index.md"]
+    assert len(studies) >= 10
+    for path in studies:
+        paragraphs = path.read_text().split("\n\n")
+        for paragraph, part in zip(paragraphs[1:], ("Question", "Answer", "Limits"), strict=False):
+            assert paragraph.startswith(f"**{part}.** "), f"{path.name} lacks {part}"

@@ -21,7 +21,9 @@ CURSOR_QUESTION = "\x1b[6n"
 
 def environment(home: Path, **extra: str) -> dict[str, str]:
     """Return the environment of a user whose files lie under `home`."""
-    kept = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "MAPLAB_PLUGINS")}
+    # readline exports the size of pytest's terminal to the processes of xdist
+    others = ("NO_COLOR", "MAPLAB_PLUGINS", "COLUMNS", "LINES")
+    kept = {k: v for k, v in os.environ.items() if k not in others}
     cache = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
     return {
         **kept,
@@ -58,7 +60,9 @@ def run_program(
 class Console:
     """The program in a pseudo-terminal, with what a person would see of it."""
 
-    def __init__(self, home: Path, *arguments: str, **extra: str) -> None:
+    def __init__(
+        self, home: Path, *arguments: str, ignores_hang_ups: bool = False, **extra: str
+    ) -> None:
         self.child = pexpect.spawn(
             PROGRAM[0],
             [*PROGRAM[1:], *arguments],
@@ -67,6 +71,7 @@ class Console:
             dimensions=(ROWS, COLUMNS),
             encoding="utf-8",
             timeout=30,
+            ignore_sighup=ignores_hang_ups,
         )
         self.screen = pyte.Screen(COLUMNS, ROWS)
         self._stream = pyte.Stream(self.screen)
@@ -75,6 +80,11 @@ class Console:
     def text(self) -> str:
         """The screen's lines."""
         return "\n".join(line.rstrip() for line in self.screen.display).rstrip()
+
+    @property
+    def unwrapped(self) -> str:
+        """The screen's text with the lines that the terminal wrapped joined again."""
+        return "".join(self.screen.display)
 
     @property
     def last_line(self) -> str:

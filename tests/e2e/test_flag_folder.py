@@ -7,16 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.algorithms.self_calibration.database import device_of
-from maplab_py.console.lines import typed_commands
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
-from maplab_py.console.settings import Layer
+from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.console.commands.lines import typed_commands
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.scripts.stages import read_stages
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.settings import Layer
+from maplab_py.pipeline.plan import Pipeline, ordered
+from maplab_py.sensors.yaml_text import parse_yaml
+from maplab_py.simulation.scenario import Scenario
 from maplab_py.storage.native import save_map
 from maplab_py.vimap.tables import LandmarkQuality
 from tests.e2e.support import run_program
-from tests.registry.workspace import make_workspace
-from tests.simulation.small import simulated
+from tests.registry.workspace import ROUND, make_workspace
+from tests.simulation.small import SMALL, simulated
 from tests.support.data import REPOSITORY, shared_data
 
 FLAGS = REPOSITORY / "flags"
@@ -41,6 +45,18 @@ def test_every_flag_of_a_flag_file_exists(path: Path) -> None:
     assert session.settings.current()
 
 
+def test_every_line_of_the_pipeline_is_a_command_with_its_flags() -> None:
+    path = FLAGS / "city.yaml"
+    stages = read_stages(parse_yaml(path.read_text(), path.name)["stages"], path)
+    assert [stage.name for stage in ordered(Pipeline(path.name, (), stages))] == [
+        stage.name for stage in stages
+    ]
+    session = Session(load_registry())
+    for stage in stages:
+        for command in typed_commands("\n".join(stage.commands)):
+            session.parse(command.words).arguments()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "maps"),
@@ -61,18 +77,18 @@ def test_scripts_on_real_maps(tmp_path: Path, script: str, maps: str) -> None:
     assert again.returncode == 0, again.stderr
 
 
-def simulated_maps(folder: Path) -> None:
+def simulated_maps(folder: Path, scenario: Scenario = SMALL) -> None:
     """Write two small maps below a folder."""
-    for number, vi_map in enumerate(simulated().maps):
+    for number, vi_map in enumerate(simulated(scenario).maps):
         save_map(vi_map, folder / f"walk_{number}")
 
 
 @pytest.mark.slow
 def test_localization_map(tmp_path: Path) -> None:
     make_workspace(tmp_path)
-    places = {"MAP": "maps/v1_01", "RESULT": "small"}
+    places = ["--maps_folder=maps/v1_01", "--map_folder=small"]
     script = str(FLAGS / "localization_map.maplab")
-    done = run_program(tmp_path, "--json", "run", script, extra=places, seconds=300)
+    done = run_program(tmp_path, "--json", "run", script, *places, seconds=300)
     assert done.returncode == 0, done.stderr
     with Session(load_registry()) as session:
         session.run("load", map_folder=tmp_path / "maps" / "v1_01")
@@ -85,9 +101,10 @@ def test_localization_map(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_calibration(tmp_path: Path) -> None:
-    places = {"MAP": str(shared_data("maplab_maps/tango_handheld")), "RESULT": "calibrated"}
+    maps = shared_data("maplab_maps/tango_handheld")
+    places = [f"--maps_folder={maps}", "--map_folder=calibrated"]
     script = str(FLAGS / "calibration.maplab")
-    done = run_program(tmp_path, "--json", "run", script, extra=places, seconds=300)
+    done = run_program(tmp_path, "--json", "run", script, *places, seconds=300)
     assert done.returncode == 0, done.stderr
     reports = {
         line["command"]: line["report"] for line in map(json.loads, done.stdout.splitlines())
@@ -108,11 +125,24 @@ def test_calibration(tmp_path: Path) -> None:
 def test_batch_over_a_folder(tmp_path: Path) -> None:
     simulated_maps(tmp_path / "maps")
     batch = str(FLAGS / "batch.yaml")
-    done = run_program(tmp_path, "batch", batch, "--json", extra={"MAPS": "maps"}, seconds=300)
+    done = run_program(tmp_path, "batch", batch, "--json", "--maps_folder=maps", seconds=300)
     assert done.returncode == 0, done.stderr
     reports = [json.loads(line) for line in done.stdout.splitlines()]
     assert [report["command"] for report in reports].count("save") == 2
     assert len(list(tmp_path.glob("maps/*/vertex_poses_velocities_biases.csv"))) == 2
-    done = run_program(tmp_path, "batch", batch, extra={"MAPS": "nowhere"})
+    done = run_program(tmp_path, "batch", batch, "--maps_folder=nowhere")
     assert done.returncode == 2
-    assert "no folder matches" in done.stderr
+    assert "there is no map in it or below it" in done.stderr
+
+
+@pytest.mark.slow
+def test_city_pipeline(tmp_path: Path) -> None:
+    simulated_maps(tmp_path / "maps", ROUND)
+    words = ("batch", str(FLAGS / "city.yaml"), "--maps_folder=maps", "--json")
+    done = run_program(tmp_path, *words, seconds=600)
+    assert done.returncode == 0, done.stderr
+    stages = json.loads(done.stdout)["report"]["stages"]
+    assert [stage["done"] for stage in stages] == [2, 1, 1, 4]
+    results = tmp_path / "city_results" / "summaries"
+    assert len(list(results.glob("*/summary_map/*"))) == 4
+    assert len(list(results.glob("*/map/metadata"))) == 4

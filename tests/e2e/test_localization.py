@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from tests.support.data import shared_data
 
 pytestmark = pytest.mark.slow

@@ -70,7 +70,7 @@ def test_errors_and_tracebacks_go_to_the_log(tmp_path: Path) -> None:
 
 
 def test_a_state_folder_that_cannot_be_written_is_no_obstacle(tmp_path: Path) -> None:
-    (tmp_path / "state").write_text("a file where a folder is wanted")
+    (tmp_path / "state").write_text("a file where a folder is expected")
     done = run_program(tmp_path, "-c", "help")
     assert done.returncode == 0
     assert "no log file" in done.stderr
@@ -86,12 +86,12 @@ def test_interrupt_ends_a_repetition_and_the_script_goes_on(tmp_path: Path) -> N
         env=environment(tmp_path),
     )
     assert child.stdout is not None
-    while "maps" not in child.stdout.readline():
+    while "map key" not in child.stdout.readline():
         assert child.poll() is None
     os.kill(child.pid, signal.SIGINT)
     out, _ = child.communicate(timeout=30)
     assert child.returncode == 0
-    assert "stopped after 1 runs" in out
+    assert "stopped after 1 run" in out
 
 
 def test_only_the_plugins_that_the_environment_names_load(tmp_path: Path) -> None:

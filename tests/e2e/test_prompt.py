@@ -157,6 +157,8 @@ def test_a_job_announces_its_end_above_the_prompt(console: Console) -> None:
 def test_leaving_with_a_running_job_asks(console: Console) -> None:
     console.enter("watch timing --every=30 &")
     console.wait_for_text("[1] watch timing")
+    console.wait_for_text("running [1] watch")
+    console.wait_until_still()  # what the job prints takes the keys for a moment
     console.type(CTRL_D)
     console.wait_for_text("leave and stop it? [y/N]")
     console.enter("y")
@@ -187,7 +189,8 @@ def test_ctrl_c_leaves_the_pager_and_the_prompt_has_the_keys(tmp_path: Path) -> 
 
 
 STAYS = (
-    "trap 'echo once more' INT; echo 'it' runs; until read a < /dev/tty; do true; done; echo got $a"
+    "sh -c \"trap 'echo once more' INT; echo 'it' runs; "
+    'until read a < /dev/tty; do true; done; echo got \\$a"'
 )
 """A shell command that Ctrl-C does not end: it wants a line."""
 
@@ -231,7 +234,7 @@ def test_a_command_that_says_nothing_for_a_second_shows_that_it_lives(console: C
     console.enter("watch timing --every=30")
     console.wait_for(lambda screen: "watch" in screen and "0:00:0" in screen)
     console.type(CTRL_C)
-    console.wait_for_text("stopped after 1 runs")
+    console.wait_for_text("stopped after 1 run")
     console.wait_for_prompt()
 
 
@@ -239,7 +242,7 @@ def test_ctrl_c_at_a_question_is_no(console: Console) -> None:
     console.enter("create_new_map a")
     console.wait_for_prompt("maplab <a>:/$")
     console.enter("delete_map")
-    console.wait_for_text("drop map 'a' from memory? [y/N]")
+    console.wait_for_text("remove map 'a' from memory? [y/N]")
     console.type(CTRL_C)
     console.wait_for_text("delete_map: cancelled")
     console.wait_for_prompt("maplab <a>:/$")

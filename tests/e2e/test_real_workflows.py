@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from tests.support.data import shared_data

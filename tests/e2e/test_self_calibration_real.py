@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.self_calibration.database import device_of
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
 from tests.support.data import shared_data
@@ -111,7 +111,7 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
     found = {one.parameter: one for one in report.parameters}
     assert found["camera focal length u"].after == pytest.approx(459.7, abs=1.0)
     assert found["camera focal length v"].after == pytest.approx(458.5, abs=1.0)
-    # these images would move the camera by 4 cm: decision 97
+    # these images would move the camera by 4 cm: decision 33
     assert found["camera position z"].verdict.startswith("kept: the data would move the camera")
     session.run("optvi")
     after: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")

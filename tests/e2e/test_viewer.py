@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import socket
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,7 +64,10 @@ def test_the_prompt_stays_clean_and_the_server_ends_with_it(console: Console) ->
         _visit(port, origin="https://evil.example")
     with socket.create_connection(("127.0.0.1", port)) as nonsense:
         nonsense.sendall(b"no http\r\n\r\n")
-    time.sleep(0.5)
+        nonsense.settimeout(20.0)
+        while nonsense.recv(4096):  # the server refuses and closes the connection
+            pass
+    console.wait_until_still()
     console.type("ms")
     console.wait_for(lambda _: console.last_line.endswith("$ ms"))
     console.wait_until_still()

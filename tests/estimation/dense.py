@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.estimation.factor_terms import FactorTerm
-from maplab_py.estimation.problem import Linearization, Problem
+from maplab_py.estimation.problem.problem import Linearization, Problem
 from maplab_py.estimation.states import States
+from maplab_py.estimation.terms.protocol import FactorTerm
 
 F64 = NDArray[np.float64]
 
@@ -58,10 +58,11 @@ def system_matrix(problem: Problem, linear: Linearization, damping: float) -> F6
     """Return the damped system matrix of a problem as a dense one."""
     size = problem.num_nodes
     dense = np.zeros((size, 3, size, 3))
-    for block, row, col in zip(linear.values, *problem.block_places, strict=True):
-        dense[row, :, col] += block
+    rows, cols = np.unique(np.stack(problem.block_places(linear.states)), axis=1)
+    for block, row, col in zip(problem.blocks(linear, rows, cols), rows, cols, strict=True):
+        dense[row, :, col] = block
         if row != col:
-            dense[col, :, row] += block.T
+            dense[col, :, row] = block.T
     matrix = dense.reshape(3 * size, -1)
     matrix = np.tril(matrix) + np.tril(matrix, -1).T
     clipped = np.clip(linear.diagonal, 1e-6, 1e32).reshape(-1)

@@ -1,4 +1,4 @@
-"""Robust losses: both implementations against the formulas of the literature and differences."""
+"""Robust losses against the formulas of the literature and differences, alone and in kernels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from maplab_py.estimation.codegen.kernels import visual_kernels
-from maplab_py.estimation.loss import Loss, robust
-from maplab_py.estimation.visual_terms import Cameras, Observations, VisualTerms
+from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.loss_values import loss_and_weight
+from maplab_py.estimation.states import States
+from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.terms.visual import NodeSystem, Observations, VisualTerms
 from maplab_py.geometry import se3
 from maplab_py.sensors import Distortion, Projection
 
@@ -26,8 +30,9 @@ def cauchy(r: float) -> float:
 
 
 def tukey(r: float) -> float:
-    inside = max(1.0 - (r / SCALE) ** 2, 0.0)
-    return SCALE**2 / 3.0 * (1.0 - inside**3)
+    if r >= SCALE:
+        return SCALE**2 / 3.0
+    return -(SCALE**2) / 3.0 * float(np.expm1(3.0 * np.log1p(-((r / SCALE) ** 2))))
 
 
 def geman_mcclure(r: float) -> float:
@@ -62,7 +67,7 @@ def slope(loss: Loss, s: float) -> float:
 
 @pytest.mark.parametrize("loss", Loss)
 def test_cost_and_weight_of_factors(loss: Loss) -> None:
-    rho, weight = robust(loss, SCALE**2, RESIDUALS**2)
+    rho, weight = loss_and_weight(loss, SCALE**2, RESIDUALS**2)
     np.testing.assert_allclose(rho, [RHO[loss](r) for r in RESIDUALS], rtol=1e-12, atol=1e-24)
     wanted = [slope(loss, r * r) for r in RESIDUALS]
     np.testing.assert_allclose(weight, wanted, rtol=1e-5, atol=2e-6)
@@ -71,14 +76,15 @@ def test_cost_and_weight_of_factors(loss: Loss) -> None:
 @pytest.mark.parametrize("loss", Loss)
 def test_compiled_kernels_agree(loss: Loss) -> None:
     visual = one_landmark_each(loss)
-    T_G_I, p_G = se3.identity(len(RESIDUALS)), np.tile([0.0, 0.0, 2.0], (len(RESIDUALS), 1))
-    system = visual.linearize(T_G_I, p_G, 0.0)
-    rho, weight = robust(loss, SCALE**2, RESIDUALS**2)
+    states = in_front_of_each()
+    system = linearized(visual, states)
+    rho, weight = loss_and_weight(loss, SCALE**2, RESIDUALS**2)
     assert system.cost == pytest.approx(0.5 * rho.sum(), rel=1e-12)
     # the residual is r along u; d u / d x_C = fu / z = 50, so the gradient is -50 w r
-    np.testing.assert_allclose(system.gradient[:, 0], -50.0 * weight * RESIDUALS, rtol=1e-9)
-    np.testing.assert_allclose(system.diagonal[:, 0], 2500.0 * weight, rtol=1e-9)
-    new_cost = visual.step(T_G_I, p_G, np.zeros((len(RESIDUALS), 6)), T_G_I, 1.0)[1]
+    np.testing.assert_allclose(system.gradient[::5, 0], -50.0 * weight * RESIDUALS, rtol=1e-9)
+    np.testing.assert_allclose(system.diagonal[::5, 0], 2500.0 * weight, rtol=1e-9)
+    still = np.zeros((states.num_nodes, 3))
+    new_cost = visual.take_step(states, still, states, 1.0)[1]
     assert new_cost == pytest.approx(system.cost, rel=1e-12)
 
 
@@ -89,12 +95,25 @@ def test_every_observation_has_its_own_scale() -> None:
     visual.use(
         Observations(data.start, data.vertex, data.camera, data.uv_px, data.inverse_sigma, scales)
     )
-    T_G_I, p_G = se3.identity(len(RESIDUALS)), np.tile([0.0, 0.0, 2.0], (len(RESIDUALS), 1))
     wanted = [
-        robust(Loss.HUBER, c * c, np.array([r * r]))[0][0]
+        loss_and_weight(Loss.HUBER, c * c, np.array([r * r]))[0][0]
         for c, r in zip(scales, RESIDUALS, strict=True)
     ]
-    assert visual.linearize(T_G_I, p_G, 0.0).cost == pytest.approx(0.5 * sum(wanted), rel=1e-12)
+    assert linearized(visual, in_front_of_each()).cost == pytest.approx(
+        0.5 * sum(wanted), rel=1e-12
+    )
+
+
+def in_front_of_each() -> States:
+    """Return vertices at the origin, each with its landmark 2 m ahead."""
+    zero = np.zeros((len(RESIDUALS), 3))
+    return States(se3.identity(len(zero)), zero, zero, zero, zero + np.array([0.0, 0.0, 2.0]))
+
+
+def linearized(visual: VisualTerms, states: States) -> NodeSystem:
+    solver = SupernodalCholesky(*visual.block_nodes(states), states.num_nodes, 3)
+    solver.clear()
+    return visual.linearize(states, 0.0, solver, visual.places(states, solver))
 
 
 def one_landmark_each(loss: Loss) -> VisualTerms:

@@ -9,17 +9,20 @@ from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.geometry.alignment import align_yaw_position, apply_similarity, umeyama
 
-RNG = np.random.default_rng(11)
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(11)
 
 
-def random_pose() -> np.ndarray:
-    return se3.make(so3.exp(RNG.normal(size=3) * 2), RNG.normal(size=3) * 10)
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    return se3.make(so3.exp(rng.normal(size=3) * 2), rng.normal(size=3) * 10)
 
 
 @pytest.mark.parametrize("count", [3, 4, 100])
 @pytest.mark.parametrize("scale", [1.0, 0.01, 37.0])
-def test_exact_motions_come_back(count: int, scale: float) -> None:
-    T, p = random_pose(), RNG.normal(size=(count, 3))
+def test_exact_motions_come_back(rng: np.random.Generator, count: int, scale: float) -> None:
+    T, p = random_pose(rng), rng.normal(size=(count, 3))
     found, s = umeyama(se3.transform(T, scale * p), p, with_scale=True)
     assert s == pytest.approx(scale, rel=1e-12)
     assert np.max(np.abs(se3.local(T, found))) < 1e-11
@@ -29,21 +32,21 @@ def test_exact_motions_come_back(count: int, scale: float) -> None:
         assert np.max(np.abs(se3.local(T, found))) < 1e-12
 
 
-def test_planar_points_and_reflections_give_rotations() -> None:
-    p = RNG.normal(size=(20, 3)) * [1, 1, 0]
-    T = random_pose()
+def test_planar_points_and_reflections_give_rotations(rng: np.random.Generator) -> None:
+    p = rng.normal(size=(20, 3)) * [1, 1, 0]
+    T = random_pose(rng)
     found, _ = umeyama(se3.transform(T, p), p)
     assert np.max(np.abs(se3.local(T, found))) < 1e-12
     mirrored, _ = umeyama(
-        RNG.normal(size=(20, 3)) * [1, 2, 3] * [-1, 1, 1], RNG.normal(size=(20, 3))
+        rng.normal(size=(20, 3)) * [1, 2, 3] * [-1, 1, 1], rng.normal(size=(20, 3))
     )
     assert np.linalg.det(se3.to_matrix(mirrored)[:3, :3]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("with_scale", [True, False])
-def test_no_small_change_is_better(with_scale: bool) -> None:
-    p_B = RNG.normal(size=(30, 3))
-    p_A = se3.transform(random_pose(), 1.3 * p_B) + RNG.normal(size=(30, 3)) * 0.2
+def test_no_small_change_is_better(rng: np.random.Generator, with_scale: bool) -> None:
+    p_B = rng.normal(size=(30, 3))
+    p_A = se3.transform(random_pose(rng), 1.3 * p_B) + rng.normal(size=(30, 3)) * 0.2
     T, scale = umeyama(p_A, p_B, with_scale=with_scale)
 
     def cost(T: np.ndarray, scale: float) -> float:
@@ -56,13 +59,13 @@ def test_no_small_change_is_better(with_scale: bool) -> None:
         assert min(cost(T, scale * 1.0001), cost(T, scale * 0.9999)) > best
 
 
-def test_yaw_and_position() -> None:
+def test_yaw_and_position(rng: np.random.Generator) -> None:
     T = np.array([4.0, -3.0, 2.0, 2.5])
-    p = RNG.normal(size=(10, 3))
+    p = rng.normal(size=(10, 3))
     found = align_yaw_position(yaw.transform(T, p), p)
     assert np.allclose(yaw.local(T, yaw.from_pose(found)), 0.0, atol=1e-13)
     assert found[:2].tolist() == [0.0, 0.0]
-    p_A = yaw.transform(T, p) + RNG.normal(size=(10, 3)) * 0.3
+    p_A = yaw.transform(T, p) + rng.normal(size=(10, 3)) * 0.3
     best = yaw.from_pose(align_yaw_position(p_A, p))
     cost = np.sum((p_A - yaw.transform(best, p)) ** 2)
     for delta in np.concatenate([np.eye(4), -np.eye(4)]) * 1e-4:
@@ -110,8 +113,8 @@ def test_yaw_alignment_refuses_what_it_cannot_solve(p: np.ndarray, message: str)
         align_yaw_position(p, p)
 
 
-def test_apply_similarity_scales_positions_only() -> None:
-    T_A_B, T_B_C = random_pose(), np.stack([random_pose(), random_pose()])
+def test_apply_similarity_scales_positions_only(rng: np.random.Generator) -> None:
+    T_A_B, T_B_C = random_pose(rng), np.stack([random_pose(rng), random_pose(rng)])
     result = apply_similarity(T_A_B, 2.0, T_B_C)
     assert np.allclose(result[:, 4:], se3.transform(T_A_B, 2.0 * T_B_C[:, 4:]))
     assert np.allclose(result[:, :4], se3.compose(T_A_B, T_B_C)[:, :4])

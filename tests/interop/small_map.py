@@ -18,6 +18,7 @@ from maplab_py.vimap import (
     VIMap,
     ids,
 )
+from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.tables import LandmarkQuality, MissionSensor
 
 IMU_ID, RIG_ID, CAMERA_ID = "a" * 32, "b" * 32, "c" * 32
@@ -98,7 +99,9 @@ def make_map() -> VIMap:
             vertex=np.arange(count),
             timestamp_ns=times,
             keypoint_count=np.full(count, per_frame),
-            descriptor_size=np.where(mission == 0, 48, 3),
+            descriptor_blocks=binary_blocks(
+                np.full(count, per_frame), np.where(mission == 0, 48, 3)
+            ),
         ),
         keypoints=Keypoints.filled(
             keypoints,

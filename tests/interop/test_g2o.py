@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import gzip
+
 import numpy as np
 import pytest
 
@@ -56,7 +58,7 @@ def test_planar_poses_and_edges_lie_in_the_plane(tmp_path):
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0\n", "1: VERTEX_SE3:QUAT has 7 numbers, not 8"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 x\n", "1: could not convert"),
         ("VERTEX_XY 0 0 0\n", "1: 'VERTEX_XY' is not among"),
-        ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 0 0 0\n", "pose 0 is there twice"),
+        ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 0 0 0\n", "pose 0 occurs twice"),
         (f"VERTEX_SE2 0 0 0 0\nEDGE_SE3:QUAT 0 7 0 0 0 0 0 0 1 {IDENTITY}\n", "pose 7"),
         ("", "no poses"),
     ],
@@ -72,3 +74,59 @@ def test_errors_name_file_and_line(tmp_path, text, message):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(MapError, match=r"cannot read .*nowhere\.g2o"):
         read_g2o(tmp_path / "nowhere.g2o")
+
+
+def test_compressed_files_are_unpacked(tmp_path):
+    graph, path = small_graph(), tmp_path / "graph.g2o"
+    write_g2o(graph, path)
+    packed = tmp_path / "graph.g2o.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    again = read_g2o(packed)
+    np.testing.assert_array_equal(again.T_G_V, read_g2o(path).T_G_V)
+    assert again.num_repaired == 0
+    packed.write_bytes(packed.read_bytes()[:-20])
+    with pytest.raises(MapError, match=r"graph\.g2o\.gz: is damaged"):
+        read_g2o(packed)
+
+
+def test_edges_alone_give_the_poses_along_the_odometry(tmp_path):
+    rng = np.random.default_rng(3)
+    T = se3.make(so3.exp(rng.normal(size=(9, 3))), rng.normal(size=(9, 3)))
+    # poses 0 .. 4 in a chain, closed by a wrong edge; 7 and 8 of another part, 5 and 6 by edges backwards
+    first, second = np.array([0, 1, 2, 3, 0, 7, 5, 6, 3]), np.array([1, 2, 3, 4, 3, 8, 1, 5, 3])
+    measured = se3.relative(T[first], T[second])
+    measured[4, 4:] += 5.0
+    information = np.tile(np.eye(6), (9, 1, 1))
+    path = tmp_path / "edges.g2o"
+    graph = PoseGraph(
+        np.arange(9) * 1, T, first, second, measured, information, np.zeros(0, dtype=np.int64)
+    )
+    write_g2o(graph, path)
+    lines = [line for line in path.read_text().splitlines() if line.startswith("EDGE")]
+    path.write_text("\n".join(lines))
+    again = read_g2o(path)
+    assert again.id.tolist() == list(range(9))
+    np.testing.assert_allclose(
+        se3.relative(again.T_G_V[[0] * 7], again.T_G_V[:7])[:, 4:],
+        se3.relative(T[[0] * 7], T[:7])[:, 4:],
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(again.T_G_V[[0, 7]], se3.identity(2))
+    kept = se3.relative(again.T_G_V[[7]], again.T_G_V[[8]])
+    np.testing.assert_allclose(kept[:, 4:], measured[[5], 4:], atol=1e-12)
+
+
+def test_information_that_is_not_positive_definite_is_repaired(tmp_path):
+    graph, path = small_graph(), tmp_path / "graph.g2o"
+    information = graph.information.copy()
+    value, vector = np.linalg.eigh(information[1])
+    value[:2] = -1e-3, 0.0
+    information[1] = (vector * value) @ vector.T
+    write_g2o(PoseGraph(**{**vars(graph), "information": information}), path)
+    again = read_g2o(path)
+    assert again.num_repaired == 1
+    np.testing.assert_array_equal(again.information[[0, 2, 3]], graph.information[[0, 2, 3]])
+    repaired = np.linalg.eigvalsh(again.information[1])
+    np.testing.assert_allclose(repaired[2:], value[2:], rtol=1e-9)
+    np.testing.assert_allclose(repaired[:2], 1e-9 * value[-1], rtol=1e-3)
+    np.linalg.cholesky(again.information)

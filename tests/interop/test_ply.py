@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from maplab_py.errors import MapError
-from maplab_py.interop.ply import PlyCloud, parse_ply, read_ply, write_ply
+from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
 
 HEAD = b"ply\nformat %s 1.0\ncomment by hand\nelement vertex 3\n"
 FIELDS = b"property double x\nproperty float y\nproperty float z\nproperty uchar red\n"
@@ -46,7 +47,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     colours = rng.integers(0, 255, (50, 3)).astype(np.uint8)
     cloud = PlyCloud(rng.normal(size=(50, 3)), colours, rng.uniform(size=50))
     write_ply(cloud, tmp_path / "cloud.ply")
-    back = read_ply(tmp_path / "cloud.ply")
+    back = parse_ply((tmp_path / "cloud.ply").read_bytes(), "cloud.ply")
     np.testing.assert_allclose(back.p, cloud.p, rtol=1e-6)
     np.testing.assert_array_equal(back.colours, colours)
     np.testing.assert_allclose(back.intensity, cloud.intensity, rtol=1e-6)
@@ -56,7 +57,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     ("data", "reason"),
     [
         (b"no ply", "not a PLY file"),
-        (b"ply\nelement vertex 1\nend_header\n", "names no format"),
+        (b"ply\nelement vertex 1\nend_header\n", "states no format"),
         (
             b"ply\nformat ascii 1.0\nelement vertex one\nend_header\n",
             "wrong line 'element vertex one'",
@@ -77,6 +78,51 @@ def test_damaged_files_are_refused(data: bytes, reason: str) -> None:
         parse_ply(data, "cloud.ply")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"none.ply: cannot be read"):
-        read_ply(tmp_path / "none.ply")
+_POSITION = ("float x", "float y", "float z")
+_LARGEST = {
+    "wide points": ("binary_little_endian", (*_POSITION, *(f"uchar f{i}" for i in range(500)))),
+    "colours of doubles": (
+        "binary_big_endian",
+        (*_POSITION, "double red", "double green", "double blue", "float intensity"),
+    ),
+    "text": ("ascii", _POSITION),
+}
+
+
+@pytest.mark.parametrize("name", _LARGEST)
+def test_reading_takes_at_most_twice_the_bound(name: str) -> None:
+    """The largest number of points that is accepted, found by bisection."""
+    encoding, properties = _LARGEST[name]
+    size = sum(np.dtype({"float": "f4", "uchar": "u1", "double": "f8"}[p.split()[0]]).itemsize
+               for p in properties)  # fmt: skip
+    bound = 1_000_000
+    refusals = set[str]()
+
+    def content(count: int) -> bytes:
+        lines = ["ply", f"format {encoding} 1.0", f"element vertex {count}"]
+        lines += [f"property {line}" for line in properties] + ["end_header\n"]
+        row = b"1 1 1\n" if encoding == "ascii" else bytes(size)
+        return "\n".join(lines).encode() + row * count
+
+    def is_accepted(count: int) -> bool:
+        try:
+            parse_ply(content(count), "cloud", bound)
+        except MapError as error:
+            refusals.add(str(error))
+            return False
+        return True
+
+    accepted, refused = 1, 100_000
+    while refused - accepted > 100:
+        middle = (accepted + refused) // 2
+        accepted, refused = (middle, refused) if is_accepted(middle) else (accepted, middle)
+    data = content(accepted)
+    tracemalloc.start()
+    try:
+        parse_ply(data, "cloud", bound)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert accepted > 1000
+    assert all("take more than 2 MB of memory" in line for line in refusals)
+    assert peak_bytes < 2 * bound

@@ -91,7 +91,7 @@ def test_formats_are_told_from_content(tmp_path: Path, text: str, pose: list[flo
         ("2 2 3 4 0 0 0 1\n1 2 3 4 0 0 0 1\n", r":2: the time stamp lies before"),
         ("1 2 3\n", "there is no column for px, py, pz, qx"),
         ("vertex index,px,py,pz,qw,qx,qy,qz\n1,2,3,4,1,0,0,0\n", "must be the time stamp"),
-        ("5\n", "a time stamp and values are wanted"),
+        ("5\n", "a time stamp and values are expected"),
     ],
 )
 def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -137,7 +137,7 @@ def test_imu_round_trip(tmp_path: Path) -> None:
 def test_imu_bad_files(tmp_path: Path) -> None:
     path = tmp_path / "imu.csv"
     path.write_text("1,2,3,4\n")
-    with pytest.raises(MapError, match="7 columns are wanted"):
+    with pytest.raises(MapError, match="7 columns are expected"):
         read_imu_csv(path)
     path.write_text("2,1,1,1,1,1,1\n2,1,1,1,1,1,1\n")
     with pytest.raises(MapError, match=r":2: the time stamp does not come after"):

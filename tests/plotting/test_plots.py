@@ -11,7 +11,7 @@ import pytest
 
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.plotting import maps, time_series
@@ -114,5 +114,5 @@ def test_a_plot_does_not_replace_a_file_unasked(vi_map: VIMap, tmp_path: Path) -
         session.run("plot_vi_states_of_mission", plot_file=path)
     with pytest.raises(UserError, match="must end in"):
         check_plot_file(Path("x.jpg"), overwrite=False)
-    with pytest.raises(UserError, match="cannot write"):
+    with pytest.raises(UserError, match="cannot be written"):
         write_figure(time_series.inertial_states(vi_map, 0), path / "y.png")

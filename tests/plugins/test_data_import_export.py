@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from maplab_plugins import data_import_export
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import VIMap, ids
+from tests.interop.recordings.written import make_content, write_folder
 from tests.interop.small_map import RIG_ID, make_map
 
 
@@ -100,7 +101,7 @@ def test_mission_info_lists_every_map(tmp_path: Path, session: Session) -> None:
     "command", ["csv_export", "csv_export_vertices_only", "encc", "export_mission_info"]
 )
 def test_a_place_to_write_to_is_needed(session: Session, command: str) -> None:
-    with pytest.raises(UserError, match="no place to write to: give --"):
+    with pytest.raises(UserError, match="no destination: give --"):
         session.run(command)
 
 
@@ -109,3 +110,18 @@ def test_help_is_complete() -> None:
         described = getattr(data_import_export, name).maplab_command
         assert all(flag.help for flag in described.flags.values())
         assert "overwrite" in described.flags
+
+
+def test_recording_info(tmp_path: Path) -> None:
+    folder = write_folder(make_content(), tmp_path / "room")
+    with Session(load_registry()) as session:  # needs no map
+        report = session.run("recording_info", recording=folder, check_images=True)
+        assert (report.frame_sets, report.checked_images, report.kind) == (8, 16, "EuRoC folder")
+        assert report.as_dict()["imu"]["samples"] == len(make_content().imu_ns)
+        part = session.run("recording_info", recording=folder, vio_rosbag_start_s=0.1)
+        assert part.frame_sets == 6
+        tight = session.run("recording_info", recording=folder, vio_nframe_sync_tolerance_ns=10)
+        assert [camera.unmatched_images for camera in tight.cameras] == [8, 8]
+        assert tight.notes == ("no images match: raise --vio_nframe_sync_tolerance_ns",)
+        with pytest.raises(UserError, match="--imu_topic and --camera_topics apply to bags only"):
+            session.run("recording_info", recording=folder, imu_topic="/imu0")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from maplab_plugins.evaluation import evaluate_trajectory
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.interop.trajectories import Trajectory, write_euroc
 from tests.interop.small_map import make_map
@@ -33,7 +33,7 @@ def test_the_command_reports_no_error_for_the_truth(tmp_path: Path, session: Ses
     report = session.run("evaluate_trajectory", ground_truth=truth)
     assert (report.matched, report.without_ground_truth) == (12, 0)
     assert report.ape_m.rmse < 1e-12
-    assert report.as_json()["ape_m"]["count"] == 12
+    assert report.as_dict()["ape_m"]["count"] == 12
     one = session.run(
         "evaluate_trajectory",
         ground_truth=truth,
@@ -63,3 +63,33 @@ def test_help_is_complete() -> None:
     assert all(flag.help for flag in described.flags.values())
     wanted = {"ground_truth", "map_mission", "alignment", "max_time_difference_s", "interpolate"}
     assert wanted <= set(described.flags)
+
+
+def test_the_second_evaluation_shows_the_difference_to_the_first(
+    tmp_path: Path, session: Session
+) -> None:
+    vi_map = session.vi_map
+    T_R_B = vi_map.T_G_I.copy()
+    T_R_B[:, 4:] += np.random.default_rng(1).normal(0.0, 0.1, (len(T_R_B), 3))
+    write_euroc(Trajectory(vi_map.vertices.timestamp_ns, T_R_B), tmp_path / "truth.csv")
+    session.run("snapshot", "start")
+    first = session.run("evaluate_trajectory", str(tmp_path / "truth.csv"))
+    assert first.baseline is None
+    assert [line.change for line in first.display().errors] == [""] * len(first.display().errors)
+    T_M_I = vi_map.vertices.T_M_I.copy()
+    T_M_I[:, 4] *= 1.5
+    moved = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I))
+    session.maps.update(session.maps.selected.with_value(moved, "test"))
+    second = session.run("evaluate_trajectory", ground_truth=tmp_path / "truth.csv")
+    assert second.baseline.name == "the last evaluation"
+    assert second.baseline.ape_m == first.ape_m.rmse
+    difference = second.ape_m.rmse - first.ape_m.rmse
+    assert second.display().errors[0].change.startswith(f"{difference:+.4g} (")
+    with_snapshot = session.run(
+        "evaluate_trajectory", ground_truth=tmp_path / "truth.csv", baseline="start"
+    )
+    assert with_snapshot.baseline.ape_m == pytest.approx(first.ape_m.rmse)
+    other = session.run("evaluate_trajectory", ground_truth=tmp_path / "truth.csv", alignment="yaw")
+    assert other.baseline is None
+    with pytest.raises(UserError, match="no snapshot 'end'"):
+        session.run("evaluate_trajectory", ground_truth=tmp_path / "truth.csv", baseline="end")

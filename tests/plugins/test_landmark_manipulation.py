@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.vimap.edits import remove_landmarks
 from tests.vimap.builders import walk_map

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from tests.simulation.small import simulated
 

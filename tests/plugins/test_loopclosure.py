@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 DRIFT = (0.2, -0.1, 0.05, 0.01)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
 from maplab_py.vimap.consistency import check_consistency
 from tests.vimap.builders import walk_map
@@ -38,7 +38,8 @@ def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: 
     before = session.vi_map
     planned = session.run("lsparsify", num_landmarks_to_keep=15, dry_run=True, coverage_csv=table)
     assert session.vi_map is before
-    done = session.run("landmark_sparsify", num_landmarks_to_keep=15)
+    assert not table.exists()
+    done = session.run("landmark_sparsify", num_landmarks_to_keep=15, coverage_csv=table)
     assert len(session.vi_map.landmarks) == 15 == planned.landmarks_after == done.landmarks_after
     assert check_consistency(session.vi_map).errors == ()
     header, *lines = table.read_text().splitlines()

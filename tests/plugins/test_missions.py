@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from tests.console.sample_plugin import map_of
 
@@ -47,7 +47,7 @@ def test_a_wrong_mission_is_an_error_and_not_the_first_one(session: Session, com
 
 
 def test_remove_missions(session: Session) -> None:
-    with pytest.raises(UserError, match="say which mission"):
+    with pytest.raises(UserError, match="no mission is given"):
         session.run("remove_mission")
     with pytest.raises(UserError, match="--yes"):
         session.run("remove_mission", map_mission="1")
@@ -55,3 +55,39 @@ def test_remove_missions(session: Session) -> None:
     assert len(session.vi_map.missions) == 1
     session.run("undo")
     assert len(session.vi_map.missions) == 3
+
+
+def test_a_mission_is_renamed_and_found_by_its_name(session: Session) -> None:
+    report = session.run("rename_mission", "monday", map_mission="2")
+    assert report.text.endswith("to 'monday'")  # type: ignore[attr-defined]
+    assert list(session.vi_map.missions.name) == ["", "monday", ""]
+    session.run("sbk", map_mission="mon")
+    assert known(session) == [False, True, False]
+    session.run("undo")
+    session.run("undo")
+    assert list(session.vi_map.missions.name) == ["", "", ""]
+
+
+def test_wrong_names(session: Session) -> None:
+    session.run("rename_mission", "monday", map_mission="2")
+    with pytest.raises(UserError, match="another mission is named 'monday'"):
+        session.run("rename_mission", "monday", map_mission="1")
+    with pytest.raises(UserError, match="cannot be a name"):
+        session.run("rename_mission", "a,b", map_mission="1")
+    with pytest.raises(UserError, match="--map_mission is empty"):
+        session.run("rename_mission", "tuesday")
+    with pytest.raises(UserError, match=r"no mission begins with 'wed'.*monday \(2000\)"):
+        session.run("sbk", map_mission="wed")
+
+
+def test_map_stats_has_a_row_for_each_mission_and_details_of_a_chosen_one(
+    session: Session,
+) -> None:
+    session.run("rename_mission", "monday", map_mission="2")
+    table = session.run("map_stats").display()
+    assert [line.mission for line in table.missions][1] == "monday"
+    assert all(line.closures == 0 for line in table.missions)
+    assert table.summary.startswith("3 missions: ")
+    details = session.run("map_stats", map_mission="monday")
+    assert details.display() is details
+    assert [mission["name"] for mission in details.as_dict()["missions"]] == ["monday"]

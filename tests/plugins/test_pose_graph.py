@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from maplab_py.algorithms.loop_closure.closing import find_loop_closures
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.algorithms.loop_closure.workflow import find_loop_closures
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from tests.algorithms.loop_closure.rooms import Walk, make_map
@@ -76,7 +76,7 @@ def test_entries_without_a_vertex_are_told(session: Session, tmp_path: Path) -> 
         "relax_external", relax_external_loop_closures_file=tmp_path / "closures.yaml"
     )
     assert "no loop closure edges" in report.failure
-    assert "no vertex within 20 ms" in report.notes[0]
+    assert "without a vertex within 20 ms" in report.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_entries_without_a_vertex_are_told(session: Session, tmp_path: Path) -> 
             "[{camera_from: {timestamp_ns: 1, pose: {rotation_xyzw: [0], translation_m: [1]}}}]",
             "4 numbers",
         ),
-        ("[", "not YAML"),
+        ("[", "not valid YAML"),
     ],
 )
 def test_wrong_files_are_errors(session: Session, tmp_path: Path, text: str, message: str) -> None:
@@ -111,7 +111,7 @@ def test_a_graph_is_exported_imported_and_relaxed(session: Session, tmp_path: Pa
     before = np.linalg.norm(graph.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
     report = session.run("relax")
     assert report.failure == ""
-    assert "no descriptors" in report.loop_closures.notes[0]
+    assert "no binary descriptors" in report.loop_closures.notes[0]
     assert len(session.vi_map.loop_closure_edges) == len(graph.loop_closure_edges) > 0
     after = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
     assert after < 0.5 * before

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError
 from tests.vimap.builders import walk_map
 
@@ -47,7 +47,7 @@ def test_vertices_are_disturbed_and_undo_puts_them_back(session: Session) -> Non
 
 
 def test_missions_are_laid_apart(session: Session) -> None:
-    assert "1 missions" in session.run("spatially_distribute_missions").text
+    assert "1 mission " in session.run("spatially_distribute_missions").text
     np.testing.assert_array_equal(session.vi_map.T_G_M[0, 4:], [20.0, 0.0, 0.0])
     session.run("set_all_mission_baseframes_to_known")
     assert "nothing" in session.run("spatially_distribute_missions").text

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.self_calibration.database import device_of
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.algorithms.self_calibration import checks
+from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.algorithms.self_calibration.segments import file as database_file
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status
+from maplab_py.console.terminal.foreground import SECONDS_OF_GRACE
+from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.storage.native import save_map
@@ -49,6 +61,40 @@ def test_a_dry_run_changes_nothing_and_the_command_does(session: Session, tmp_pa
     assert database.is_file()
 
 
+@pytest.mark.parametrize("moment", ["calibrated", "saving"])
+def test_ctrl_c_leaves_no_thread_that_writes_the_database(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Cancelled means that the database and the map are as before."""
+    database = tmp_path / "device.segments"
+
+    def interrupted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*words: Any, **flags: Any) -> Any:
+            result = function(*words, **flags) if moment == "calibrated" else None
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(3.0 * SECONDS_OF_GRACE)
+            return function(*words, **flags) if moment == "saving" else result
+
+        return call
+
+    module, name = (
+        (checks, "calibrate_with_checks") if moment == "calibrated" else
+        (database_file, "save_database")
+    )  # fmt: skip
+    monkeypatch.setattr(module, name, interrupted(getattr(module, name)))
+    session.terminal = terminal = ConsoleTerminal()
+    runner = Runner(session, terminal)
+    flags = " ".join(f"--{name}={value}" for name, value in FLAGS.items())
+    before = session.vi_map
+    status = runner.run_text(f"self_calibrate --database={database} {flags}")
+    for thread in threading.enumerate():
+        if thread.name == "command self_calibrate":
+            thread.join(timeout=60.0)  # an abandoned command runs on without effect
+    assert status == Status.CANCELLED
+    assert list(tmp_path.iterdir()) == []
+    assert session.vi_map is before
+
+
 def test_batch_uses_everything(session: Session) -> None:
     report = session.run("self_calibrate", batch=True, **FLAGS)
     assert report.keyframes == 61
@@ -68,7 +114,10 @@ def test_the_joint_filter_leaves_the_lens_alone(session: Session) -> None:
 
 def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
     database = tmp_path / "device.segments"
+    planned = session.run("collect_segments", database=database, dry_run=True, **FLAGS)
+    assert not database.exists()
     collected = session.run("collect_segments", database=database, **FLAGS)
+    assert collected.segments == planned.segments
     shown = session.run("segment_database_stats", database=database)
     assert shown.sessions == 1
     assert len(shown.segments) == collected.segments_kept
@@ -77,7 +126,13 @@ def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None
         "camera": 2,
         "extrinsics": 2,
     }
+    before = database.read_bytes()
+    planned = session.run(
+        "prune_segments", database=database, segments_per_group=1, dry_run=True, **FLAGS
+    )
+    assert database.read_bytes() == before
     pruned = session.run("prune_segments", database=database, segments_per_group=1, **FLAGS)
+    assert pruned == planned
     assert pruned.segments_after < pruned.segments_before == collected.segments_kept
     session.run("export_segments", database=database, map_folder=tmp_path / "map")
     session.run("load", map_folder=tmp_path / "map")
@@ -85,7 +140,7 @@ def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None
     with pytest.raises(UserError, match="no segment"):
         session.run("prune_segments", database=database, missions="abc", **FLAGS)
     for probability in (-1.0, 0.0, 1.0, 2.0, float("nan")):
-        with pytest.raises(UserError, match=r"--probability=.*: wants a number between 0 and 1"):
+        with pytest.raises(UserError, match=r"--probability=.*: must be between 0 and 1"):
             session.run("prune_segments", database=database, probability=probability)
 
 
@@ -123,9 +178,9 @@ def test_mistakes_are_explained(session: Session, tmp_path: Path) -> None:
         session.run("self_calibrate", sc_states="lens")
     with pytest.raises(UserError, match="--sc_groups"):
         session.run("self_calibrate", sc_groups="imu,lens")
-    with pytest.raises(UserError, match="neither with --batch"):
+    with pytest.raises(UserError, match="cannot be combined with --batch"):
         session.run("self_calibrate", batch=True, database=tmp_path / "d")
-    with pytest.raises(UserError, match="one of"):
+    with pytest.raises(UserError, match="cannot be combined"):
         session.run("self_calibrate", batch=True, joint_ekf=True)
     with pytest.raises(UserError, match="max_camera_shift_m"):
         session.run("self_calibrate", max_camera_shift_m=-1.0)

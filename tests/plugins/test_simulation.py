@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.simulation.truth import Truth
 from maplab_py.storage.native import load_map

@@ -1,19 +1,21 @@
-"""Maps in memory and their loading and saving, on a storage that keeps maps in a dictionary."""
+"""Maps in memory, and their loading and saving."""
 
 from __future__ import annotations
 
-import sys
-import types
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.report import Message
+from maplab_py.storage.mission_names import named
+from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap
+from maplab_py.vimap.comparison import is_same
 from tests.console.sample_plugin import map_of
 from tests.vimap.builders import walk_map
 
@@ -24,29 +26,12 @@ def session() -> Session:
 
 
 @pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[Path, VIMap]:
-    """Exchange the native storage for a dictionary; damaged maps are those without missions."""
-    maps: dict[Path, VIMap] = {}
-
-    def load_map(folder: Path, **options: Any) -> tuple[VIMap, Message]:
-        if folder not in maps or not len(maps[folder].missions):
-            raise MapError(f"{folder}: metadata is missing")
-        return maps[folder], Message(f"loaded {folder.name}")
-
-    def save_map(vi_map: VIMap, folder: Path, **options: Any) -> Message:
-        maps[folder] = vi_map
-        return Message(f"saved {folder.name}")
-
-    def find_maps(folder: Path) -> list[Path]:
-        return sorted(path for path in maps if folder in path.parents or path == folder)
-
-    fake: Any = types.ModuleType("maplab_py.storage.native")
-    fake.load_map, fake.save_map, fake.find_maps = load_map, save_map, find_maps
-    fake.is_map_folder = maps.__contains__
-    monkeypatch.setitem(sys.modules, "maplab_py.storage.native", fake)
-    for number in range(3):
-        maps[tmp_path / f"walk_{number}"] = walk_map(seed=number)
-    return maps
+def disk(tmp_path: Path) -> dict[Path, VIMap]:
+    """Three maps in folders, and their values by folder."""
+    folders = [tmp_path / f"walk_{number}" for number in range(3)]
+    for number, folder in enumerate(folders):
+        save_map(walk_map(seed=number), folder)
+    return {folder: load_map(folder)[0] for folder in folders}
 
 
 def test_load_selects_the_map_under_its_folders_name(
@@ -54,9 +39,10 @@ def test_load_selects_the_map_under_its_folders_name(
 ) -> None:
     session.run("load", map_folder=tmp_path / "walk_0")
     assert session.maps.keys == ["walk_0"]
-    assert session.vi_map is disk[tmp_path / "walk_0"]
+    assert list(session.vi_map.missions.name) == ["walk_0"]
+    assert is_same(named(session.vi_map, [""]), disk[tmp_path / "walk_0"])
     assert session.maps.selected.is_saved
-    with pytest.raises(UserError, match="'walk_0' is taken"):
+    with pytest.raises(UserError, match="'walk_0' is in use"):
         session.run("load", map_folder=tmp_path / "walk_0")
     session.run("load", map_folder=tmp_path / "walk_0", map_key="again", assign_new_ids=True)
     assert not session.maps.selected.is_saved
@@ -66,16 +52,17 @@ def test_load_selects_the_map_under_its_folders_name(
 def test_load_all_takes_all_maps_or_none(
     session: Session, disk: dict[Path, VIMap], tmp_path: Path
 ) -> None:
-    disk[tmp_path / "walk_9"] = VIMap()
+    shutil.copytree(tmp_path / "walk_2", tmp_path / "walk_9")
+    (tmp_path / "walk_9" / "vi_map" / "missions").unlink()
     before = session.maps.state
     for command in ("load_all", "load_merge_all_maps", "load_merge_all_submaps"):
         with pytest.raises(MapError, match="walk_9"):
             session.run(command, maps_folder=tmp_path)
     assert session.maps.state is before
-    del disk[tmp_path / "walk_9"]
+    shutil.rmtree(tmp_path / "walk_9")
     session.run("load_all", maps_folder=tmp_path)
     assert session.maps.keys == ["walk_0", "walk_1", "walk_2"]
-    with pytest.raises(UserError, match="is taken"):
+    with pytest.raises(UserError, match="is in use"):
         session.run("load_all", maps_folder=tmp_path)
 
 
@@ -112,11 +99,12 @@ def test_save_needs_a_folder_and_overwrite(
     with pytest.raises(UserError, match="has no folder yet"):
         session.run("save")
     session.run("save", map_folder=tmp_path / "out")
-    assert disk[tmp_path / "out"] is session.vi_map
+    assert is_same(session.vi_map.missions, load_map(tmp_path / "out")[0].missions)
     assert session.maps.selected.is_saved
-    with pytest.raises(UserError, match="give --overwrite"):
-        session.run("save")
-    session.run("save", overwrite=True)
+    with pytest.raises(UserError, match="use --overwrite"):
+        session.run("save", map_folder=tmp_path / "walk_0")
+    session.run("save", map_folder=tmp_path / "walk_0", overwrite=True)
+    assert len(load_map(tmp_path / "walk_0")[0].missions) == 2
 
 
 def test_save_all_writes_nothing_when_one_map_cannot_be_saved(
@@ -124,13 +112,90 @@ def test_save_all_writes_nothing_when_one_map_cannot_be_saved(
 ) -> None:
     session.maps.add("a", map_of(1))
     session.maps.add("walk_0", map_of(2))
-    before = dict(disk)
     with pytest.raises(UserError, match="'walk_0'"):
         session.run("save_all", maps_folder=tmp_path)
-    assert disk == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["walk_0", "walk_1", "walk_2"]
     session.run("save_all", maps_folder=tmp_path / "out")
-    assert len(disk[tmp_path / "out" / "walk_0"].missions) == 2
+    assert len(load_map(tmp_path / "out" / "walk_0")[0].missions) == 2
     assert session.maps.unsaved == []
+
+
+def test_a_map_is_saved_back_to_its_own_folder_without_a_flag(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to("walk_0")
+    session.run("load", map_folder=Path("walk_0"))
+    for folder in (None, Path("link"), tmp_path / "walk_0"):
+        session.run("evaluate_landmark_quality")
+        session.run("save", map_folder=folder)
+        assert session.maps.selected.is_saved
+    session.run("save_all")
+    with pytest.raises(UserError, match="use --overwrite"):
+        session.run("save", map_folder=tmp_path / "walk_1")
+    session.run("set_map_folder", map_folder=tmp_path / "walk_1")
+    with pytest.raises(UserError, match="use --overwrite"):
+        session.run("save")
+
+
+def test_what_another_console_has_saved_is_replaced_only_by_force(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    folder = tmp_path / "walk_0"
+    with Session() as other:
+        for console in (session, other):
+            console.run("load", map_folder=folder)
+        other.run("load_merge_map", map_folder=tmp_path / "walk_1")
+        other.run("save")
+        for flags in ({}, {"overwrite": True}, {"overwrite": True, "dry_run": True}):
+            with pytest.raises(UserError, match=r"changed by another program.*--force"):
+                session.run("save", **flags)
+        assert len(load_map(folder)[0].missions) == 2
+        session.run("save", force=True)
+        assert len(load_map(folder)[0].missions) == 1
+        session.run("save")  # what it has written itself is known
+        with pytest.raises(UserError, match="--force"):
+            other.run("save")
+
+
+def test_two_maps_of_one_console_do_not_replace_each_other(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    for key in ("a", "b"):
+        session.run("load", map_folder=tmp_path / "walk_0", map_key=key)
+    session.run("load_merge_map", map_folder=tmp_path / "walk_1")
+    session.run("save")
+    session.run("select_map", "a")
+    with pytest.raises(UserError, match="--force"):
+        session.run("save")
+
+
+def test_save_all_keeps_account_of_what_was_saved_before_it_failed(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    from maplab_py.atomic import replaced_folder
+
+    session.run("load_all", maps_folder=tmp_path)
+    session.maps.select("walk_0")
+    session.run("set_all_mission_baseframes_to_known")
+    with replaced_folder(tmp_path / "walk_1"):  # another console is saving there
+        report = session.run("save_all")
+        assert "not saved: walk_1, walk_2" in report.failure
+        assert "another program is saving" in report.failure
+    assert session.maps.get("walk_0").is_saved
+
+
+def test_a_command_without_effect_does_not_mark_the_map(
+    session: Session, disk: dict[Path, VIMap], tmp_path: Path
+) -> None:
+    session.run("load", map_folder=tmp_path / "walk_0")
+    entry = session.maps.selected
+    session.run("set_all_mission_baseframes_to_unknown")
+    session.run("use_map_resource_folder")
+    session.run("schema")
+    session.run("set_map_folder", map_folder=tmp_path / "walk_0")
+    assert session.maps.selected.is_saved
+    assert session.maps.selected == entry
 
 
 def test_map_folder_can_be_chosen(session: Session, tmp_path: Path) -> None:

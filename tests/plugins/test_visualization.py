@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from maplab_plugins.visualization.following import Following
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.ply import PlyCloud, read_ply, write_ply
+from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.storage.resource_types import RESOURCE_TYPES
 from maplab_py.storage.resources import relative_path
@@ -264,10 +264,32 @@ def test_clouds_are_where_their_owners_are(with_resources: Session, tmp_path: Pa
     expected = se3.transform(vi_map.T_G_M[0], POINTS)
     np.testing.assert_allclose(_cloud(with_resources), expected, atol=1e-6)
     assert _layers(report)["color point cloud"] == (3, True)
-    written = read_ply(out)
+    written = parse_ply(out.read_bytes(), out.name)
     np.testing.assert_allclose(written.p, expected, atol=1e-5)
     assert written.colours is not None
     assert (written.colours == 7).all()
+
+
+def test_a_mesh_of_a_file_is_shown_in_the_global_frame(session: Session, tmp_path: Path) -> None:
+    file = tmp_path / "mesh.ply"
+    write_ply(PlyCloud(POINTS, faces=np.array([[0, 1, 2]], dtype=np.int32)), file)
+    report = session.run("visualize_mesh", mesh_file=file)
+    assert _layers(report)["mesh.ply"] == (1, True)
+    np.testing.assert_array_equal(_cloud(session), POINTS)
+
+
+def test_wrong_meshes_are_refused(session: Session, tmp_path: Path) -> None:
+    file = tmp_path / "mesh.ply"
+    with pytest.raises(UserError, match="create_tsdf_from_depth_resource makes one"):
+        session.run("visualize_mesh")
+    with pytest.raises(UserError, match="cannot be read"):
+        session.run("visualize_mesh", mesh_file=file)
+    write_ply(PlyCloud(POINTS), file)
+    with pytest.raises(UserError, match="no triangles"):
+        session.run("visualize_mesh", mesh_file=file)
+    write_ply(PlyCloud(POINTS, faces=np.array([[0, 1, 7]], dtype=np.int32)), file)
+    with pytest.raises(MapError, match="a vertex that is not there"):
+        session.run("visualize_mesh", mesh_file=file)
 
 
 def test_depth_maps_become_points(with_resources: Session) -> None:
@@ -294,5 +316,5 @@ def test_resources_that_are_missing_are_named(with_resources: Session, session: 
     with pytest.raises(UserError, match="no resources of type 'point_cloud_w_intensity'"):
         with_resources.run("visualize_xyzi_pointclouds")
     with_resources.maps.add("unsaved", walk_map(seed=3))
-    with pytest.raises(UserError, match="never loaded or saved"):
+    with pytest.raises(UserError, match="no resources of type 'point_cloud'"):
         with_resources.run("visualize_xyz_pointclouds")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from maplab_py.interop.ply import PlyCloud, write_ply
+from maplab_py.interop.resources.matching import camera_frames, mission_rig
 from maplab_py.storage.native import save_map
 from maplab_py.storage.resource_types import RESOURCE_TYPES
 from maplab_py.storage.resources import relative_path
@@ -61,3 +62,19 @@ def _write(path: Path, name: str) -> None:
     else:
         shape = (24, 32, 3) if "color" in name else (24, 32)
         cv2.imwrite(str(path), np.full(shape, 80, dtype=np.uint8))
+
+
+def write_stamped_files(vi_map: VIMap, folder: Path) -> None:
+    """Write images, depth maps and clouds of the first vertices, named by their time stamps."""
+    camera = mission_rig(vi_map, 0).cameras[0]
+    images = folder / "images_of_v1_01" / "mav0" / "cam0"
+    for place in (images / "data", folder / "depth_of_v1_01", folder / "clouds_of_v1_01"):
+        place.mkdir(parents=True)
+    stamps = vi_map.frames.timestamp_ns[camera_frames(vi_map, 0, 0)[:3]].tolist()
+    size = camera.height_px, camera.width_px
+    for stamp in stamps:
+        cv2.imwrite(str(images / "data" / f"{stamp}.png"), np.full(size, 80, dtype=np.uint8))
+        depth = np.full(size, 2500, dtype=np.uint16)
+        cv2.imwrite(str(folder / "depth_of_v1_01" / f"{stamp}.png"), depth)
+        write_ply(PlyCloud(np.eye(3)), folder / "clouds_of_v1_01" / f"{stamp}.ply")
+    (images / "data.csv").write_text("".join(f"{stamp},{stamp}.png\n" for stamp in stamps))

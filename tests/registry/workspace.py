@@ -13,14 +13,18 @@ from typing import Any
 
 import numpy as np
 import yaml
+from pymap3d import enu2geodetic
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
-from tests.registry.resources import save_with_resources
+from tests.frontend.simulated import REST_FIRST, replayed
+from tests.interop.recordings.written import make_content, write_folder
+from tests.registry.resources import save_with_resources, write_stamped_files
 from tests.simulation.small import simulated
+from tests.support.stereo_room import StereoRoom, quarter_size
 
 ROUND = Scenario(
     name="round",
@@ -35,6 +39,7 @@ ROUND = Scenario(
 
 MERGED = "load_merge_all_maps --maps_folder=maps --target_map_key=office; elq"
 PREPARED = {
+    "rovioli": "",
     "cancel": "",
     "load": "",
     "load_all": "",
@@ -74,9 +79,23 @@ for _name in ("segment_database_stats", "prune_segments", "export_segments"):
 PREPARED["self_calibrate"] = f"{MERGED}; set --sc_states=intrinsics,extrinsics_rotation"
 PREPARED["remove_loopclosure"] = f"{MERGED}; lc"
 PREPARED["simulate"] = f"{MERGED}; !rm -r simulated"
+PREPARED["tour"] = "!mkdir -p maplab_tour/sessions && touch maplab_tour/sessions/truth.npz"
 PREPARED["relax_external"] = f"{MERGED}; sbk --map_mission=59f0; sbk --map_mission=a1"
 PREPARED["import_g2o"] = f"{MERGED}; export_g2o graph.g2o"
+PREPARED["import_calibration"] = f"{MERGED}; export_calibration --format=kalibr --folder=kalibr"
+PREPARED["import_trajectory"] = (
+    f"{MERGED}; ettc --pose_export_file=poses.csv --csv_export_format=rpg --map_mission=59f0"
+)
 PREPARED["visualize_difference"] = f"{MERGED}; snapshot before; rlq"
+
+for _name in ("export_images", "remove_resources", "clean_up_resource_folders"):
+    PREPARED[_name] = "load with_resources/office"
+_ROOM = "load stereo_room/session_1; import_images stereo_room/raw/session_1"
+PREPARED["stereo_dense_reconstruction"] = _ROOM
+PREPARED["convert_all_depth_maps_to_point_clouds"] = f"{_ROOM}; sdr"
+PREPARED["create_tsdf_from_depth_resource"] = f"{_ROOM}; sdr"
+PREPARED["create_mesh_from_tsdf_grid"] = f"{_ROOM}; sdr; tsdf"
+PREPARED["visualize_mesh"] = PREPARED["create_mesh_from_tsdf_grid"]
 
 _SHOWING = ("images", "depth_maps", "disparity_maps", "pointclouds")
 
@@ -107,10 +126,14 @@ SLOW = (
 def make_workspace(folder: Path) -> None:
     """Write the maps and files that examples name."""
     data = simulated(ROUND)
-    first, second = (
-        _with_mission_id(vi_map, id_)
-        for vi_map, id_ in zip(data.maps, (0x59F0, 0xA1B2), strict=True)
-    )
+    (folder / "simulated").mkdir()
+    data.truth.save(folder / "simulated" / "truth.npz")
+    write_workspace(folder, *data.maps)
+
+
+def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
+    """Write two maps, and the files that examples name, under the names of the examples."""
+    first, second = _with_mission_id(first, 0x59F0), _with_mission_id(second, 0xA1B2)
     for place, vi_map in (
         ("maps/v1_01", first),
         ("maps/v1_02", second),
@@ -121,14 +144,26 @@ def make_workspace(folder: Path) -> None:
         save_map(vi_map, folder / place)
     save_with_resources(first, folder / "with_resources" / "office")
     _write_closures(first, second, folder / "closures.yaml")
+    _write_fixes(first, folder / "track.csv")
     sensors = next((folder / "maps" / "v1_01").rglob("sensors.yaml"))
     (folder / "sensors.yaml").write_bytes(sensors.read_bytes())
     (folder / "images").mkdir()
-    (folder / "simulated").mkdir()
-    data.truth.save(folder / "simulated" / "truth.npz")
+    write_stamped_files(first, folder)
+    StereoRoom.simulated(folder / "stereo_room", quarter_size(frame_rate_hz=2.0))
+    write_folder(make_content(), folder / "MH_01_easy")
+    save_map(replayed(REST_FIRST, 1)[0], folder / "walk")  # a recording to replay
     with Session() as session:
         session.run("load", map_folder=folder / "maps" / "v1_01")
-        session.run("ettc", pose_export_file=folder / "V1_01_easy.csv", csv_export_format="rpg")
+        for name in ("V1_01_easy.csv", "vil.csv"):
+            session.run("ettc", pose_export_file=folder / name, csv_export_format="rpg")
+
+
+def _write_fixes(vi_map: VIMap, path: Path) -> None:
+    """Write the positions of the vertices of a map as a satellite receiver would give them."""
+    positions = enu2geodetic(*vi_map.T_G_I[:, 4:].T, 47.3769, 8.5417, 450.0)
+    rows = zip(vi_map.vertices.timestamp_ns.tolist(), *positions, strict=True)
+    lines = [f"{time_ns},{lat:.10f},{lon:.10f},{alt:.4f}" for time_ns, lat, lon, alt in rows]
+    path.write_text("\n".join(["timestamp,latitude,longitude,altitude", *lines]))
 
 
 def _write_closures(first: VIMap, second: VIMap, path: Path) -> None:

@@ -217,8 +217,12 @@ BAD = [
     ("image_height: 480", "", f"camera {CAMERA_ID}: key 'image_height' is missing"),
     ("image_height: 480", "image_height: 480.5", "must be a whole number"),
     ("image_height: 480", "image_height: 0", "must be positive"),
-    ("type: unified-projection", "type: fancy", "'fancy' is none of pinhole, unified-projection"),
-    ("type: equidistant", "type: odd", "camera .*distortion: key 'type': 'odd' is none of"),
+    (
+        "type: unified-projection",
+        "type: fancy",
+        "'fancy' is not one of pinhole, unified-projection",
+    ),
+    ("type: equidistant", "type: odd", "camera .*distortion: key 'type': 'odd' is not one of"),
     ("type: unified-projection", "type: pinhole", "'intrinsics' needs 4 values, not 5"),
     ("[[0.9], [400]", "[[0.9], [-400]", "focal lengths must be positive"),
     ("[[0.9], [400]", "[[0.9], [.inf]", "not finite numbers"),
@@ -228,7 +232,7 @@ BAD = [
     ("0, 0, 1, 0.3, 0, 0, 0, 1]", "0, 0, 1, 0.3, 0, 0, 0, 2]", "last row must be 0 0 0 1"),
     ("data: [0, 1, 0, 0.1,", "data: [0, -1, 0, 0.1,", "is not a rotation matrix"),
     ("T_C_B:", "T_B_X:", "key 'T_B_C' is missing"),
-    ("        T_C_B:", "        T_B_C: 1\n        T_C_B:", "exclude each other"),
+    ("        T_C_B:", "        T_B_C: 1\n        T_C_B:", "cannot be combined"),
     (f"sensor_id: {RIG_ID}", f"sensor_id: {CAMERA_ID}", "there is no sensor"),
     (f"sensor_id: {RIG_ID}", f"sensor_id: {IMU_ID}", "two entries|its own base"),
     ("data: [1,0,0,0, 0,1,0,0,", "data: [1,0,0,5, 0,1,0,0,", "its own base"),
@@ -253,13 +257,13 @@ def test_bad_input_is_one_clear_line(old: str, new: str, message: str) -> None:
 
 @pytest.mark.parametrize("text", ["- 1\n", "just text", "3", "sensors: [1]", "sensors: [null]"])
 def test_wrong_structure_is_refused(text: str) -> None:
-    with pytest.raises(MapError, match=r"sensors.yaml: key-value pairs are wanted"):
+    with pytest.raises(MapError, match=r"sensors.yaml: key-value pairs are expected"):
         parse_sensors(text, "sensors.yaml")
 
 
 def test_base_sensors_in_a_circle_are_refused() -> None:
     text = FULL.replace(f"base_sensor_id: {IMU_ID}", f"base_sensor_id: {RIG_ID}", 1)
-    with pytest.raises(MapError, match="circle"):
+    with pytest.raises(MapError, match="cycle"):
         parse_sensors(text, "x").T_I_C(IMU_ID, RIG_ID)
 
 
@@ -295,7 +299,7 @@ def test_legacy_files(tmp_path: Path) -> None:
     assert sensors.T_I_C(IMU_ID, RIG_ID)[0, 4] == 7.0
     again = parse_sensors(write_sensors(sensors), "2.x")
     assert again.camera_rig(RIG_ID).cameras[0].distortion is Distortion.FOV
-    with pytest.raises(MapError, match="one CameraRig is wanted, 0 found"):
+    with pytest.raises(MapError, match="one CameraRig is expected, 0 found"):
         read_legacy_sensors(tmp_path / "imu.yaml", tmp_path / "imu.yaml")
 
 

@@ -10,6 +10,7 @@ from types import ModuleType
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from tests.support.data import REPOSITORY
+from tests.support.noiseless import without_noise
 
 SMALL = Scenario(
     name="small",
@@ -20,7 +21,7 @@ SMALL = Scenario(
         SessionOptions(kind="figure_8", duration_s=4.0, turns=0.3, start_turn=0.1, reverse=True),
     ),
 )
-PERFECT = dataclasses.replace(SMALL.without_noise(), sessions=SMALL.sessions[:1])
+PERFECT = dataclasses.replace(without_noise(SMALL), sessions=SMALL.sessions[:1])
 
 
 @cache

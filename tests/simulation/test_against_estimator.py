@@ -12,7 +12,7 @@ import pytest
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.report import VIOptimizationReport
+from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.geometry import so3

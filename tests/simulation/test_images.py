@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 import yaml
 
-from maplab_py.console.session import Session
+from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import back_project
+from maplab_py.simulation.brightness import Brightness
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.imaging import Imager
 from maplab_py.simulation.mesh import write_mesh
+from maplab_py.simulation.pixel_rays import pixel_rays
 from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.rendering import Scene, make_scene, pixel_rays
+from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import (
     CalibrationOptions,
     CameraOptions,
@@ -33,6 +35,8 @@ from maplab_py.simulation.scenario import (
     WorldOptions,
 )
 from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.scene import Scene, make_scene
+from maplab_py.simulation.shading_kernels import PaintedBoxes
 from maplab_py.simulation.simulate import SimulatedData, simulate
 
 SMALL_CAMERA = CameraOptions(
@@ -58,7 +62,13 @@ def data() -> SimulatedData:
 @cache
 def scene() -> Scene:
     world = data().world
-    return make_scene(world.bounds, world.boxes, 0.01, np.random.default_rng(0))
+    options = ImageOptions(texel_m=0.01)
+    return make_scene(world.bounds, world.boxes, options, np.random.default_rng(0))
+
+
+@cache
+def painted() -> PaintedBoxes:
+    return painted_boxes(scene())
 
 
 def _imager(row: int, **changes: float) -> Imager:
@@ -69,7 +79,8 @@ def _imager(row: int, **changes: float) -> Imager:
     def at_time(time_s: np.ndarray) -> np.ndarray:
         return se3.compose(session.recording.spline.evaluate(time_s).T_G_I, T_I_C)
 
-    return Imager.of(scene(), session.device.true_rig.cameras[row], options, 0.0, at_time)
+    camera, brightness = session.device.true_rig.cameras[row], Brightness(swing=options.gain_swing)
+    return Imager.of(painted(), camera, options, 0.0, at_time, brightness)
 
 
 def _image(row: int, time_s: float = 1.0, **changes: float) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +163,8 @@ def test_features_are_found_and_tracked_through_the_images() -> None:
     T = imager.at_time(np.array([1.0, 1.05]))
     depth = _image(0, 1.0)[1]
     uv = np.round(corners[:, 0]).astype(int)
-    ray = np.concatenate([imager.rays[uv[:, 1], uv[:, 0]], np.ones((len(uv), 1))], axis=1)
+    rays = pixel_rays(session.device.true_rig.cameras[0])
+    ray = np.concatenate([rays[uv[:, 1], uv[:, 0]], np.ones((len(uv), 1))], axis=1)
     p = se3.transform(se3.relative(T[1], T[0]), ray * depth[uv[:, 1], uv[:, 0], None])
     expected = pixels_of(session.device.true_rig.cameras[0], p) - uv
     flow = (moved - corners)[:, 0]

@@ -11,11 +11,11 @@ from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.propagation import propagate
 from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
-from maplab_py.sensors.imu_model import correct_imu
 from maplab_py.simulation.imu import intrinsics_of, measure
 from maplab_py.simulation.motion import motion_spline
 from maplab_py.simulation.scenario import ImuOptions, SessionOptions, WorldOptions
 from maplab_py.simulation.spline import MotionState
+from tests.support.imu_model import correct_imu
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 QUIET = ImuOptions(

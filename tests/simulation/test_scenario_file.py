@@ -22,7 +22,7 @@ def test_named_scenarios_load(name: str) -> None:
 def test_there_are_the_promised_scenarios() -> None:
     wanted = {"single_session", "three_sessions", "four_sessions", "aliased_rooms", "ar_room"}
     wanted |= {"navigation", "degenerate", "large", "false_loop_edges"}
-    wanted |= {"stereo_room"}
+    wanted |= {"stereo_room", "one_room_many_sessions", "loop_many_sessions"}
     assert wanted <= set(scenario_names())
 
 
@@ -39,32 +39,35 @@ def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("imu: {rate_herz: 200}", r"imu.rate_herz: unknown key; did you mean 'rate_hz'\?"),
-        ("imu: {rate_hz: fast}", "imu.rate_hz: a number is wanted, not 'fast'"),
-        ("imu: {rate_hz: true}", "imu.rate_hz: a number is wanted, not True"),
+        ("imu: {rate_hz: fast}", "imu.rate_hz: a number is expected, not 'fast'"),
+        ("imu: {rate_hz: true}", "imu.rate_hz: a number is expected, not True"),
         ("imu: {rate_hz: -1}", "imu.rate_hz: must be greater than 0, not -1"),
         ("imu: {rate_hz: .nan}", "imu.rate_hz: must be a number up to 1e.06, not nan"),
-        ("imu: 3", "imu: a mapping of keys is wanted, not 3"),
-        ("[1, 2]", "the file: a mapping of keys is wanted"),
-        ("", "the file: a mapping of keys is wanted, not None"),
-        ("seeds: {world: 1.5}", "seeds.world: a whole number is wanted, not 1.5"),
+        ("imu: 3", "imu: a mapping of keys is expected, not 3"),
+        ("[1, 2]", "the file: a mapping of keys is expected"),
+        ("", "the file: a mapping of keys is expected, not None"),
+        ("seeds: {world: 1.5}", "seeds.world: a whole number is expected, not 1.5"),
         ("seeds: {world: -1}", "seeds.world: must be 0 or greater"),
-        ("world: {room_size_m: [1, 2]}", "world.room_size_m: 3 values are wanted, not 2"),
-        ("world: {room_size_m: 3}", "world.room_size_m: a list is wanted, not 3"),
+        ("world: {room_size_m: [1, 2]}", "world.room_size_m: 3 values are expected, not 2"),
+        ("world: {room_size_m: 3}", "world.room_size_m: a list is expected, not 3"),
         ("sessions: []", "sessions: at least one is needed"),
         ("cameras: []", "cameras: at least one is needed"),
         ("sessions: [{kind: jump}]", r"sessions\[0\].kind: must be one of room_scan"),
         ("sessions: [{}, {duraton_s: 3}]", r"sessions\[1\].duraton_s: unknown key; did you mean"),
         ("sessions: [{duration_s: 0}]", r"sessions\[0\].duration_s: too short"),
-        ("sessions: [{reverse: 1}]", r"sessions\[0\].reverse: true or false is wanted, not 1"),
+        ("sessions: [{reverse: 1}]", r"sessions\[0\].reverse: true or false is expected, not 1"),
         ("sessions: [{height_m: 3.4}]", r"sessions\[0\].height_m: leads through"),
         ("sessions: [{wall_distance_m: 5}]", r"sessions\[0\].wall_distance_m: leaves no room"),
         ("cameras: [{distortion: fish}]", r"cameras\[0\].distortion: must be one of none"),
-        ("cameras: [{intrinsics: [1]}]", r"cameras\[0\].intrinsics: 4 values are wanted, not 1"),
-        ("world: {layout: tower}", "world.layout: must be one of rooms, corridor, not 'tower'"),
+        ("cameras: [{intrinsics: [1]}]", r"cameras\[0\].intrinsics: 4 values are expected, not 1"),
+        (
+            "world: {layout: tower}",
+            "world.layout: must be one of rooms, corridor, city, not 'tower'",
+        ),
         ("world: {layout: corridor, corridor_width_m: 3}", "world.corridor_width_m: must not"),
         (
             "world: {layout: corridor, corridor_width_m: 2}",
-            r"sessions\[0\].kind: the corridor layout has no room for",
+            r"sessions\[0\].kind: room_scan needs world.layout: rooms",
         ),
         ("sessions: [{kind: corridor}]", r"sessions\[0\].kind: corridor needs world.layout"),
         ("sessions: [{room: 1}]", r"sessions\[0\].room: must be from 0 to 0"),

@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.atomic import replaced_folder
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.native import find_maps, load_map, save_map
+from maplab_py.storage.native import disk_copy, find_maps, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
@@ -247,6 +248,34 @@ def test_same_map_same_bytes_and_resources_stay(tmp_path: Path) -> None:
     assert resource.read_bytes() == b"P5"
 
 
+def test_what_else_lies_in_the_folder_stays(tmp_path: Path) -> None:
+    vi_map, _ = load_map(shared_data(SUBMAP))
+    folder = tmp_path / "map"
+    save_map(vi_map, folder)
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk/a.pgm").write_bytes(b"P5")
+    (folder / "resources").symlink_to("../disk")
+    (folder / "notes.txt").write_text("kitchen, second floor")
+    save_map(vi_map, folder, overwrite=True)
+    assert (folder / "resources").is_symlink()
+    assert (folder / "resources/a.pgm").read_bytes() == b"P5"
+    assert (folder / "notes.txt").read_text() == "kitchen, second floor"
+    (folder / "notes.txt").write_text("changed")
+    assert load_map(folder)[1].notes == []
+
+
+def test_the_fingerprint_stands_for_the_content(tmp_path: Path) -> None:
+    vi_map, _ = load_map(shared_data(SUBMAP))
+    first = save_map(vi_map, tmp_path / "a").fingerprint
+    assert save_map(vi_map, tmp_path / "b").fingerprint == first
+    assert disk_copy(tmp_path / "a").fingerprint == first
+    (tmp_path / "a/vi_map/sensors.yaml").write_text("sensors: []\n")
+    assert disk_copy(tmp_path / "a").fingerprint != first
+    with pytest.raises(UserError, match="--force"):
+        save_map(vi_map, tmp_path / "a", overwrite=True, known=first)
+    assert save_map(vi_map, tmp_path / "a", known=first, force=True).fingerprint == first
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path: Path) -> None:
@@ -274,8 +303,6 @@ def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="the lock is a POSIX one")
 def test_the_second_program_that_saves_is_told(tmp_path: Path) -> None:
-    from maplab_py.storage.atomic import replaced_folder
-
     vi_map, _ = load_map(shared_data(SUBMAP))
     with replaced_folder(tmp_path / "map") as temporary:
         with pytest.raises(UserError, match="another program is saving"):

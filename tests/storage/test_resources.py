@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resource_types import RESOURCE_TYPES, resource_type

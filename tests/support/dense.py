@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.factor_terms import FactorTerm
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.estimation.inertial_terms import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem import Problem
+from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import States
 from maplab_py.estimation.symbolic.sources import inertial
-from maplab_py.estimation.visual_terms import Cameras, Observations, VisualTerms
+from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
+from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig, Imu
 from maplab_py.sensors.projection import project, project_with_jacobians

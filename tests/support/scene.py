@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, ImuIntrinsics, Projection
-from maplab_py.sensors.imu_model import distort_imu
 from maplab_py.sensors.projection import is_inside_image, project
 from maplab_py.sensors.sensor_set import Extrinsics, SensorSet
 from maplab_py.vimap import VIMap
@@ -31,6 +30,7 @@ from maplab_py.vimap.tables import (
     MissionSensor,
     Vertices,
 )
+from tests.support.imu_model import distort_imu
 
 F64 = NDArray[np.float64]
 

@@ -23,6 +23,7 @@ from maplab_py.vimap import (
     Vertices,
     VIMap,
 )
+from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import from_hex, random_ids
 
 IMU_ID, RIG_ID, CAMERA_ID, ODOMETRY_ID = "1" * 32, "2" * 32, "3" * 32, "4" * 32
@@ -87,7 +88,7 @@ def walk_map(
             vertex=steps,
             timestamp_ns=time,
             keypoint_count=counts,
-            descriptor_size=np.full(vertices, 8),
+            descriptor_blocks=binary_blocks(counts, 8),
         ),
         keypoints=keypoints,
         landmarks=Landmarks.filled(

@@ -80,7 +80,7 @@ def test_double_ids_and_gaps_are_found():
     ids = m.landmarks.id.copy()
     ids[4] = ids[3]
     twice = check_consistency(m.replace(landmarks=m.landmarks.replace(id=ids)))
-    assert [v.rule for v in twice.errors] == ["landmark id that is there twice"]
+    assert [v.rule for v in twice.errors] == ["landmark id that occurs twice"]
     cut = m.replace(transformation_edges=m.transformation_edges.take([0]))
     keep = np.arange(len(m.imu_edges)) != 6
     samples = np.repeat(keep, m.imu_edges.sample_count)

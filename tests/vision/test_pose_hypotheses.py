@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from maplab_py.geometry import se3, so3
 from maplab_py.vision.absolute_pose import HYPOTHESES, solve_poses
-from maplab_py.vision.pose_kernels import three_point
+from maplab_py.vision.minimal_solvers import three_point
 from tests.vision.synthetic import pose_problems
 from tests.vision.test_absolute_pose import errors
 

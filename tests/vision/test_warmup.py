@@ -1,12 +1,23 @@
 from __future__ import annotations
 
+import numpy as np
+
 from maplab_py.vision import kmeans, pose_kernels, projection, search_kernels, track_union
-from maplab_py.vision.warmup import compile_poses, compile_search
+from maplab_py.vision.absolute_pose import HYPOTHESES
+from maplab_py.vision.features import corner_kernels
+from maplab_py.vision.tracking import tracker, two_point_kernels
+from maplab_py.vision.warmup import SEARCH, pose_job, vision_jobs
+from tests.vision.tracking.rendered import pose, stereo
+
+
+def compile_usual_kernels():
+    jobs = vision_jobs()
+    jobs[SEARCH]()
+    jobs[pose_job(HYPOTHESES[0])]()
 
 
 def test_warmup_compiles_every_kernel_that_place_recognition_calls():
-    compile_search()
-    compile_poses()
+    compile_usual_kernels()
     for kernel in (
         kmeans._nearest,
         projection._sum_table,
@@ -20,11 +31,10 @@ def test_warmup_compiles_every_kernel_that_place_recognition_calls():
 
 
 def test_a_search_on_a_map_compiles_nothing_more():
-    from maplab_py.algorithms.loop_closure.closing import close_loops
+    from maplab_py.algorithms.loop_closure.workflow import close_loops
     from tests.algorithms.loop_closure.rooms import Walk, make_map
 
-    compile_search()
-    compile_poses()
+    compile_usual_kernels()
     kernels = (
         kmeans._nearest,
         projection._sum_table,
@@ -36,4 +46,22 @@ def test_a_search_on_a_map_compiles_nothing_more():
     before = [list(kernel.signatures) for kernel in kernels]
     vi_map, _ = make_map([Walk(room=1), Walk(room=1, start_s=60.0)])
     close_loops(vi_map)
+    assert [list(kernel.signatures) for kernel in kernels] == before
+
+
+def test_tracking_compiles_nothing_after_the_warmup():
+    tracker.compile_kernels()
+    kernels = (
+        corner_kernels.corner_strengths,
+        corner_kernels.occupy_all,
+        corner_kernels.select_corners,
+        two_point_kernels.search_turn,
+        two_point_kernels.search_two_point,
+    )
+    before = [list(kernel.signatures) for kernel in kernels]
+    assert all(before)
+    rig = stereo()
+    frame_tracker = tracker.FrameTracker(rig.cameras, rig.T_I_C)
+    for time_ns, turn in enumerate((None, np.eye(3), None)):
+        frame_tracker.track(time_ns, rig.images(pose(y=0.02 * time_ns)), turn)
     assert [list(kernel.signatures) for kernel in kernels] == before

@@ -1,1 +1,1 @@
-"""Anchoring: find how missions of unknown base frame lie among the known ones."""
+"""Anchoring: estimate unknown base frames of missions relative to known ones."""

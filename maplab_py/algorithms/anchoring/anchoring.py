@@ -1,7 +1,8 @@
-"""Anchor missions: align all pairs, drop contradictions, grow the best tree, fit the base frames.
+"""Anchor missions: align pairs, reject contradictions, grow a spanning tree, fit base frames.
 
-The result depends neither on the order of missions nor on which are known: all pairs are aligned
-and compared first, the tree takes those with most inliers first, the fit takes all that fit it.
+The result depends neither on the order of the missions nor on which of them are known: all pairs
+are aligned and compared first, the tree takes pairs in order of inliers, and the fit uses all pairs
+that are consistent with the tree.
 """
 
 from __future__ import annotations
@@ -12,25 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
-from maplab_py.algorithms.anchoring.options import (
-    AnchoringOptions,
-    AnchoringReport,
-    MissionAlignment,
+from maplab_py.algorithms.anchoring.hypotheses import described_hypotheses
+from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.algorithms.anchoring.pairs import (
+    USED,
+    Pair,
+    align_pairs,
+    consistent,
+    fits,
+    strongest_pairs,
 )
-from maplab_py.algorithms.anchoring.pairs import USED, Pair, align_pairs, consistent, fits
-from maplab_py.algorithms.loop_closure.closing import describe, with_quality
-from maplab_py.algorithms.loop_closure.closures import VERDICTS
+from maplab_py.algorithms.anchoring.reports import AnchoringReport, MissionAlignment
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
+from maplab_py.algorithms.loop_closure.alignment_contest import AlignmentChoice
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.recording import with_closures
-from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.loop_closure.record_updates import with_closures
+from maplab_py.algorithms.loop_closure.workflow import describe
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import yaw
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _DEFAULT = AnchoringOptions()
 _LOOPS = LoopClosureOptions()
@@ -42,21 +46,25 @@ def anchor_missions(
     loop_options: LoopClosureOptions = _LOOPS,
     *,
     missions: I64 | None = None,
+    choice: AlignmentChoice | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, AnchoringReport]:
     """Anchor missions of unknown base frame to those of known one.
 
-    Landmarks, poses in the missions' own frames and known base frames stay as they are. A mission
-    without a trustworthy chain of alignments to a known mission stays unknown.
+    Landmarks, poses in mission frames and known base frames do not change. A mission
+    without a trustworthy chain of alignments to a known mission stays unknown. The detected
+    closures are recorded in the map, unless no mission was anchored: then the map does not change.
 
     Args:
         vi_map: The map.
         options: When missions count as aligned.
         loop_options: How places are recognised.
         missions: Mission rows to anchor; None = all unknown ones. Others may serve as bridges.
+        choice: An alignment that a person has chosen; `options.hypothesis` is one, too.
         progress: Progress.
 
     Raises:
+        UserError: The chosen alignment does not exist.
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
     names = [to_hex(words)[:8] for words in vi_map.missions.id]
@@ -68,18 +76,26 @@ def anchor_missions(
         wanted &= ~known
     if not known.any() or not wanted.any():
         return vi_map, _nothing_to_do(names, known, wanted)
-    judged, notes = with_quality(vi_map, progress)
+    if options.hypothesis:
+        choice = AlignmentChoice(options.hypothesis)
+    judged, notes = evaluate_unknown_quality(vi_map, progress)
     detection = detect(
         judged,
         loop_options,
         missions=np.arange(len(known)),
         only_other_missions=True,
         trust_base_frames=False,
+        choice=choice,
         progress=progress,
     )
-    pairs = align_pairs(_sightings(judged, detection), _looks_alike(judged, detection), options)
-    pairs = consistent(pairs, options, names)
-    T_G_M, reached, pairs = _spread(yaw.from_pose(vi_map.T_G_M), known, pairs, options)
+    T_G_M, reached, pairs = _aligned(
+        yaw.from_pose(vi_map.T_G_M),
+        known,
+        _sightings(judged, detection),
+        _undecided(detection),
+        options,
+        names,
+    )
     used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
     if used:
         T_G_M = fit_missions(_joined(used), T_G_M, known | ~reached)
@@ -93,8 +109,11 @@ def anchor_missions(
             for i in np.flatnonzero(wanted & ~reached)
         },
         alignments=tuple(alignments),
+        hypotheses=described_hypotheses(detection.contests, names),
         notes=notes,
     )
+    if not anchored.any():
+        return vi_map, report
     result = _with_base_frames(vi_map, T_G_M, anchored)
     return with_closures(result, detection.closures, "anchor"), report
 
@@ -128,15 +147,9 @@ def _described(pair: Pair, names: list[str]) -> MissionAlignment:
     )
 
 
-def _looks_alike(vi_map: VIMap, detection: Detection) -> I64:
-    """Count closures (M, M; upper triangle) that were refused since places look alike."""
-    c = detection.closures
-    rows = np.flatnonzero(c.verdict == VERDICTS.index(Verdict.AMBIGUOUS))
-    ends = np.stack([c.query_vertex[rows], c.place_vertex[rows]])
-    pair = np.sort(vi_map.vertices.mission[ends], axis=0)
-    count = np.zeros((len(vi_map.missions),) * 2, dtype=np.int64)
-    np.add.at(count, (pair[0], pair[1]), 1)
-    return count
+def _undecided(detection: Detection) -> dict[tuple[int, int], str]:
+    """Return the pairs of missions that have alignments of which none wins, with the reason."""
+    return {c.pair.missions: c.reason for c in detection.contests if c.winner < 0}
 
 
 def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
@@ -158,14 +171,39 @@ def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
     )
 
 
+def _aligned(
+    T_G_M: F64,
+    known: NDArray[np.bool_],
+    sightings: Sightings,
+    undecided: dict[tuple[int, int], str],
+    options: AnchoringOptions,
+    names: list[str],
+) -> tuple[F64, NDArray[np.bool_], list[Pair]]:
+    """Align the strongest pairs and grow the tree; align all pairs if a mission is not reached."""
+    wanted = strongest_pairs(sightings, len(known))
+    pairs = align_pairs(sightings, undecided, options, wanted)
+    T, reached, pairs = _spread(T_G_M, known, consistent(pairs, options, names), options)
+    joined = np.unique(np.concatenate([sightings.mission_A, sightings.mission_B]))
+    is_complete = len(wanted) == len(np.unique(_pair_keys(sightings)))
+    if is_complete or reached[joined].all():
+        return T, reached, pairs
+    pairs = consistent(align_pairs(sightings, undecided, options), options, names)
+    return _spread(T_G_M, known, pairs, options)
+
+
+def _pair_keys(sightings: Sightings) -> I64:
+    size = int(sightings.mission_B.max(initial=0)) + 1
+    return np.asarray(sightings.mission_A * size + sightings.mission_B)
+
+
 def _spread(
     T_G_M: F64, known: NDArray[np.bool_], pairs: list[Pair], options: AnchoringOptions
 ) -> tuple[F64, NDArray[np.bool_], list[Pair]]:
     """Grow a maximum spanning tree from the known missions (Prim).
 
     Returns:
-        Where the missions are, which are reached, and the pairs: those that contradict the tree
-        over a longer cycle have that as their verdict.
+        The poses of the missions, a mask of reached missions, and the pairs; pairs that contradict
+        the tree over a longer cycle are marked as such.
     """
     T_G_M, reached = T_G_M.copy(), known.copy()
     ranked = sorted((p for p in pairs if p.verdict == USED), key=lambda p: -p.weight)
@@ -185,7 +223,7 @@ def _spread(
 def _against_tree(
     pair: Pair, T_G_M: F64, reached: NDArray[np.bool_], options: AnchoringOptions
 ) -> Pair:
-    """Refuse a pair that does not fit where the tree put its missions."""
+    """Reject a pair that contradicts the poses of its missions in the tree."""
     if pair.verdict != USED or not (reached[pair.a] and reached[pair.b]):
         return pair
     T_B_A = yaw.compose(yaw.inverse(T_G_M[pair.b]), T_G_M[pair.a])

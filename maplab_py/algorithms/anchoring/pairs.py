@@ -1,28 +1,25 @@
-"""Alignments of pairs of missions: fitted, judged by their own closures, then by each other."""
+"""Estimate alignments of pairs of missions and test them by their closures and by cycles."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.anchoring.alignment import Sightings, agreeing, fit_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import yaw
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 USED = "used"
+_PAIRS_PER_MISSION = 10
 _CYCLE_TOLERANCE = 1.5
-"""A cycle may be open by as many times what single closures may differ by: drift adds up."""
+"""Tolerance of a cycle in multiples of the tolerance of single closures; drift accumulates."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pair:
-    """How two missions lie in each other by their closures."""
+    """Alignment of two missions estimated from their closures."""
 
     a: int
     b: int
@@ -43,31 +40,70 @@ class Pair:
         return float(np.sqrt(np.mean(gap**2))) if len(gap) else 0.0
 
 
-def align_pairs(sightings: Sightings, looks_alike: I64, options: AnchoringOptions) -> list[Pair]:
-    """Align every pair of missions that closures join.
+def align_pairs(
+    sightings: Sightings,
+    undecided: dict[tuple[int, int], str],
+    options: AnchoringOptions,
+    wanted: set[tuple[int, int]] | None = None,
+) -> list[Pair]:
+    """Align pairs of missions that closures join.
 
     Args:
         sightings: The accepted closures.
-        looks_alike: Closures (M, M) that were refused since places look alike, upper triangle.
+        undecided: Pairs whose closures support no unique alignment, with the reason.
         options: When two missions count as aligned.
+        wanted: The pairs to align; None = all.
     """
-    joined = np.stack([sightings.mission_A, sightings.mission_B], axis=1)
-    doubted = np.argwhere(looks_alike > 0)
+    rows = _rows_of_pairs(sightings)
     pairs = []
-    for a, b in np.unique(np.concatenate([joined, doubted]), axis=0).tolist():
-        between = sightings.take((sightings.mission_A == a) & (sightings.mission_B == b))
-        count = len(between.weight)
-        if count == 0:
-            verdict = (
-                f"{looks_alike[a, b]} closures with places that look like other places, and none "
-                "that tells which of them it is"
-            )
-            pairs.append(Pair(a, b, np.zeros(4), between, 0, verdict))
-            continue
-        T_B_A, agree = agreeing(between, options)
-        pair = Pair(a, b, T_B_A, between.take(agree), count)
-        pairs.append(_judged(_fitted(pair), options))
+    for a, b in sorted({*rows, *undecided}):
+        mine = rows.get((a, b), np.zeros(0, dtype=np.int64))
+        between = sightings.take(mine)
+        if (a, b) in undecided:
+            pairs.append(Pair(a, b, np.zeros(4), between, len(mine), undecided[a, b]))
+        elif wanted is None or (a, b) in wanted:
+            T_B_A, agree = agreeing(between, options)
+            pair = Pair(a, b, T_B_A, between.take(agree), len(mine))
+            pairs.append(_judged(_fitted(pair), options))
     return pairs
+
+
+def strongest_pairs(sightings: Sightings, missions: int) -> set[tuple[int, int]]:
+    """Return the strongest pairs of each mission and a maximum spanning forest of all.
+
+    Their number is in proportion to the missions, where that of all pairs grows with the square. In
+    a map of few missions they are all pairs.
+    """
+    rows = _rows_of_pairs(sightings)
+    ranked = sorted(rows, key=lambda pair: (-float(sightings.weight[rows[pair]].sum()), pair))
+    count = np.zeros(missions, dtype=np.int64)
+    root = list(range(missions))
+
+    def tree(mission: int) -> int:
+        while root[mission] != mission:
+            mission = root[mission]
+        return mission
+
+    chosen = set()
+    for a, b in ranked:
+        joins = tree(a) != tree(b)
+        if joins or min(count[a], count[b]) < _PAIRS_PER_MISSION:
+            root[tree(b)] = tree(a)
+            count[[a, b]] += 1
+            chosen.add((a, b))
+    return chosen
+
+
+def _rows_of_pairs(sightings: Sightings) -> dict[tuple[int, int], I64]:
+    """Return the rows of the closures of each pair of missions."""
+    size = int(sightings.mission_B.max(initial=0)) + 1
+    key = sightings.mission_A * size + sightings.mission_B
+    order = np.argsort(key, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
+    return {
+        (int(sightings.mission_A[rows[0]]), int(sightings.mission_B[rows[0]])): rows
+        for rows in parts
+    }
 
 
 def _fitted(pair: Pair) -> Pair:
@@ -84,7 +120,7 @@ def _fitted(pair: Pair) -> Pair:
 def _judged(pair: Pair, options: AnchoringOptions) -> Pair:
     agreed = len(pair.sightings.weight)
     if agreed < options.min_inlier_count:
-        verdict = f"{agreed} closures agree, {options.min_inlier_count} are wanted"
+        verdict = f"{agreed} closures agree, {options.min_inlier_count} are needed"
     elif agreed < options.min_inlier_ratio * pair.closures:
         verdict = f"only {agreed} of {pair.closures} closures agree"
     else:
@@ -93,12 +129,12 @@ def _judged(pair: Pair, options: AnchoringOptions) -> Pair:
 
 
 def consistent(pairs: list[Pair], options: AnchoringOptions, names: list[str]) -> list[Pair]:
-    """Refuse pairs that contradict others: going round three missions must lead back.
+    """Reject pairs that contradict others: every cycle of three missions must close.
 
-    Of three alignments that contradict each other, at least one is wrong. Each triangle speaks for
-    or against its pairs with the inliers of its weakest one; the pair with most against it (of
-    equals the weakest) goes, until nothing contradicts. A pair that has nothing but a contradiction
-    to show, and is not clearly stronger than its opponents, goes with them.
+    Of three alignments that contradict each other, at least one is wrong. Each triangle votes for
+    or against its pairs with the number of inliers of its weakest pair. The pair with most votes
+    against it (of equals the weakest) is rejected until no contradiction remains. A pair with
+    contradictions only is rejected too unless it is clearly stronger than its opponents.
     """
     verdicts = {(p.a, p.b): p.verdict for p in pairs}
     used = {(p.a, p.b): p for p in pairs if p.verdict == USED}
@@ -133,13 +169,15 @@ _Triangle = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
 def _triangles(
     used: dict[tuple[int, int], Pair], options: AnchoringOptions
 ) -> tuple[list[_Triangle], list[_Triangle]]:
-    """Return the triangles of pairs that do not close, and those that do."""
-    missions = sorted({mission for edge in used for mission in edge})
+    """Return the inconsistent and the consistent triangles of pairs."""
+    partners: dict[int, set[int]] = {}
+    for a, b in used:  # a < b
+        partners.setdefault(a, set()).add(b)
     open_: list[_Triangle] = []
     closed: list[_Triangle] = []
-    for a, b, c in itertools.combinations(missions, 3):
-        triangle = ((a, b), (b, c), (a, c))
-        if all(edge in used for edge in triangle):
+    for a, b in sorted(used):
+        for c in sorted(partners[a] & partners.get(b, set())):
+            triangle = ((a, b), (b, c), (a, c))
             ab, bc, ac = (used[edge] for edge in triangle)
             over = yaw.compose(bc.T_B_A, ab.T_B_A)
             (closed if fits(ac, over, options) else open_).append(triangle)
@@ -147,7 +185,7 @@ def _triangles(
 
 
 def fits(pair: Pair, T_B_A: F64, options: AnchoringOptions) -> bool:
-    """Tell whether an alignment that others imply puts the pair's closures where they belong."""
+    """Return whether the alignment implied by other pairs agrees with the pair's closures."""
     gap = float(np.median(_gaps(T_B_A, pair.sightings)))
     turn = abs(float(yaw.wrap(T_B_A[3] - pair.T_B_A[3])))
     return (
@@ -157,6 +195,6 @@ def fits(pair: Pair, T_B_A: F64, options: AnchoringOptions) -> bool:
 
 
 def _gaps(T_B_A: F64, sightings: Sightings) -> F64:
-    """Return how far apart (N,) [m] the two sides of closures are."""
+    """Return the distances (N,) [m] between the two ends of closures."""
     gap = yaw.transform(T_B_A, sightings.T_A_I[:, 4:]) - sightings.T_B_I[:, 4:]
     return np.asarray(np.linalg.norm(gap, axis=1))

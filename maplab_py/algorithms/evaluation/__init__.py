@@ -1,1 +1,1 @@
-"""How far a trajectory is from the truth: absolute and relative pose errors."""
+"""Absolute and relative pose errors of trajectories."""

@@ -6,18 +6,16 @@ Following Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IR
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.evaluation.options import ALIGNMENTS, ErrorStatistics
+from maplab_py.algorithms.evaluation.options import ALIGNMENTS
+from maplab_py.algorithms.evaluation.reports import ErrorStatistics
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import align_yaw_position, apply_similarity, umeyama
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 ALL_PAIRS_TOLERANCE = 0.1
-"""Part of delta by which the length of a piece may deviate when all pairs are used, as in evo."""
+"""Relative tolerance of the length of a segment when all pairs are used, as in evo."""
 
 
 def statistics(errors: F64) -> ErrorStatistics:
@@ -34,7 +32,7 @@ def statistics(errors: F64) -> ErrorStatistics:
 
 
 def align(T_R_B: F64, T_G_I: F64, alignment: str) -> tuple[F64, float]:
-    """Return the estimate laid on the reference (N, 7), and the scale.
+    """Return the estimate aligned with the reference (N, 7), and the scale.
 
     Args:
         T_R_B: Reference poses (N, 7).
@@ -45,7 +43,7 @@ def align(T_R_B: F64, T_G_I: F64, alignment: str) -> tuple[F64, float]:
         EstimationError: Too few points, points on a line, or an unknown alignment.
     """
     if alignment not in ALIGNMENTS:
-        raise EstimationError(f"alignment '{alignment}' is none of {', '.join(ALIGNMENTS)}")
+        raise EstimationError(f"alignment '{alignment}' is not one of {', '.join(ALIGNMENTS)}")
     if alignment == "none":
         return T_G_I, 1.0
     if alignment == "yaw":
@@ -72,26 +70,26 @@ def relative_errors(T_R_B: F64, T_R_I: F64, pairs: I64) -> tuple[F64, F64]:
 def pairs_by_frames(count: int, delta: int, *, all_pairs: bool) -> I64:
     """Return pairs (P, 2) of rows that are `delta` rows apart."""
     if delta < 1:
-        raise EstimationError("a piece of the relative pose error must span at least one frame")
+        raise EstimationError("a segment of the relative pose error must span at least one frame")
     rows = np.arange(0, count, 1 if all_pairs else delta, dtype=np.int64)
     rows = rows[rows + delta < count]
     return np.stack([rows, rows + delta], axis=1)
 
 
 def pairs_by_length(steps: F64, delta: float, *, all_pairs: bool) -> I64:
-    """Return pairs (P, 2) of rows between which the steps add up to `delta`.
+    """Return pairs (P, 2) of rows with a distance of `delta` along the path.
 
-    Consecutive pieces end where their length first reaches delta. With all pairs, each row is
+    Consecutive segments end where their length first reaches delta. With all pairs, each row is
     paired with the later row whose distance along the path is nearest to delta, if it is within
     10 % of it.
 
     Args:
         steps: Length (N - 1,) of the step from each row to the next: metres or seconds, >= 0.
         delta: Wanted length in the same unit, > 0.
-        all_pairs: Pieces from every row on.
+        all_pairs: Start a segment at every row.
     """
     if delta <= 0.0:
-        raise EstimationError("the length of a piece of the relative pose error must be positive")
+        raise EstimationError("the length of a segment of the relative pose error must be positive")
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     if not all_pairs:
         return _consecutive(steps, travelled, delta)
@@ -109,7 +107,7 @@ def pairs_by_length(steps: F64, delta: float, *, all_pairs: bool) -> I64:
 
 
 def _consecutive(steps: F64, travelled: F64, delta: float) -> I64:
-    """Cut the path greedily; each piece is summed afresh, so that no rounding is carried on."""
+    """Split the path greedily; each segment is summed separately to avoid accumulated rounding."""
     cuts = [0]
     while True:
         begin = cuts[-1]

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.evaluation import pose_errors
-from maplab_py.algorithms.evaluation.options import (
-    DELTA_UNITS,
+from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.reports import (
     ErrorStatistics,
     MissionEvaluation,
-    TrajectoryEvaluationOptions,
     TrajectoryEvaluationReport,
 )
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.association import nearest_rows
@@ -20,9 +20,6 @@ from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ids
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _MIN_MATCHED = 3
 _GAP_STEPS = 3
@@ -36,11 +33,11 @@ def evaluate_trajectory(
     missions: NDArray[np.integer] | None = None,
     progress: Progress = SILENT,
 ) -> TrajectoryEvaluationReport:
-    """Return the errors of the vertices' T_G_I, all chosen missions laid on the truth together.
+    """Return the errors of the vertices' T_G_I after a joint alignment of the chosen missions.
 
-    The relative errors are taken within missions. The body frame of the ground truth may be
-    turned against the IMU by a constant rotation; that leaves positions alone, but not the
-    relative errors, see `align_body_frame`.
+    Relative errors are computed within missions. A constant rotation between the body frame of the
+    ground truth and the IMU changes the relative errors but not the positions; see
+    `align_body_frame`.
 
     Args:
         vi_map: Map whose vertices have time stamps of the ground truth's clock.
@@ -91,10 +88,10 @@ def evaluate_trajectory(
 def match(
     ground_truth: Trajectory, times_ns: I64, options: TrajectoryEvaluationOptions
 ) -> tuple[F64, NDArray[np.bool_]]:
-    """Return the ground-truth poses (N, 7) at the times (N,) and where there is one (N,).
+    """Return the ground-truth poses (N, 7) at the times (N,) and a mask (N,) of those that exist.
 
-    There is one where a pose lies within the tolerance; interpolated poses must not bridge a gap,
-    which is more than twice the tolerance and more than three usual steps of the ground truth.
+    A pose exists if the ground truth has one within the tolerance. Interpolation does not bridge
+    gaps longer than twice the tolerance and three median steps of the ground truth.
     """
     if len(ground_truth) == 0:
         return se3.identity(len(times_ns)), np.zeros(len(times_ns), dtype=np.bool_)
@@ -123,8 +120,10 @@ def _vertex_rows(vi_map: VIMap, missions: NDArray[np.integer] | None) -> I64:
 def _no_match_message(
     vi_map: VIMap, rows: I64, ground_truth: Trajectory, matched: NDArray[np.bool_]
 ) -> str:
-    found = int(np.count_nonzero(matched))
-    message = f"only {found} of {len(rows)} vertices have ground truth, {_MIN_MATCHED} are needed"
+    match_count = int(np.count_nonzero(matched))
+    message = (
+        f"only {match_count} of {len(rows)} vertices have ground truth, {_MIN_MATCHED} are needed"
+    )
     if len(rows) == 0 or len(ground_truth) == 0:
         return message
     times = vi_map.vertices.timestamp_ns[rows]
@@ -135,7 +134,7 @@ def _no_match_message(
 
 
 def _similarity(T_R_B: F64, T_G_I: F64) -> tuple[ErrorStatistics | None, float | None]:
-    """Return position errors after a Sim(3) alignment and its scale, where there is one."""
+    """Return position errors after a Sim(3) alignment and its scale; None if it is degenerate."""
     try:
         aligned, scale = pose_errors.align(T_R_B, T_G_I, "sim3")
     except EstimationError:
@@ -146,7 +145,7 @@ def _similarity(T_R_B: F64, T_G_I: F64) -> tuple[ErrorStatistics | None, float |
 def _relative(
     vi_map: VIMap, rows: I64, T_R_B: F64, T_R_I: F64, options: TrajectoryEvaluationOptions
 ) -> tuple[ErrorStatistics | None, ErrorStatistics | None]:
-    """Return statistics of the relative errors in metres and degrees, pieces within missions."""
+    """Return statistics of the relative errors [m], [deg] of segments within missions."""
     mission = vi_map.vertices.mission[rows]
     times_s = (vi_map.vertices.timestamp_ns[rows] - vi_map.vertices.timestamp_ns[rows].min()) * 1e-9
     if options.rpe_delta_unit not in DELTA_UNITS:
@@ -176,7 +175,7 @@ def _relative(
 def _by_mission(
     vi_map: VIMap, rows: I64, T_R_B: F64, options: TrajectoryEvaluationOptions
 ) -> tuple[MissionEvaluation, ...]:
-    """Evaluate each mission aligned on its own."""
+    """Evaluate each mission with a separate alignment."""
     mission = vi_map.vertices.mission[rows]
     results = []
     for members in _groups(mission):

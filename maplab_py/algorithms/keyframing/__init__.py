@@ -1,1 +1,1 @@
-"""Keyframing: which vertices are worth keeping."""
+"""Keyframing: selection of the vertices to keep."""

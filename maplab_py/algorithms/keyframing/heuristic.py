@@ -1,4 +1,4 @@
-"""Heuristic keyframing: walk along each mission and keep the vertices that bring something new."""
+"""Heuristic keyframing: keep vertices of each mission that add new information."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.keyframing.options import KeyframingOptions, KeyframingReport
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.keyframing.reports import KeyframingReport
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import mission_mask
+from maplab_py.vimap.queries import mission_mask, observation_counts
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.vertex_removal import remove_vertices_counted
 
-Mask = NDArray[np.bool_]
-
 
 class Reason(IntEnum):
-    """Why a vertex is a keyframe, in the order in which maplab asks."""
+    """Reason why a vertex is a keyframe, in the order of maplab's checks."""
 
     NONE = 0
     MISSION_END = 1
@@ -37,7 +36,6 @@ def keyframe(
     *,
     missions: NDArray[np.int64] | None = None,
     progress: Progress = SILENT,
-    dry_run: bool = False,
 ) -> tuple[VIMap, KeyframingReport]:
     """Keep keyframes and remove the vertices between them.
 
@@ -48,13 +46,14 @@ def keyframe(
         vi_map: The map.
         options: When a vertex becomes a keyframe.
         missions: Mission rows; None = all.
-        progress: Where to learn of cancellation.
-        dry_run: Only report what would go; the map is returned as it is.
+        progress: Reports progress and checks for cancellation.
     """
     reason = choose_keyframes(vi_map, options, missions=missions, progress=progress)
     chosen = mission_mask(vi_map, missions)[vi_map.vertices.mission]
     result, removal = remove_vertices_counted(vi_map, chosen & (reason == Reason.NONE))
     count = np.bincount(reason[chosen], minlength=len(Reason))
+    had = observation_counts(vi_map) >= 2
+    undetermined = int(np.count_nonzero(had & (observation_counts(result) < 2)))
     report = KeyframingReport(
         vertices_before=int(chosen.sum()),
         vertices_after=int(chosen.sum()) - removal.vertices,
@@ -67,12 +66,22 @@ def keyframe(
         rotation=int(count[Reason.ROTATION]),
         observations_removed=removal.observations,
         landmarks_moved=removal.landmarks_moved,
+        landmarks_undetermined=undetermined,
         imu_edges_dropped=removal.imu_edges_dropped,
         transformation_edges_dropped=removal.transformation_edges_dropped,
         resources_removed=removal.resources,
-        dry_run=dry_run,
+        note=_note(undetermined, int(np.count_nonzero(had))),
     )
-    return (vi_map if dry_run else result), report
+    return result, report
+
+
+def _note(undetermined: int, landmarks: int) -> str:
+    if 2 * undetermined <= landmarks:
+        return ""
+    return (
+        f"{undetermined} of {landmarks} landmarks keep fewer than two observations and are bad until lc "
+        "merges them; a smaller --kf_every_nth_vertex or larger --kf_min_shared_landmarks_obs keeps more"
+    )
 
 
 def choose_keyframes(
@@ -82,10 +91,10 @@ def choose_keyframes(
     missions: NDArray[np.int64] | None = None,
     progress: Progress = SILENT,
 ) -> NDArray[np.int8]:
-    """Return why each vertex (V,) is a keyframe, `Reason.NONE` where it is not.
+    """Return the reason why each vertex (V,) is a keyframe, or `Reason.NONE`.
 
-    Vertices of other missions are `Reason.NONE` too. The walk is sequential by nature: each
-    verdict depends on the last keyframe.
+    Vertices of other missions are `Reason.NONE` too. The loop is sequential because each decision
+    depends on the last keyframe.
     """
     walk = _Walk(vi_map, options)
     reason = np.zeros(len(vi_map.vertices), dtype=np.int8)
@@ -105,7 +114,7 @@ def choose_keyframes(
 
 
 class _Walk:
-    """The state of the walk: the last keyframe and the landmarks it sees."""
+    """Loop state: the last keyframe and the landmarks that it observes."""
 
     def __init__(self, vi_map: VIMap, options: KeyframingOptions) -> None:
         self._options = options

@@ -1,4 +1,4 @@
-"""Options and report of heuristic keyframing; maplab's names and defaults."""
+"""Options of heuristic keyframing; maplab's names and defaults."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
-from maplab_py.report import Report
 
 
 @dataclasses.dataclass(frozen=True)
 class KeyframingOptions:
-    """When a vertex becomes a keyframe."""
+    """Criteria for keyframes."""
 
     flag_prefix: ClassVar[str] = "kf_"
 
@@ -34,26 +33,3 @@ class KeyframingOptions:
         for name in ("distance_threshold_m", "rotation_threshold_deg", "min_shared_landmarks_obs"):
             if getattr(self, name) < 0:
                 raise FlagError(f"--kf_{name} must not be negative")
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyframingReport(Report):
-    """Keyframes by the first reason that applied, and what goes with the other vertices."""
-
-    vertices_before: int
-    vertices_after: int
-    # keyframes by reason
-    mission_ends: int
-    every_nth: int
-    few_shared_landmarks: int
-    absolute_pose: int
-    loop_closure: int
-    distance: int
-    rotation: int
-    # what the removed vertices take along
-    observations_removed: int
-    landmarks_moved: int
-    imu_edges_dropped: int
-    transformation_edges_dropped: int
-    resources_removed: int
-    dry_run: bool = False

@@ -1,1 +1,1 @@
-"""Landmarks: triangulation, quality, tracks, and what is wrong with their observations."""
+"""Landmarks: triangulation, quality, tracks and invalid observations."""

@@ -11,13 +11,18 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class LandmarkQualityOptions:
-    """When a landmark counts as well constrained."""
+    """Criteria for well-constrained landmarks."""
 
     flag_prefix: ClassVar[str] = "elq_"
 
-    min_observers: int = option(4, help="Smallest number of vertices that observe a landmark.")
+    min_observers: int = option(2, help="Smallest number of vertices that observe a landmark.")
     min_observation_angle_deg: float = option(
-        5.0, help="Smallest angle between the two most different rays.", unit="deg"
+        2.0, help="Smallest angle between the two most different rays.", unit="deg"
+    )
+    max_relative_sigma: float = option(
+        0.05,
+        help="Largest standard deviation of a landmark along its worst axis, relative to its distance from "
+        "the closest observer; predicted from its rays and reprojection errors; negative = not checked.",
     )
     min_distance_from_closest_observer: float = option(
         0.05, help="Smallest distance of a landmark from its closest observer.", unit="m"
@@ -62,7 +67,7 @@ class LandmarkQualityOptions:
 
 @dataclasses.dataclass(frozen=True)
 class InvalidObservationOptions:
-    """Which observations contradict their landmark."""
+    """Criteria for invalid observations."""
 
     flag_prefix: ClassVar[str] = "rio_"
 

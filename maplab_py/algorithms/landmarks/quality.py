@@ -1,4 +1,4 @@
-"""Which landmarks are well constrained (maplab's rules)."""
+"""Landmark quality: tests whether landmarks are well constrained by the geometry of their rays."""
 
 from __future__ import annotations
 
@@ -7,33 +7,44 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.landmarks.covariance import landmark_covariance, largest_sigma
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.reports import LandmarkQualityReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.queries import landmark_mask
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+_USUAL_SIGMA_PX = 1.0
+"""Standard deviation of keypoints of which the map has none."""
+
+_REASONS = {
+    "too_few_observers": "with too few observers",
+    "too_small_angle": "seen from too similar directions",
+    "too_uncertain": "too uncertain",
+    "too_near_or_behind": "too near to or behind a camera",
+    "too_far": "too far away",
+    "too_large_error": "with too large an error",
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Verdict:
-    """Reasons (L,) against each of some landmarks."""
+    """Failed quality criteria (L,) of landmarks."""
 
     too_few_observers: Mask
     too_small_angle: Mask
+    too_uncertain: Mask
     too_near_or_behind: Mask
     too_far: Mask
     too_large_error: Mask
 
     @property
     def is_good(self) -> Mask:
-        """Landmarks without a reason against them."""
+        """Landmarks that pass all criteria."""
         reasons = [getattr(self, field.name) for field in dataclasses.fields(self)]
         return np.asarray(~np.any(reasons, axis=0))
 
@@ -47,14 +58,15 @@ def evaluate_quality(
 ) -> tuple[VIMap, LandmarkQualityReport]:
     """Set the quality of every landmark stored in the missions to good or bad.
 
-    Good: seen by enough vertices, from directions that differ enough, in front of every camera
-    that sees it and not too near or far of the closest, with no large reprojection error.
+    Good: seen by two vertices, from directions that differ, with a predicted standard deviation that
+    is small compared with its distance, in front of every camera that sees it and not too near or far
+    of the closest, with no large reprojection error.
 
     Args:
         vi_map: The map.
         options: The thresholds.
         missions: Mission rows; None = all.
-        progress: Where to learn of cancellation.
+        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -65,8 +77,7 @@ def evaluate_quality(
     quality = vi_map.landmarks.quality.copy()
     before = quality[rows]
     quality[rows] = np.where(verdict.is_good, LandmarkQuality.GOOD, LandmarkQuality.BAD)
-    reasons = {f.name: int(getattr(verdict, f.name).sum()) for f in dataclasses.fields(verdict)}
-    report = _report(before, quality[rows], reasons)
+    report = _report(before, quality[rows], _counts(verdict))
     return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), report
 
 
@@ -84,7 +95,7 @@ def reset_quality(
 
 
 def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Verdict:
-    """Return the reasons against landmarks (N,); observations of all missions count."""
+    """Return the failed criteria of landmarks (N,); observations of all missions count."""
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks)]
     start = starts_of_counts(np.diff(vi_map.observation_start)[landmarks])
     of_landmark = np.repeat(np.arange(len(landmarks)), np.diff(start))
@@ -99,6 +110,7 @@ def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Ver
     observers = _distinct(vi_map.keypoint_vertex[keypoints], of_landmark, len(landmarks))
     closest = _least(seen.signed_distance_m, start, empty=np.inf)
     angle_deg = np.rad2deg(largest_ray_angle(directions, start))
+    sigma_m = _scaled_sigma(vi_map, landmarks, keypoints, seen.error_px, start)
     worst_px = -_least(-seen.error_px, start, empty=np.inf)
     worst_m = -_least(-np.nan_to_num(seen.error_m), start, empty=np.inf)
     o = options
@@ -107,6 +119,9 @@ def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Ver
     return Verdict(
         too_few_observers=observers < np.where(lidar, o.lidar_min_observers, o.min_observers),
         too_small_angle=~lidar & (angle_deg < o.min_observation_angle_deg),
+        too_uncertain=~lidar
+        & (o.max_relative_sigma >= 0.0)
+        & ~(sigma_m <= o.max_relative_sigma * closest),
         too_near_or_behind=closest
         < np.where(
             lidar,
@@ -128,6 +143,48 @@ def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Ver
             checks_px & (worst_px > o.max_reprojection_error_px),
         ),
     )
+
+
+def predicted_sigma(vi_map: VIMap, landmarks: I64) -> F64:
+    """Return the standard deviations (N,) [m] of landmarks along their worst axes.
+
+    The covariance by rays is multiplied by the variance of unit weight where that exceeds 1: the median
+    squared reprojection error in deviations over that of Gaussian noise (chi-square with two degrees of
+    freedom: 2 ln 2). The median ignores single wrong observations.
+
+    Args:
+        vi_map: The map.
+        landmarks: Landmark rows (N,).
+    """
+    keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks)]
+    start = starts_of_counts(np.diff(vi_map.observation_start)[landmarks])
+    p_G = np.repeat(vi_map.p_G[landmarks], np.diff(start), axis=0)
+    return _scaled_sigma(
+        vi_map, landmarks, keypoints, residuals(vi_map, keypoints, p_G).error_px, start
+    )
+
+
+def _scaled_sigma(vi_map: VIMap, landmarks: I64, keypoints: I64, error_px: F64, start: I64) -> F64:
+    given = vi_map.keypoints.sigma_px.astype(np.float64)
+    sigma_px = np.where(given > 0.0, given, _USUAL_SIGMA_PX)
+    sigma_m = largest_sigma(landmark_covariance(vi_map, landmarks, sigma_px))
+    squared = np.square(error_px / sigma_px[keypoints])
+    variance = np.maximum(_medians(squared, start) / (2.0 * np.log(2.0)), 1.0)
+    return np.asarray(sigma_m * np.sqrt(variance))
+
+
+def _medians(values: F64, start: I64) -> F64:
+    """Return the median (L,) of each group of values, 0 where there is none."""
+    count = np.diff(start)
+    owner = np.repeat(np.arange(len(count)), count)
+    ordered = values[np.lexsort((values, owner))]
+    medians = np.zeros(len(count))
+    filled = np.flatnonzero(count)
+    first, middle = start[:-1][filled], count[filled] // 2
+    upper = ordered[first + middle]
+    lower = ordered[first + np.maximum(count[filled] - 1, 0) // 2]
+    medians[filled] = np.where(np.isinf(upper), np.inf, 0.5 * (lower + upper))
+    return medians
 
 
 def _distinct(vertex: NDArray[np.int32], group: I64, groups: int) -> I64:
@@ -152,6 +209,7 @@ def _report(
     old = np.bincount(before, minlength=3)
     new = np.bincount(after, minlength=3)
     unknown, bad, good = LandmarkQuality.UNKNOWN, LandmarkQuality.BAD, LandmarkQuality.GOOD
+    note = mostly_bad(int(new[bad]), len(after), reasons)
     return LandmarkQualityReport(
         landmarks=len(after),
         good=int(new[good]),
@@ -160,5 +218,54 @@ def _report(
         good_before=int(old[good]),
         bad_before=int(old[bad]),
         unknown_before=int(old[unknown]),
-        **reasons,
+        too_few_observers=reasons.get("too_few_observers", 0),
+        too_small_angle=reasons.get("too_small_angle", 0),
+        too_uncertain=reasons.get("too_uncertain", 0),
+        too_near_or_behind=reasons.get("too_near_or_behind", 0),
+        too_far=reasons.get("too_far", 0),
+        too_large_error=reasons.get("too_large_error", 0),
+        note=note,
     )
+
+
+def mostly_bad(bad: int, landmarks: int, reasons: dict[str, int]) -> str:
+    """Return a note if most landmarks are bad, else nothing.
+
+    Args:
+        bad: Number of bad landmarks.
+        landmarks: Number of landmarks.
+        reasons: Number of landmarks by name of the criterion that they fail.
+    """
+    if 2 * bad <= landmarks:
+        return ""
+    causes = sorted(((count, name) for name, count in reasons.items() if count), reverse=True)
+    listed = ", ".join(f"{count} {_REASONS[name]}" for count, name in causes)
+    return f"{bad} of {landmarks} landmarks are bad" + (f": {listed}" if listed else "")
+
+
+def evaluate_unknown_quality(
+    vi_map: VIMap, progress: Progress = SILENT
+) -> tuple[VIMap, tuple[str, ...]]:
+    """Evaluate the landmarks of unknown quality only.
+
+    Returns:
+        The map and notes for the report, empty if no quality was unknown.
+    """
+    unknown = vi_map.landmarks.quality == LandmarkQuality.UNKNOWN
+    if not unknown.any():
+        return vi_map, ()
+    progress.check()
+    rows = np.flatnonzero(unknown)
+    verdict = judge(vi_map, rows, LandmarkQualityOptions())
+    quality = vi_map.landmarks.quality.copy()
+    quality[rows] = np.where(verdict.is_good, LandmarkQuality.GOOD, LandmarkQuality.BAD)
+    judged = vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality))
+    bad = int(np.count_nonzero(~verdict.is_good))
+    note = mostly_bad(bad, len(rows), _counts(verdict))
+    notes = (f"evaluated the quality of {len(rows)} landmarks first", note)
+    return judged, tuple(text for text in notes if text)
+
+
+def _counts(verdict: Verdict) -> dict[str, int]:
+    """Return the number of landmarks that fail each criterion."""
+    return {f.name: int(getattr(verdict, f.name).sum()) for f in dataclasses.fields(verdict)}

@@ -6,30 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.options import InvalidObservationOptions
-from maplab_py.algorithms.landmarks.reports import InvalidObservationReport, RemovalReport
+from maplab_py.algorithms.landmarks.reports import InvalidObservationReport, LandmarkRemovalReport
 from maplab_py.algorithms.landmarks.sightings import Residuals, is_lidar, residuals
 from maplab_py.algorithms.landmarks.tracks import add_tracks, group_tracks
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
+from maplab_py.array_types import I64, Mask
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.edits import remove_landmarks, remove_observations
 from maplab_py.vimap.queries import landmark_mask, observation_counts
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 
 def remove_bad(
     vi_map: VIMap, *, missions: NDArray[np.int64] | None = None, progress: Progress = SILENT
-) -> tuple[VIMap, RemovalReport]:
+) -> tuple[VIMap, LandmarkRemovalReport]:
     """Remove every landmark of quality bad that is stored in the missions (None = all)."""
     progress.check()
     chosen = landmark_mask(vi_map, missions)
     bad = chosen & (vi_map.landmarks.quality == LandmarkQuality.BAD)
     result = remove_landmarks(vi_map, bad)
     unknown = vi_map.landmarks.quality == LandmarkQuality.UNKNOWN
-    report = RemovalReport(
+    report = LandmarkRemovalReport(
         landmarks_removed=int(bad.sum()),
         observations_removed=int(observation_counts(vi_map)[bad].sum()),
         landmarks_left=int((chosen & ~bad).sum()),
@@ -45,18 +42,18 @@ def remove_invalid_observations(
     missions: NDArray[np.int64] | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, InvalidObservationReport]:
-    """Detach observations that contradict their landmark, and make new landmarks from their tracks.
+    """Detach invalid observations and create new landmarks from their tracks.
 
-    Invalid are: the second and further observations of one landmark in one frame (the one with the
-    smallest reprojection error stays), points behind the camera, and reprojection errors above
-    the limit. Detached keypoints of one landmark and one feature track that triangulate and agree
-    become a landmark of unknown quality.
+    Observations are invalid if they repeat a landmark in a frame (the one with the smallest
+    reprojection error stays), lie behind the camera, or have a reprojection error above the limit.
+    Detached keypoints of one landmark and one feature track become a new landmark of unknown
+    quality if they can be triangulated and agree.
 
     Args:
         vi_map: The map.
         options: The limits.
         missions: Rows of the missions that store the landmarks; None = all.
-        progress: Where to learn of cancellation.
+        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -67,13 +64,13 @@ def remove_invalid_observations(
     landmark = vi_map.keypoints.landmark[keypoints]
     seen = residuals(vi_map, keypoints, vi_map.p_G[landmark])
     twice, behind, far = _reasons(vi_map, keypoints, seen, options.max_reprojection_error_px)
-    gone = twice | behind | far
+    removed = twice | behind | far
     progress.check()
-    result = remove_observations(vi_map, keypoints[gone])
+    result = remove_observations(vi_map, keypoints[removed])
     added, reattached = 0, 0
     if options.make_new_landmarks:
         result, added, reattached = _from_detached(
-            result, keypoints[gone], landmark[gone].astype(np.int64), options
+            result, keypoints[removed], landmark[removed].astype(np.int64), options
         )
     had = np.diff(vi_map.observation_start) > 0
     lost = had & (observation_counts(result)[: len(had)] == 0)
@@ -92,7 +89,7 @@ def remove_invalid_observations(
 def _reasons(
     vi_map: VIMap, keypoints: I64, seen: Residuals, max_error_px: float
 ) -> tuple[Mask, Mask, Mask]:
-    """Return which observations (O,) are repeated in a frame, behind the camera, or far off."""
+    """Return which observations (O,) are repeated in a frame, behind the camera, or outliers."""
     landmark, frame = vi_map.keypoints.landmark[keypoints], vi_map.keypoint_frame[keypoints]
     order = np.lexsort((keypoints, seen.error_px, frame, landmark))
     again = np.zeros(len(keypoints), dtype=np.bool_)

@@ -8,15 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Projection
 from maplab_py.sensors.projection import back_project, project
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LIDAR_FEATURE_TYPES = (21,)
 """Feature types (proto values) whose keypoints carry a 3-D position."""
@@ -24,7 +21,7 @@ LIDAR_FEATURE_TYPES = (21,)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Residuals:
-    """How points appear to the keypoints that observe them."""
+    """Reprojection and depth of points at the keypoints that observe them."""
 
     error_px: F64  # (O,), infinite where the point does not project into the camera
     signed_distance_m: F64  # (O,), negative behind the camera
@@ -32,7 +29,7 @@ class Residuals:
 
 
 def cameras_of(vi_map: VIMap, keypoints: I64) -> Iterator[tuple[Camera, F64, I64]]:
-    """Yield each mission's cameras with T_I_C (7,) and the positions in `keypoints` of their own.
+    """Yield each mission's cameras with T_I_C (7,) and the indices into `keypoints` they measured.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -53,7 +50,7 @@ def cameras_of(vi_map: VIMap, keypoints: I64) -> Iterator[tuple[Camera, F64, I64
 
 
 def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:
-    """Tell which landmarks (N,) are seen as 3-D points."""
+    """Return which landmarks (N,) are observed as 3-D points."""
     if vi_map.keypoints.position_3d.shape[1] != 3:
         return np.zeros(len(landmarks), dtype=np.bool_)
     return np.isin(vi_map.landmarks.feature_type[landmarks], LIDAR_FEATURE_TYPES)
@@ -62,8 +59,8 @@ def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:
 def rays_in_G(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, Mask]:
     """Return camera centres (O, 3), unit rays (O, 3) in G, and which rays exist (O,).
 
-    Cameras are taken to be at their vertex' pose: time offsets between a vertex and its images
-    are below a millisecond in maplab's maps.
+    Cameras are assumed to be at the pose of their vertex: time offsets between a vertex and its
+    images are below a millisecond in maplab's maps.
     """
     origins, directions = np.zeros((len(keypoints), 3)), np.zeros((len(keypoints), 3))
     valid = np.zeros(len(keypoints), dtype=np.bool_)
@@ -77,7 +74,7 @@ def rays_in_G(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, Mask]:
 
 
 def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
-    """Compare points (O, 3) of G, one for each keypoint (O,), with what was measured."""
+    """Compare points (O, 3) in G, one for each keypoint (O,), with the measurements."""
     error_px = np.full(len(keypoints), np.inf)
     distance, error_m = np.zeros(len(keypoints)), np.full(len(keypoints), np.nan)
     table = vi_map.keypoints
@@ -85,11 +82,11 @@ def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
     observing = table.landmark[keypoints] >= 0
     lidar[observing] = is_lidar(vi_map, table.landmark[keypoints[observing]])
     for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
-        own = keypoints[rows]
-        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[own]], T_I_C)
+        camera_keypoints = keypoints[rows]
+        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[camera_keypoints]], T_I_C)
         p_C = se3.transform(se3.inverse(T_G_C), p_G[rows])
         uv, visible = project(camera, p_C)
-        error = np.linalg.norm(uv - table.uv_px[own], axis=1)
+        error = np.linalg.norm(uv - table.uv_px[camera_keypoints], axis=1)
         error_px[rows] = np.where(visible, error, np.inf)
         in_front = p_C[:, 2] > 0.0 if camera.projection is Projection.PINHOLE else visible
         distance[rows] = np.where(in_front, 1.0, -1.0) * np.linalg.norm(p_C, axis=1)
@@ -97,5 +94,5 @@ def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
         if len(points):
             measured = table.position_3d[keypoints[points]]
             error_m[points] = np.linalg.norm(p_C[lidar[rows]] - measured, axis=1)
-            distance[points] = np.abs(distance[points])  # a lidar sees all round
+            distance[points] = np.abs(distance[points])  # a lidar has a field of view of 360 deg
     return Residuals(error_px, distance, error_m)

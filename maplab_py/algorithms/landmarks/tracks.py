@@ -1,4 +1,4 @@
-"""New landmarks from feature tracks that have none."""
+"""Create landmarks from feature tracks without landmark."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.reports import TrackReport
 from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangulate_keypoints
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import NO_DESCRIPTOR, FeatureType
 from maplab_py.vimap.edits import add_landmarks
 from maplab_py.vimap.queries import mission_mask
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 def init_tracks(
@@ -25,9 +23,10 @@ def init_tracks(
     options: LandmarkQualityOptions,
     *,
     missions: NDArray[np.int64] | None = None,
+    across_cameras: bool = False,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, TrackReport]:
-    """Make landmarks from keypoints without one that share mission, camera and track id.
+    """Create landmarks from keypoints without landmark that share mission, camera and track id.
 
     A track needs two keypoints of different frames (of two in one frame the first counts), rays
     that meet, and a point in front of its cameras; the landmark is stored in its first observer.
@@ -37,7 +36,9 @@ def init_tracks(
         vi_map: The map.
         options: Thresholds of the quality.
         missions: Mission rows; None = all.
-        progress: Where to learn of cancellation.
+        across_cameras: Track ids are unique in a mission: keypoints of different cameras with the
+            same id show the same point.
+        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -47,7 +48,8 @@ def init_tracks(
     unused = (vi_map.keypoints.landmark < 0) & (vi_map.keypoints.track_id >= 0)
     rows = np.flatnonzero(unused)
     rows = rows[chosen[vi_map.vertices.mission[vi_map.keypoint_vertex[rows]]]]
-    keypoints, start = group_tracks(vi_map, rows, np.zeros(len(rows), dtype=np.int64))
+    label = np.zeros(len(rows), dtype=np.int64)
+    keypoints, start = group_tracks(vi_map, rows, label, across_cameras=across_cameras)
     p_G, _, usable = triangulate_keypoints(vi_map, keypoints, start)
     progress.check()
     added, observations = add_tracks(vi_map, keypoints, start, p_G, usable)
@@ -62,8 +64,10 @@ def init_tracks(
     return result, report
 
 
-def group_tracks(vi_map: VIMap, rows: I64, label: I64) -> tuple[I64, I64]:
-    """Group keypoints (N,) by mission, camera, track id and label (N,).
+def group_tracks(
+    vi_map: VIMap, rows: I64, label: I64, *, across_cameras: bool = False
+) -> tuple[I64, I64]:
+    """Group keypoints (N,) by mission, camera (unless across them), feature type, track, label (N,).
 
     Returns:
         Keypoint rows in groups of two or more, one per frame, and the groups' offsets.
@@ -71,9 +75,12 @@ def group_tracks(vi_map: VIMap, rows: I64, label: I64) -> tuple[I64, I64]:
     frame = vi_map.keypoint_frame[rows]
     mission = vi_map.vertices.mission[vi_map.frames.vertex[frame]]
     camera, track = vi_map.frames.camera_index[frame], vi_map.keypoints.track_id[rows]
-    order = np.lexsort((rows, track, label, camera, mission))
+    if across_cameras:
+        camera = np.zeros_like(camera)
+    kind = vi_map.feature_type[rows]
+    order = np.lexsort((rows, track, kind, label, camera, mission))
     rows, frame = rows[order], frame[order]
-    keys = np.stack([mission[order], camera[order], label[order], track[order]])
+    keys = np.stack([mission[order], camera[order], label[order], kind[order], track[order]])
     begins = np.ones(len(rows), dtype=np.bool_)
     begins[1:] = np.any(keys[:, 1:] != keys[:, :-1], axis=0)
     again = np.zeros(len(rows), dtype=np.bool_)
@@ -87,7 +94,7 @@ def group_tracks(vi_map: VIMap, rows: I64, label: I64) -> tuple[I64, I64]:
 def add_tracks(
     vi_map: VIMap, keypoints: I64, start: I64, p_G: F64, usable: Mask
 ) -> tuple[VIMap, int]:
-    """Make a landmark at p_G (L, 3) of each usable group; return also their observations' number."""
+    """Create a landmark at p_G (L, 3) for each valid group; also return the observation count."""
     groups = np.flatnonzero(usable)
     if len(groups) == 0:
         return vi_map, 0
@@ -95,7 +102,13 @@ def add_tracks(
     store = vi_map.keypoint_vertex[keypoints[start[:-1][groups]]]
     p_I = se3.transform(se3.inverse(vi_map.T_G_I[store]), p_G[groups])
     number = np.repeat(np.arange(len(groups)), np.diff(start)[groups])
+    kind = vi_map.feature_type[keypoints[start[:-1][groups]]]
     added = add_landmarks(
-        vi_map, vertex=store, p_I=p_I, keypoint_rows=taken, keypoint_landmark=number
+        vi_map,
+        vertex=store,
+        p_I=p_I,
+        keypoint_rows=taken,
+        keypoint_landmark=number,
+        feature_type=np.where(kind == NO_DESCRIPTOR, FeatureType.BINARY, kind),
     )
     return added, len(taken)

@@ -1,4 +1,4 @@
-"""Place landmarks anew from the rays of their observations."""
+"""Triangulate landmarks again from the rays of their observations."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.landmarks.reports import RetriangulationReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import triangulation
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_p_G
 from maplab_py.vimap.queries import landmark_mask
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 def retriangulate(
@@ -30,15 +27,15 @@ def retriangulate(
 ) -> tuple[VIMap, RetriangulationReport]:
     """Triangulate every landmark stored in the missions, then evaluate its quality.
 
-    A landmark keeps its place when it has fewer than two observations, when its rays are parallel
-    or when the new point would lie behind one of its cameras; quality then tells that it is bad.
-    Each stays in its store vertex. Landmarks of 3-D (lidar) observations are left in place.
+    The position of a landmark is unchanged if it has fewer than two observations, if its rays are
+    parallel, or if the new point is behind one of its cameras; quality evaluation then marks it as
+    bad. Store vertices do not change, nor do landmarks of 3-D (lidar) observations.
 
     Args:
         vi_map: The map.
         options: Thresholds of the quality.
         missions: Mission rows; None = all.
-        progress: Where to learn of cancellation.
+        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.

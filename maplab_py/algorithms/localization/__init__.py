@@ -1,1 +1,1 @@
-"""Localisation: where in a map was an image taken?"""
+"""Localisation: estimation of the pose of images in a map."""

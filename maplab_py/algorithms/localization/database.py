@@ -1,4 +1,4 @@
-"""What localisation searches in: landmarks and their descriptors, of a full or a summary map."""
+"""Localisation database: landmarks and descriptors of a full map or a summary map."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
+from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -17,14 +18,10 @@ from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DescriptorProjection
 
-F64 = NDArray[np.float64]
-U64 = NDArray[np.uint64]
-I64 = NDArray[np.int64]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sights:
-    """From where L landmarks were seen."""
+    """View directions and distances from which L landmarks were observed."""
 
     direction: F64  # (L, 3) unit, in G, toward the middle of the observers
     spread_rad: F64  # (L,) largest angle of an observer from there
@@ -34,7 +31,7 @@ class Sights:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalizationMap:
-    """L landmarks seen by K observers in N observations."""
+    """L landmarks observed by K vertices in N observations."""
 
     p_G: F64  # (L, 3)
     descriptors: DescriptorSet  # (N,) labels are landmark rows; without words in summary maps
@@ -45,7 +42,7 @@ class LocalizationMap:
 
     @property
     def has_bits(self) -> bool:
-        """Tell whether descriptors are there bit by bit, not only projected."""
+        """Return whether the database holds binary descriptors, not only projected ones."""
         return bool(self.descriptors.words.shape[1] > 0)
 
     @cached_property
@@ -62,7 +59,7 @@ class LocalizationMap:
 
     @cached_property
     def sights(self) -> Sights:
-        """From where each landmark was seen."""
+        """View directions and distances of each landmark."""
         start, rows = self.rows_of
         first, count = start[:-1], np.diff(start)
         toward = self.p_G_observer[self.observer[rows]] - np.repeat(self.p_G, count, axis=0)
@@ -84,7 +81,7 @@ class LocalizationMap:
         return _grouped(self.observer, self.descriptors.label, len(self.p_G_observer))
 
     def place_of(self, observer: int, min_shared: int) -> NDArray[np.bool_]:
-        """Tell which observers (K,) share so many landmarks with one; it is always among them."""
+        """Return which observers (K,) share at least this many landmarks with an observer, or are it."""
         start, landmarks = self.landmarks_of
         mine = landmarks[start[observer] : start[observer + 1]]
         offset, observers = self.observers_of
@@ -97,22 +94,23 @@ class LocalizationMap:
 def database_of_map(
     vi_map: VIMap, *, missions: I64 | None = None, projection: DescriptorProjection | None = None
 ) -> LocalizationMap:
-    """Use the good landmarks that some missions (None = all) observe.
+    """Build the database from the good landmarks that missions (None = all) observe.
 
-    One observation is enough: keyframing takes the others, but not the place that they gave.
+    A single observation suffices: keyframing removes observations but keeps the position that
+    they determined.
 
     Raises:
-        EstimationError: There is none with descriptors, or the projection cannot be learned.
+        EstimationError: No landmark has descriptors, or the projection cannot be learned.
     """
-    judged, _ = with_quality(vi_map)
+    judged, _ = evaluate_unknown_quality(vi_map)
     rows = np.arange(len(judged.missions)) if missions is None else missions
     features, projection = map_features(judged, rows, projection=projection)
-    found = features_of_good_landmarks(judged, features)
-    if len(found) == 0:
-        raise EstimationError("the map has no good landmark with descriptors: run rtl")
-    descriptors = features.descriptors.take(found)
+    good_features = features_of_good_landmarks(judged, features)
+    if len(good_features) == 0:
+        raise EstimationError("the map has no good landmark with binary descriptors: run rtl")
+    descriptors = features.descriptors.take(good_features)
     landmarks, label = np.unique(descriptors.label, return_inverse=True)
-    vertices, observer = np.unique(features.vertex[found], return_inverse=True)
+    vertices, observer = np.unique(features.vertex[good_features], return_inverse=True)
     return LocalizationMap(
         p_G=judged.p_G[landmarks],
         descriptors=dataclasses.replace(descriptors, label=label.reshape(-1)),
@@ -132,11 +130,11 @@ def features_of_good_landmarks(vi_map: VIMap, features: MapFeatures) -> I64:
 def database_of_summary(
     summary: SummaryMap, projection: DescriptorProjection | None = None
 ) -> LocalizationMap:
-    """Use a summary map.
+    """Build the database from a summary map.
 
     Args:
         summary: The summary map.
-        projection: Projection that its descriptors were made with; by default its own.
+        projection: Projection that its descriptors were made with; by default the database's.
 
     Raises:
         UserError: It holds no projection and none is given, or it is empty.

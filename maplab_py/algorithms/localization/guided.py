@@ -1,9 +1,9 @@
-"""Matches that a rough pose suggests: landmarks it has in view, with keypoints near their images.
+"""Matches guided by an approximate pose: landmarks in view and keypoints near their projections.
 
-Searching the whole map for the nearest descriptor finds a keypoint's landmark only when nothing
-else in the map looks more like it. Where a pose says which landmarks are near which keypoint, the
-descriptor only has to be similar, and a true pose finds most of what is there while a wrong one
-finds next to nothing (active search: Sattler et al., TPAMI 2017).
+A search for the nearest descriptor in the whole map finds the landmark of a keypoint only if no
+other landmark looks more similar. If an approximate pose predicts which landmarks are near which
+keypoint, a similar descriptor suffices: a correct pose finds most visible landmarks, a wrong pose
+almost none (active search: Sattler 2017).
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.vimap.table import ragged_rows
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _RANGE_FACTOR = 2.0
 _TURN_RAD = np.deg2rad(40.0)
-"""A landmark is looked for from up to so much farther, nearer and more aside than it was seen."""
+"""Tolerance on the distance and view direction from which a landmark is expected to be visible."""
 
 
 def guided_matches(
@@ -38,12 +36,12 @@ def guided_matches(
 
     Args:
         database: The map.
-        T_G_I: Rough pose (7,) of the query.
+        T_G_I: Approximate pose (7,) of the query.
         projected: Projected descriptors (N, dimensions) of its keypoints.
         words: Packed descriptors (N, W); empty rows for summary maps.
         origin_I: Camera centres (N, 3) of the keypoints in the body frame [m].
         ray_I: Unit rays (N, 3) of the keypoints in the body frame.
-        radius_rad: Angle (N,) around each ray in which landmarks are looked for.
+        radius_rad: Angle (N,) around each ray in which landmarks are searched.
         max_distance: Largest distance of descriptors: bits, or squared in the projected space.
     """
     landmarks = np.flatnonzero(_in_range(database, T_G_I[4:]))
@@ -70,7 +68,7 @@ def guided_matches(
 
 
 def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
-    """Tell which landmarks (L,) may be visible from a place, judging by where they were seen."""
+    """Return which landmarks (L,) may be visible from a position, given where they were observed."""
     s = database.sights
     toward = p_G_I - database.p_G
     distance = np.linalg.norm(toward, axis=1)
@@ -90,7 +88,7 @@ def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I6
         toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-9)[:, None]
         in_view = np.flatnonzero(_in_cone(ray_I[mine], float(radius_rad[mine].max()), toward))
         x, y, z = toward[in_view].T
-        # written out: a product with an inner length of 3 is not worth the threads of BLAS
+        # written out: BLAS threads do not pay off for an inner dimension of 3
         cosine = ray_I[mine, :1] * x + ray_I[mine, 1:2] * y + ray_I[mine, 2:] * z
         ray, point = np.nonzero(cosine > np.cos(radius_rad[mine])[:, None])
         keypoints.append(mine[ray])
@@ -101,7 +99,7 @@ def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I6
 
 
 def _in_cone(ray: F64, radius_rad: float, toward: F64) -> NDArray[np.bool_]:
-    """Tell which directions (N, 3) lie in the cone around all rays (R, 3), or near to it."""
+    """Return which directions (N, 3) lie inside or near the cone around all rays (R, 3)."""
     axis = ray.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-9)
     widest = float(np.arccos(np.clip((ray @ axis).min(), -1.0, 1.0)))

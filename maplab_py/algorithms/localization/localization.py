@@ -6,33 +6,29 @@ import dataclasses
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.localization.queries import queries, query_vertices
-from maplab_py.algorithms.localization.report import Distribution, LocalizationReport
+from maplab_py.algorithms.localization.reports import Distribution, LocalizationReport
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 _ROUNDS = 15
 _TRUSTED = 3.0
-"""Points further off than as many times the median do not take part in an alignment."""
+"""Pairs with a distance above this multiple of the median are excluded from an alignment."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Localizations:
-    """Answers to all queries, one row each."""
+    """Results of all queries, one row each."""
 
     vertex: I64  # (Q,) vertex rows of the query map
-    T_G_I: F64  # (Q, 7), in the G of the map that was searched
+    T_G_I: F64  # (Q, 7), in G of the searched map
     is_localized: Mask  # (Q,)
     answers: tuple[Localization, ...]
     seconds: float
@@ -40,7 +36,7 @@ class Localizations:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
-    """Where the queries really were, in a frame R of its own."""
+    """Reference poses of the queries, in a reference frame R."""
 
     name: str
     T_R_I: F64  # (Q, 7)
@@ -56,7 +52,7 @@ def localize_missions(
     sequence_length: int = 1,
     progress: Progress = SILENT,
 ) -> Localizations:
-    """Localise every vertex of some missions (None = all), one after the other.
+    """Localise every vertex of some missions (None = all) sequentially.
 
     Args:
         database: Where to localise; it is not changed.
@@ -87,14 +83,14 @@ def localize_missions(
 
 
 def align_robustly(p_R: F64, p_G: F64, *, level: bool) -> F64:
-    """Return T_R_G (7,) that lays points of G on those of R although some pairs are wrong.
+    """Return T_R_G (7,) that aligns points of G with those of R, robust against wrong pairs.
 
-    Pairs that are far off, compared with the median, leave; what remains is aligned again.
+    Pairs with a distance far above the median are removed and the remaining pairs aligned again.
 
     Args:
         p_R: Points (N, 3).
         p_G: Points (N, 3).
-        level: Both frames are gravity-aligned: turn about the vertical only.
+        level: Both frames are gravity-aligned: rotate about the vertical only.
     """
     kept = np.ones(len(p_R), dtype=np.bool_)
     T_R_G = se3.identity()
@@ -111,10 +107,10 @@ def align_robustly(p_R: F64, p_G: F64, *, level: bool) -> F64:
     return T_R_G
 
 
-def pose_errors(found: Localizations, reference: Reference, T_R_G: F64) -> tuple[F64, F64]:
-    """Return position [m] and orientation errors [deg] (Q,), NaN where there is no answer."""
-    step = se3.local(reference.T_R_I, se3.compose(T_R_G, found.T_G_I))
-    valid = found.is_localized & reference.is_known
+def pose_errors(localizations: Localizations, reference: Reference, T_R_G: F64) -> tuple[F64, F64]:
+    """Return position [m] and orientation errors [deg] (Q,), NaN where a query was not localised."""
+    step = se3.local(reference.T_R_I, se3.compose(T_R_G, localizations.T_G_I))
+    valid = localizations.is_localized & reference.is_known
     position = np.where(valid, np.linalg.norm(step[:, :3], axis=1), np.nan)
     orientation = np.where(valid, np.degrees(np.linalg.norm(step[:, 3:], axis=1)), np.nan)
     return position, orientation
@@ -122,14 +118,14 @@ def pose_errors(found: Localizations, reference: Reference, T_R_G: F64) -> tuple
 
 def describe(
     database: LocalizationMap,
-    found: Localizations,
+    localizations: Localizations,
     *,
     reference: Reference | None = None,
     T_R_G: F64 | None = None,
     success_error_m: float = 0.5,
 ) -> LocalizationReport:
-    """Summarise answers, and their errors if there is a reference."""
-    outcomes = [answer.outcome for answer in found.answers]
+    """Summarise the results, and their errors if there is a reference."""
+    outcomes = [answer.outcome for answer in localizations.answers]
     refused = {
         outcome.value: outcomes.count(outcome)
         for outcome in Outcome
@@ -138,11 +134,11 @@ def describe(
     position = orientation = np.full(len(outcomes), np.nan)
     known = np.zeros(len(outcomes), dtype=np.bool_)
     if reference is not None and T_R_G is not None:
-        position, orientation = pose_errors(found, reference, T_R_G)
+        position, orientation = pose_errors(localizations, reference, T_R_G)
         known = reference.is_known
     success = int(np.count_nonzero(position < success_error_m))
-    localized = int(found.is_localized.sum())
-    answered = [answer for answer in found.answers if answer.outcome is Outcome.LOCALIZED]
+    localized = int(localizations.is_localized.sum())
+    answered = [answer for answer in localizations.answers if answer.outcome is Outcome.LOCALIZED]
     return LocalizationReport(
         map_kind="full" if database.has_bits else "summary",
         map_landmarks=len(database.p_G),
@@ -160,9 +156,9 @@ def describe(
         position_error_m=_distribution(position),
         orientation_error_deg=_distribution(orientation),
         inliers=_distribution(np.array([a.inliers for a in answered], dtype=np.float64)),
-        matching_ms=_distribution(1e3 * np.array([a.matching_s for a in found.answers])),
-        ransac_ms=_distribution(1e3 * np.array([a.ransac_s for a in found.answers])),
-        seconds=found.seconds,
+        matching_ms=_distribution(1e3 * np.array([a.matching_s for a in localizations.answers])),
+        ransac_ms=_distribution(1e3 * np.array([a.ransac_s for a in localizations.answers])),
+        seconds=localizations.seconds,
     )
 
 

@@ -1,4 +1,4 @@
-"""Localise one query at a time: matches, places, pose. Nothing is learned from query to query."""
+"""Localise single queries: matches, places, pose. Queries are independent of each other."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level
@@ -22,21 +23,17 @@ from maplab_py.vision.descriptors import pack_words
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
-
 _CERTAIN = 2
-"""As many times the wanted inliers leave no doubt: no further place is tried."""
+"""The search stops at this multiple of the required inliers."""
 _MIN_HYPOTHESIS = 3
-"""Inliers that make a pose worth trying on all landmarks in view."""
+"""Minimum number of inliers of a pose for guided matching with all visible landmarks."""
 _GUIDED_ROUNDS = 2
 _GUIDED_RADIUS, _GUIDED_DISTANCE = 6.0, 1.3
-"""Landmarks in view are looked for in as many times the inliers' error and match distance."""
+"""Search radius and match distance of guided matching, in multiples of those of inliers."""
 
 
 class Outcome(Enum):
-    """What became of a query."""
+    """Outcome of a query."""
 
     LOCALIZED = "localized"
     FEW_MATCHES = "too few matches with one place"
@@ -49,7 +46,7 @@ class Outcome(Enum):
 class Query:
     """Keypoints of one image, of a rig's images, or of a short sequence, in one body frame."""
 
-    key: int  # with the seed it decides the random numbers
+    key: int  # determines the random numbers, together with the seed
     descriptors: NDArray[np.uint8]  # (N, bytes)
     origin_I: F64  # (N, 3) camera centres in the body frame [m]
     ray_I: F64  # (N, 3) unit rays in the body frame
@@ -59,7 +56,7 @@ class Query:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Localization:
-    """Answer to one query; the pose means something only when localised."""
+    """Result of one query; the pose is valid only if it was localised."""
 
     outcome: Outcome
     T_G_I: F64  # (7,)
@@ -74,7 +71,7 @@ class Localization:
 
 
 class Localizer:
-    """A map, indexed."""
+    """Localises queries in an indexed map."""
 
     def __init__(self, database: LocalizationMap, options: LocalizationOptions) -> None:
         """Build the index.
@@ -97,22 +94,15 @@ class Localizer:
             max_distance=self._max_distance,
         )
 
-    def localize(self, query: Query) -> Localization:
-        """Find the pose of a query in G."""
-        begin = time.perf_counter()
-        descriptors = self._described(query)
-        keypoint, landmark = self._match(descriptors)
-        places = self._places(keypoint, landmark)
-        first = list(itertools.islice(places, 1))
-        matched = time.perf_counter()
-        answer = self._solve(query, descriptors, keypoint, landmark, itertools.chain(first, places))
-        return dataclasses.replace(
-            answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
-        )
+    @property
+    def max_distance(self) -> float:
+        """Largest distance of descriptors of a match: bits, or squared in the projected space."""
+        return self._max_distance
 
-    def _described(self, query: Query) -> DescriptorSet:
-        count = len(query.descriptors)
-        raw = np.ascontiguousarray(query.descriptors)
+    def described(self, descriptors: NDArray[np.uint8]) -> DescriptorSet:
+        """Return descriptors (N, bytes) in the form in which the map has them."""
+        count = len(descriptors)
+        raw = np.ascontiguousarray(descriptors)
         words = self._map.descriptors.words.shape[1]
         return DescriptorSet(
             projected=self._map.projection.project(raw),
@@ -122,17 +112,41 @@ class Localizer:
             time_ns=np.zeros(count, dtype=np.int64),
         )
 
+    def verify(self, query: Query, keypoint: I64, landmark: I64) -> Localization:
+        """Find the pose that given matches agree on, sorted by keypoint, without the index."""
+        begin = time.perf_counter()
+        solution = self._search(
+            _Level.of(query), query.key * self._options.places, keypoint, landmark
+        )
+        answer = self._judged(query, solution)
+        return dataclasses.replace(answer, ransac_s=time.perf_counter() - begin)
+
+    def localize(self, query: Query) -> Localization:
+        """Find the pose of a query in G."""
+        begin = time.perf_counter()
+        descriptors = self.described(query.descriptors)
+        keypoint, landmark = self._match(descriptors)
+        places = self._places(keypoint, landmark)
+        first = list(itertools.islice(places, 1))
+        matched = time.perf_counter()
+        answer = self._solve(query, descriptors, keypoint, landmark, itertools.chain(first, places))
+        return dataclasses.replace(
+            answer, matching_s=matched - begin, ransac_s=time.perf_counter() - matched
+        )
+
     def _match(self, descriptors: DescriptorSet) -> tuple[I64, I64]:
         """Return keypoints and landmarks of all matches, sorted by keypoint."""
-        found = self._index.nearest(descriptors, self._options.num_neighbors, MatchRule())
-        keypoint, rank = np.nonzero((found.row >= 0) & (found.distance <= self._max_distance))
-        return keypoint, self._map.descriptors.label[found.row[keypoint, rank]]
+        neighbours = self._index.nearest(descriptors, self._options.num_neighbors, MatchRule())
+        keypoint, rank = np.nonzero(
+            (neighbours.row >= 0) & (neighbours.distance <= self._max_distance)
+        )
+        return keypoint, self._map.descriptors.label[neighbours.row[keypoint, rank]]
 
     def _places(self, keypoint: I64, landmark: I64) -> Iterator[I64]:
-        """Yield the rows of the matches in each of the best places, as far as they are asked for.
+        """Yield the rows of the matches in each of the best places, lazily.
 
         Every matched landmark votes for its observers; the observer with most votes and those
-        that share landmarks with it are a place (Sattler et al., ICCV 2015).
+        that share landmarks with it are a place (Sattler 2015).
         """
         o = self._options
         distinct, index = np.unique(landmark, return_inverse=True)
@@ -160,9 +174,9 @@ class Localizer:
         landmark: I64,
         places: Iterable[I64],
     ) -> Localization:
-        """Search the pose place by place; the most inliers win, and many inliers end the search.
+        """Estimate a pose for each place and return the one with most inliers; many inliers end the search.
 
-        A pose that few matches agree with is tried on all landmarks that it has in view.
+        A pose with few inliers is refined by guided matching with all visible landmarks.
         """
         o = self._options
         best = _failed(Outcome.FEW_MATCHES, len(query.descriptors))
@@ -170,13 +184,13 @@ class Localizer:
         level = _Level.of(query)
         for number, rows in enumerate(places):
             key = query.key * o.places + number
-            found = self._search(level, key, keypoint[rows], landmark[rows])
+            solution = self._search(level, key, keypoint[rows], landmark[rows])
             for _ in range(_GUIDED_ROUNDS):
-                if not _MIN_HYPOTHESIS <= found.landmarks < enough:
+                if not _MIN_HYPOTHESIS <= solution.landmarks < enough:
                     break
                 near = guided_matches(
                     self._map,
-                    found.T_G_I,
+                    solution.T_G_I,
                     projected=descriptors.projected,
                     words=descriptors.words,
                     origin_I=query.origin_I,
@@ -185,17 +199,17 @@ class Localizer:
                     max_distance=_GUIDED_DISTANCE * self._max_distance,
                 )
                 guided = self._search(level, key, *near)
-                if guided.landmarks <= found.landmarks:
+                if guided.landmarks <= solution.landmarks:
                     break
-                found = guided
-            if best.outcome is Outcome.FEW_MATCHES or found.landmarks > best.inliers:
-                best = self._judged(query, found)
+                solution = guided
+            if best.outcome is Outcome.FEW_MATCHES or solution.landmarks > best.inliers:
+                best = self._judged(query, solution)
             if best.outcome is Outcome.LOCALIZED and best.inliers >= enough:
                 break
         return best
 
-    def _search(self, level: _Level, key: int, keypoint: I64, landmark: I64) -> _Found:
-        """Search the pose from some matches, sorted by keypoint."""
+    def _search(self, level: _Level, key: int, keypoint: I64, landmark: I64) -> _PoseSolution:
+        """Estimate the pose from matches, sorted by keypoint."""
         solutions = search_level(
             LevelProblems(
                 start=np.array([0, len(keypoint)]),
@@ -210,17 +224,20 @@ class Localizer:
             max_iterations=self._options.num_ransac_iters,
         )
         agreeing = np.flatnonzero(solutions.is_inlier)
-        return _Found(
+        return _PoseSolution(
             level.query, solutions, len(np.unique(keypoint)), keypoint[agreeing], landmark[agreeing]
         )
 
-    def _judged(self, query: Query, found: _Found) -> Localization:
-        """Decide whether a pose is to be believed."""
+    def _judged(self, query: Query, solution: _PoseSolution) -> Localization:
+        """Decide whether a pose is accepted."""
         o = self._options
-        solutions, inliers = found.solutions, int(found.solutions.inlier_count[0])
+        solutions, inliers = solution.solutions, int(solution.solutions.inlier_count[0])
         covariance = solutions.covariances(query.q_M_I[None])[0]
         sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
-        if found.landmarks < o.min_inlier_count or inliers < o.min_inlier_ratio * found.matched:
+        if (
+            solution.landmarks < o.min_inlier_count
+            or inliers < o.min_inlier_ratio * solution.matched
+        ):
             outcome = Outcome.FEW_INLIERS
         elif np.degrees(solutions.tilt_rad[0]) > o.max_gravity_misalignment_deg:
             outcome = Outcome.TILTED
@@ -230,13 +247,13 @@ class Localizer:
             outcome = Outcome.LOCALIZED
         return Localization(
             outcome=outcome,
-            T_G_I=found.T_G_I,
+            T_G_I=solution.T_G_I,
             covariance=covariance,
             keypoints=len(query.descriptors),
-            matches=found.matched,
-            inliers=found.landmarks,
-            keypoint=found.keypoint,
-            landmark=found.landmark,
+            matches=solution.matched,
+            inliers=solution.landmarks,
+            keypoint=solution.keypoint,
+            landmark=solution.landmark,
             matching_s=0.0,
             ransac_s=0.0,
         )
@@ -244,7 +261,7 @@ class Localizer:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Level:
-    """A query, turned once to W, the frame of its attitude with the origin at the body."""
+    """A query rotated to W, the frame of its attitude with the origin at the body."""
 
     query: Query
     origin_W: F64  # (N, 3)
@@ -257,8 +274,8 @@ class _Level:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Found:
-    """What a search found, before it is judged."""
+class _PoseSolution:
+    """Result of a pose search before the acceptance test."""
 
     query: Query
     solutions: LevelSolutions
@@ -268,7 +285,7 @@ class _Found:
 
     @cached_property
     def landmarks(self) -> int:
-        """How many landmarks agree."""
+        """Number of inlier landmarks."""
         return len(np.unique(self.landmark))
 
     @cached_property

@@ -11,7 +11,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class LocalizationOptions:
-    """How images are matched with a map and when a pose is believed."""
+    """Matching of images with a map and acceptance of poses."""
 
     flag_prefix: ClassVar[str] = "localization_"
 
@@ -21,29 +21,31 @@ class LocalizationOptions:
     )
     max_bit_fraction: float = option(
         0.26,
-        help="Largest part of a descriptor's bits in which a match may differ; full maps only.",
+        help="Largest fraction of descriptor bits in which a match may differ; full maps only.",
     )
     max_projected_distance: float = option(
         40.0, help="Largest squared distance of projected descriptors of a match; summary maps."
     )
     places: int = option(6, help="Places of the map that are tried for each query.")
     min_shared_landmarks: int = option(
-        5, help="Observers of the map that share so many landmarks belong to one place."
+        5, help="Number of shared landmarks above which observers of the map belong to one place."
     )
-    min_matches: int = option(5, help="Matches with one place that are worth verifying.")
+    min_matches: int = option(5, help="Smallest number of matches with a place for verification.")
     ransac_pixel_sigma: float = option(
         2.0, help="Largest reprojection error of an inlier.", unit="px"
     )
-    num_ransac_iters: int = option(500, help="Most samples of two matches per place.")
+    num_ransac_iters: int = option(500, help="Largest number of samples of two matches per place.")
     min_inlier_count: int = option(8, help="Landmarks that must agree with the pose.")
     min_inlier_ratio: float = option(
-        0.03, help="Part of the keypoints matched in the place that must agree."
+        0.03, help="Fraction of the keypoints matched in the place that must agree."
     )
     max_gravity_misalignment_deg: float = option(
-        5.0, help="Largest angle between gravity as the query has it and as found.", unit="deg"
+        5.0,
+        help="Largest angle between gravity in the query's frame and in the estimated pose.",
+        unit="deg",
     )
     max_position_sigma_m: float = option(
-        0.5, help="Poses whose position is less certain are not believed.", unit="m"
+        0.5, help="Largest standard deviation of the position of an accepted pose.", unit="m"
     )
     seed: int = option(0, help="Seed of all random choices.")
 

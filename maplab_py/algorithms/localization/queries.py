@@ -6,16 +6,14 @@ import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.localizer import Query
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
+from maplab_py.array_types import I64
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.projection import DescriptorProjection
-
-I64 = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,8 +41,8 @@ def query_vertices(vi_map: VIMap, missions: I64, projection: DescriptorProjectio
 def queries(source: QueryVertices, sequence_length: int = 1) -> Iterator[Query]:
     """Yield one query per vertex.
 
-    With a sequence length of n, the images of the n - 1 vertices before (of the same mission) are
-    seen as those of one big rig, placed by the map's own relative poses.
+    With a sequence length of n, the images of the n - 1 preceding vertices of the same mission are
+    treated as those of one rig whose extrinsics are the relative poses of the map.
     """
     vi_map = source.vi_map
     first_of_mission = vi_map.vertex_start[vi_map.vertices.mission]

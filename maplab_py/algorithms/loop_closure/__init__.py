@@ -1,1 +1,1 @@
-"""Loop closure: which vertices saw the same place, verified, and what follows for the map."""
+"""Loop closure: place recognition, geometric verification, and landmark merging or edges."""

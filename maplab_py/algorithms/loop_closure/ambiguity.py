@@ -1,8 +1,8 @@
-"""Places that look alike: queries that fit several places of one mission, or a far one of their own.
+"""Ambiguous places: queries that match several places of a mission, or a distant place of their own.
 
-A mission is rigid up to its drift, so a query cannot be in two of its places at once. When it fits
-two about equally well, its looks do not tell where it is, and a closure with a third mission, which
-may have seen only one of the two, is no better.
+A mission is rigid up to its drift, so a query cannot be at two of its places at once. If it matches
+two places about equally well, its appearance does not determine the place. A closure with a third
+mission that observed only one of the two places is then unreliable too.
 """
 
 from __future__ import annotations
@@ -10,24 +10,20 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclasses.dataclass(frozen=True)
 class AmbiguityRule:
-    """When two places are two, and when the second one counts."""
+    """Criteria for distinct places and for a significant second place."""
 
     drift_offset_m: float
-    drift_ratio: float  # of the way between the places
+    drift_ratio: float  # fraction of the arc length between the places
     max_turn_rad: float = 0.3
-    inlier_share: float = 0.5  # that the second place needs of the best one's
-    min_inliers: int = 20  # of a far place of the query's own mission
+    inlier_share: float = 0.5  # inliers of the second place relative to the best
+    min_inliers: int = 20  # of a distant place of the query's mission
 
 
 def ambiguous_queries(
@@ -36,21 +32,21 @@ def ambiguous_queries(
     place_mission: I64,
     T_M_I: F64,
     inliers: I64,
-    is_far_own: Mask,
+    is_far_same_mission: Mask,
     candidate: Mask,
     rule: AmbiguityRule,
 ) -> I64:
-    """Return the query vertices that fit several places.
+    """Return the query vertices that match several places.
 
     Args:
         query_vertex: Query (N,) of each closure.
-        place_way_m: Way along its mission (N,) of the place.
+        place_way_m: Arc length (N,) of the place along its mission.
         place_mission: Mission (N,) of the place.
-        T_M_I: Poses found (N, 7).
+        T_M_I: Estimated poses (N, 7).
         inliers: Inliers (N,).
-        is_far_own: Closures (N,) with a place of the query's own mission that is beyond any drift.
+        is_far_same_mission: Closures (N,) with a place of the query's mission beyond any plausible drift.
         candidate: Closures (N,) that passed the geometric gates.
-        rule: When two places are two.
+        rule: Criteria for distinct places.
     """
     rows = np.flatnonzero(candidate)
     order = rows[np.lexsort((-inliers[rows], place_mission[rows], query_vertex[rows]))]
@@ -65,5 +61,5 @@ def ambiguous_queries(
     drift = rule.drift_offset_m + rule.drift_ratio * np.abs(place_way_m[order] - place_way_m[best])
     is_other = (apart > drift) | (turn > rule.max_turn_rad)
     rivals = is_other & (inliers[order] >= rule.inlier_share * inliers[best])
-    own = rows[is_far_own[rows] & (inliers[rows] >= rule.min_inliers)]
-    return np.union1d(query_vertex[order[rivals]], query_vertex[own])
+    same_mission = rows[is_far_same_mission[rows] & (inliers[rows] >= rule.min_inliers)]
+    return np.union1d(query_vertex[order[rivals]], query_vertex[same_mission])

@@ -1,9 +1,9 @@
-"""Which closures can be right together: neighbours along the way must agree in yaw and position.
+"""Consistency of closures: neighbours along the trajectory must agree in yaw and position.
 
-A closure i of a query in mission A with a place in mission B says how frame A lies in B. Two
-closures of the same pair of missions agree when both lay a query at the same spot, up to the drift
-on the way between the queries and between the places (Mangelson et al., ICRA 2018: pairwise
-consistency, here with neighbours only).
+A closure of a query in mission A with a place in mission B determines T_B_A. Two closures of the
+same pair of missions agree if both give the same position of a query, up to the drift between the
+queries and between the places (Mangelson 2018: pairwise consistency, here restricted
+to neighbours).
 """
 
 from __future__ import annotations
@@ -11,35 +11,31 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, yaw
 from maplab_py.vimap import VIMap
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 _WINDOW = 60
-"""Closures along the query's way that are compared with each one, before and after."""
+"""Number of closures before and after each closure, by arc length, that it is compared with."""
 _REACH_M = 15.0
-"""Farther along the way closures say nothing about each other."""
+"""Maximum arc length between compared closures."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ConsensusRule:
-    """When two closures agree, and how many must."""
+    """Criteria for the agreement of two closures and the required support."""
 
     position_tolerance_m: float = 0.15
     yaw_tolerance_rad: float = 0.025
-    drift_ratio: float = 0.02  # of the way between the queries plus that between the places
+    drift_ratio: float = 0.02  # per arc length between the queries plus that between the places
     yaw_drift_rad_per_m: float = 4e-4  # over the same way
     min_support: int = 2
-    lone_inliers: int = 50  # a closure without any neighbour needs as many inliers
+    lone_inliers: int = 50  # required inliers of a closure without neighbours
 
 
 def path_lengths(vi_map: VIMap) -> F64:
-    """Return the way (V,) [m] along its mission from the first vertex to each."""
+    """Return the arc length (V,) [m] of each vertex along its mission."""
     p, mission = vi_map.vertices.T_M_I[:, 4:], vi_map.vertices.mission
     step = np.zeros(len(p))
     step[1:] = np.linalg.norm(np.diff(p, axis=0), axis=1) * (mission[1:] == mission[:-1])
@@ -64,7 +60,7 @@ def check_consensus(
     order = np.lexsort((place_vertex, way[query_vertex], pair))
     T_A_I = vi_map.vertices.T_M_I[query_vertex]
     alive = np.ones(count, dtype=np.bool_)
-    # a wrong closure may speak against right ones: judge twice, the second time by survivors only
+    # a wrong closure may contradict correct ones: test twice, the second time with survivors only
     for _ in range(2):
         support, for_, against = _votes(
             order, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, inliers, alive, rule
@@ -88,7 +84,7 @@ def _votes(
     alive: Mask,
     rule: ConsensusRule,
 ) -> tuple[I64, F64, F64]:
-    """Return support by distinct query vertices, and the inliers that speak for and against."""
+    """Return support by distinct query vertices, and the inliers that support and contradict."""
     count = len(query)
     support = np.zeros(count, dtype=np.int64)
     for_, against = inliers.astype(np.float64), np.zeros(count)
@@ -98,7 +94,7 @@ def _votes(
             between = np.abs(way[query[i]] - way[query[j]])
             near = (pair[i] == pair[j]) & (between < _REACH_M) & alive[j]
             between_places = np.abs(way[place[i]] - way[place[j]])
-            # where closure j would put query i
+            # position of query i implied by closure j
             p = yaw.transform(E[j], T_A_I[i, 4:])
             both_ways = between + np.minimum(between_places, between + _REACH_M)
             largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways

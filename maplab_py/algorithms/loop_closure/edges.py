@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.array_types import F64
 from maplab_py.geometry import so3
 from maplab_py.vimap import LoopClosureEdges
 
-F64 = NDArray[np.float64]
-
 _FLOOR_STD = np.array([0.01, 0.01, 0.01, 0.002, 0.002, 0.002])
-"""[m, rad] What points of a map err in common, which their matches do not show."""
+"""Common error of the points of a map [m, rad], which the residuals of matches do not show."""
 
 
 def closure_edges(closures: Closures, options: LoopClosureOptions) -> LoopClosureEdges:
     """Return one edge per accepted closure, from the query vertex (A) to the place's vertex (B).
 
-    Closures that correct less than `edge_min_distance_meters` get none.
+    Closures with a correction below `edge_min_distance_meters` get no edge.
     """
     enough = closures.correction_m >= options.edge_min_distance_meters
     rows = np.flatnonzero(closures.accepted & enough)
     _, first = np.unique(closures.id[rows], axis=0, return_index=True)
-    rows = rows[np.sort(first)]  # two neighbourhoods may have their best vertex in common
+    rows = rows[np.sort(first)]  # two places may have the same best vertex
     T_M_A = closures.T_M_I[rows]
     T_A_B = closures.T_A_B[rows]
     covariance = _of_relative_pose(closures.covariance[rows], T_M_A, T_A_B)
@@ -41,7 +39,7 @@ def closure_edges(closures: Closures, options: LoopClosureOptions) -> LoopClosur
 
 
 def _of_relative_pose(covariance: F64, T_M_A: F64, T_A_B: F64) -> F64:
-    """Turn the covariance of T_M_A into that of T_A_B = T_M_A^-1 T_M_B, T_M_B being fixed.
+    """Convert the covariance of T_M_A to that of T_A_B = T_M_A^-1 T_M_B with fixed T_M_B.
 
     With t <- t + dp, R <- R exp(d): p_A_B changes by -R^T dp + [p_A_B]x d, the attitude by -R_B_A d.
     """
@@ -49,6 +47,6 @@ def _of_relative_pose(covariance: F64, T_M_A: F64, T_A_B: F64) -> F64:
     J[:, :3, :3] = -so3.to_matrix(so3.inverse(T_M_A[:, :4]))
     J[:, :3, 3:] = so3.skew(T_A_B[:, 4:])
     J[:, 3:, 3:] = -so3.to_matrix(so3.inverse(T_A_B[:, :4]))
-    # matches err together, as neighbours share landmarks: count each closure as a few of them
+    # errors of neighbouring closures are correlated because they share landmarks
     turned = J @ covariance @ np.swapaxes(J, 1, 2)
     return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))

@@ -1,4 +1,4 @@
-"""The recorded closures as lines that a person can read, and as JSON or CSV."""
+"""List the recorded closures as a table, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import csv
 import dataclasses
 import io
 import json
+import weakref
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closure_report import ClosureLine, ClosureReport
-from maplab_py.algorithms.loop_closure.closures import VERDICTS
-from maplab_py.algorithms.loop_closure.record import USES, LoopRecord, read_record
-from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.loop_closure.closure_record import USES, LoopRecord, read_record
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.gate_values import gate_values, shortfalls
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.reports import ClosureLine, ClosureReport, Verdict
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.output_files import write_text
 from maplab_py.report import to_json
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdArray, IdIndex, to_hex, to_hex_list
-
-I64 = NDArray[np.int64]
 
 
 def list_closures(
@@ -32,16 +33,23 @@ def list_closures(
     missions: I64 | None = None,
     sort_by: str = "time",
     limit: int = 0,
+    reason: str = "",
+    descending: bool = False,
 ) -> ClosureReport:
     """Return the recorded closures.
 
     Args:
         vi_map: The map.
-        which: "accepted", "refused" or "all".
+        which: "accepted", "refused" or "all" closures.
         missions: Only closures with an end in these missions (rows); None = all.
         sort_by: "time" of the query, or "gap", "correction" (largest first), "inliers" (fewest
-            first).
+            first), or "near_miss" (fewest failed gates and nearest to the default thresholds first).
         limit: Most lines; 0 = all.
+        reason: Only closures whose verdict contains this text.
+        descending: Reverse the order.
+
+    Raises:
+        UserError: No verdict contains the reason.
     """
     record = read_record(vi_map)
     c = record.closures
@@ -53,14 +61,17 @@ def list_closures(
     mission = vi_map.vertices.mission
     if missions is not None:
         chosen = chosen & (np.isin(mission[query], missions) | np.isin(mission[place], missions))
+    if reason:
+        chosen = chosen & np.isin(c.verdict, _verdicts_with(reason))
     key = {
+        "near_miss": np.zeros(len(c)) if sort_by != "near_miss" else _near_misses(vi_map, record),
         "time": np.zeros(len(c)),
         "gap": -gap,
         "correction": -c.correction_m,
         "inliers": c.inliers,
     }[sort_by]
     order = np.lexsort((place, query, key))
-    order = order[chosen[order]]
+    order = order[chosen[order]][:: -1 if descending else 1]
     shown = order[:limit] if limit > 0 else order
     codes, counts = np.unique(c.verdict[~is_accepted], return_counts=True)
     return ClosureReport(
@@ -75,33 +86,84 @@ def list_closures(
     )
 
 
+def accepted_by_mission(vi_map: VIMap) -> I64:
+    """Return the number (M,) of accepted recorded closures with an end in each mission."""
+    closures = read_record(vi_map).closures
+    accepted = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
+    mission = vi_map.vertices.mission.astype(np.int64)
+    query, place = (
+        mission[vi_map.vertex_index.rows(ids)] for ids in (accepted.query, accepted.place)
+    )
+    ends = np.concatenate([query, place[place != query]])
+    return np.bincount(ends, minlength=len(vi_map.missions))
+
+
+def _verdicts_with(reason: str) -> list[int]:
+    codes = [code for code, verdict in enumerate(VERDICTS) if reason.lower() in verdict.value]
+    if not codes:
+        known = ", ".join(verdict.value for verdict in VERDICTS)
+        raise UserError(f"--reason={reason}: no verdict contains this text (there are: {known})")
+    return codes
+
+
+def _near_misses(vi_map: VIMap, record: LoopRecord) -> F64:
+    """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses."""
+    gates = gate_values(vi_map, record.closures, LoopClosureOptions())
+    total = shortfalls(gates)
+    failed = np.sum([gate.failed for gate in gates], axis=0)
+    return np.asarray(failed + total / (1.0 + total), dtype=np.float64)
+
+
+_DESCRIBED: weakref.WeakKeyDictionary[VIMap, list[tuple[str, str]]] = weakref.WeakKeyDictionary()
+"""Descriptions of the closures of maps, which do not change as maps are values."""
+
+
+def described_ids(vi_map: VIMap) -> list[tuple[str, str]]:
+    """Return the beginnings of the ids of all recorded closures, with inliers and verdict."""
+    if vi_map not in _DESCRIBED:
+        c = read_record(vi_map).closures
+        _DESCRIBED[vi_map] = [
+            (id_[:8], f"{inliers} of {matches} matches, {VERDICTS[verdict].value}")
+            for id_, inliers, matches, verdict in zip(
+                to_hex_list(c.id),
+                c.inliers.tolist(),
+                c.matches.tolist(),
+                c.verdict.tolist(),
+                strict=True,
+            )
+        ]
+    return _DESCRIBED[vi_map]
+
+
 def describe_closure(vi_map: VIMap, row: int) -> ClosureLine:
-    """Return one recorded closure (a row of what `read_record` returns)."""
+    """Return a recorded closure (a row of the closures of `read_record`)."""
     record = read_record(vi_map)
     chosen = record.closures.take(np.array([row]))
     return _lines(vi_map, dataclasses.replace(record, closures=chosen))[0]
 
 
 def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0.0) -> IdArray:
-    """Return the ids (N, 2) of recorded closures by the beginnings of their ids.
+    """Return the ids (N, 2) of recorded closures from prefixes of their ids.
 
     Args:
         vi_map: The map.
-        prefixes: Beginnings of ids, each of one closure.
-        neighbours_s: Also accepted closures both of whose ends are as near in time.
+        prefixes: Prefixes of ids, each of a single closure.
+        neighbours_s: Also select accepted closures with both ends within this time.
 
     Raises:
-        UserError: A prefix is of no closure or of several.
+        UserError: A prefix matches no closure or several.
     """
     c = read_record(vi_map).closures
     names = to_hex_list(c.id)
     rows = []
     for prefix in prefixes:
-        found = [row for row, name in enumerate(names) if name.startswith(prefix.strip().lower())]
-        if not prefix.strip() or len(found) != 1:
-            many = f"{len(found)} closures begin" if found else "no closure begins"
+        matching = [
+            row for row, name in enumerate(names) if name.startswith(prefix.strip().lower())
+        ]
+        if not prefix.strip() or len(matching) != 1:
+            many = f"{len(matching)} closures begin" if matching else "no closure begins"
             raise UserError(f"{many} with '{prefix}': lc_report lists them")
-        rows.append(found[0])
+        rows.append(matching[0])
     chosen = np.array(rows, dtype=np.int64)
     if neighbours_s > 0.0:
         chosen = _with_neighbours(vi_map, chosen, neighbours_s)
@@ -113,9 +175,9 @@ def _with_neighbours(vi_map: VIMap, chosen: I64, reach_s: float) -> I64:
     a, b = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
     time_ns, mission = vi_map.vertices.timestamp_ns, vi_map.vertices.mission
 
-    def near(one: I64, other: I64) -> NDArray[np.bool_]:
-        apart = np.abs(time_ns[one][:, None] - time_ns[other]) * 1e-9
-        return np.asarray((apart <= reach_s) & (mission[one][:, None] == mission[other]))
+    def near(first: I64, second: I64) -> NDArray[np.bool_]:
+        apart = np.abs(time_ns[first][:, None] - time_ns[second]) * 1e-9
+        return np.asarray((apart <= reach_s) & (mission[first][:, None] == mission[second]))
 
     same = near(a, a[chosen]) & near(b, b[chosen])
     swapped = near(a, b[chosen]) & near(b, a[chosen])

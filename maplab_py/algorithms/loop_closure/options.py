@@ -10,7 +10,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class LoopClosureOptions:
-    """How places are recognised, verified and used. Names are maplab's where it has the option."""
+    """Recognition, verification and use of places. maplab's names where it has the option."""
 
     flag_prefix: ClassVar[str] = "lc_"
 
@@ -23,97 +23,116 @@ class LoopClosureOptions:
     projection_matrix_filename: str = option(
         "",
         help="Projection of descriptors that train_projection_matrix wrote; empty, or of another "
-        "length of descriptors = learned from the map's own tracks",
+        "length of descriptors = learned from the tracks of the map",
     )
     target_dimensionality: int = option(
         10, help="Dimensions of a projection that is learned from the map"
     )
     num_neighbors: int = option(-1, help="Landmarks to retrieve per keypoint; -1 = 3")
+    max_missions_per_query: int = option(
+        8,
+        help="In maps of more missions each image is compared with so many of the others, those that most "
+        "of its nearest landmarks belong to",
+    )
     num_words_for_nn_search: int = option(
         16, help="Cells of the multi-index that are searched per keypoint"
     )
     max_bit_fraction: float = option(
-        0.26, help="Largest part of a descriptor's bits in which a match may differ"
+        0.26, help="Largest fraction of descriptor bits in which a match may differ"
     )
     fraction_best_scores: float = option(
-        0.25, help="A place needs this part of the votes of the query's best place in the mission"
+        0.25,
+        help="Smallest ratio of the votes of a place to those of the query's best place in the mission",
     )
     min_image_time_seconds: float = option(
         10.0, help="Vertices of one mission that are closer in time are not matched", unit="s"
     )
-    min_verify_matches_num: int = option(10, help="Matches with one place that are worth verifying")
+    min_verify_matches_num: int = option(
+        10, help="Smallest number of matches with a place for verification"
+    )
     ransac_pixel_sigma: float = option(
         2.0, help="Largest reprojection error of an inlier", unit="px"
     )
-    num_ransac_iters: int = option(300, help="Most samples of matches per query vertex")
+    num_ransac_iters: int = option(
+        300, help="Largest number of samples of matches per query vertex"
+    )
     pose_hypotheses: str = option(
         "gravity",
-        help="What a sample makes a pose of: gravity (two matches, and gravity as the query has "
-        "it) or three_point (three matches: P3P, generalised for rigs of several cameras)",
+        help="Minimal solver: gravity (two matches and the query's gravity direction) or three_point "
+        "(three matches: P3P, generalised for rigs of several cameras)",
         choices=("gravity", "three_point"),
     )
     min_inlier_count: int = option(12, help="Keypoints that must agree with the pose")
     min_inlier_ratio: float = option(
-        0.1, help="Part of the query's keypoints matched in the place that must agree"
+        0.1, help="Fraction of the query's keypoints matched in the place that must agree"
     )
     max_gravity_deviation_deg: float = option(
         3.0,
-        help="Largest angle between gravity as the query vertex has it and as found",
+        help="Largest angle between gravity at the query vertex and in the estimated pose",
         unit="deg",
     )
     max_rotation_sigma_deg: float = option(
         1.0,
-        help="Largest standard deviation of the rotation, by the inliers' own geometry",
+        help="Largest standard deviation of the rotation, from the geometry of the inliers",
         unit="deg",
     )
     max_delta_position_m: float = option(
-        -1.0, help="Largest change of the query's position; negative = by drift alone", unit="m"
+        -1.0,
+        help="Largest change of the query's position; negative = limited by drift only",
+        unit="m",
     )
     max_delta_rotation_deg: float = option(
         -1.0, help="Largest change of the query's attitude; negative = not limited", unit="deg"
     )
     max_drift_ratio: float = option(
         0.1,
-        help="Drift that a mission may have, as part of the way between query and place; a closure "
-        "inside one mission that corrects more (plus 0.5 m) is implausible",
+        help="Largest drift of a mission relative to the arc length between query and place; a closure "
+        "inside a mission with a larger correction (plus 0.5 m) is implausible",
     )
     min_support: int = option(
-        2, help="Other query vertices nearby whose closures must agree in yaw and position"
+        2, help="Number of nearby query vertices whose closures must agree in yaw and position"
     )
     max_ambiguous_ratio: float = option(
-        0.25,
-        help="Between missions of unknown relation: closures that tell another alignment, or whose "
-        "query fits several places, as part of those that agree; with more, none of them counts",
+        0.1,
+        help="Between missions of unknown relative pose: largest ratio of the stretches of a trajectory "
+        "that only another alignment explains to those that only the best one explains; else all "
+        "closures are rejected",
+    )
+    guided_matching: bool = option(
+        True,
+        help="Search merged landmarks also near the other keypoints of verified query vertices",
     )
     min_merge_observations: int = option(
-        2, help="Verified observations that must agree before two landmarks are merged"
+        2,
+        help="Number of verified observations that must agree before two landmarks are merged, one more "
+        "where their positions leave doubt; all of them where one of the two has fewer",
     )
     max_merge_distance_m: float = option(
         0.3, help="Largest distance of merged landmarks once the closure is applied", unit="m"
     )
     max_merge_distance_ratio: float = option(
-        0.1,
-        help="The distance may also be this part of the landmark's distance from the query: depth "
-        "is what landmarks err most in",
+        0.5,
+        help="Largest distance of merged landmarks relative to their distance from the query; the error "
+        "of landmarks is largest in depth, and --lc_max_merge_sigma limits it by the rays",
     )
     max_merge_sigma: float = option(
         4.0,
-        help="And at most so many standard deviations, by how the rays of both landmarks cross "
-        "(keypoints err by --lc_ransac_pixel_sigma) and by the closure's covariance",
+        help="Largest Mahalanobis distance of merged landmarks, from the rays of both landmarks "
+        "(keypoint error: --lc_ransac_pixel_sigma) and the closure's covariance",
     )
     max_merge_gap_m: float = option(
         0.5,
-        help="Landmarks are not merged over a closure that corrects more: relax first",
+        help="Largest correction of a closure that merges landmarks; else relax first",
         unit="m",
     )
     edge_min_distance_meters: float = option(
-        0.0, help="Closures that correct less get no edge", unit="m"
+        0.0, help="Smallest correction of a closure that becomes an edge", unit="m"
     )
     edge_covariance_scaler: float = option(
-        1.0, help="Factor on the covariance that verification gives an edge"
+        1.0, help="Factor on the covariance of an edge from verification"
     )
     switch_variable_variance: float = option(
-        1e-2, help="Variance of the prior that holds an edge's switch variable at 1"
+        1e-2, help="Variance of the prior of an edge's switch variable at 1"
     )
-    only_against_other_missions: bool = option(False, help="Look for places of other missions only")
+    only_against_other_missions: bool = option(False, help="Search places of other missions only")
     seed: int = option(0, help="Seed of all random choices")

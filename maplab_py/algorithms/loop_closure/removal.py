@@ -1,14 +1,12 @@
-"""Taking back single closures: their edges, and the merges that they alone justified."""
+"""Remove single closures with their edges and the merges that only they support."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closure_report import RemovalReport
-from maplab_py.algorithms.loop_closure.record import (
+from maplab_py.algorithms.loop_closure.closure_record import (
     USES,
     ClosureRecord,
     LoopRecord,
@@ -17,30 +15,33 @@ from maplab_py.algorithms.loop_closure.record import (
     read_record,
     write_record,
 )
-from maplab_py.algorithms.loop_closure.recording import REMOVED
+from maplab_py.algorithms.loop_closure.record_updates import REMOVED
+from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport
+from maplab_py.array_types import I64
+from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges
+from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges, with_p_G
 from maplab_py.vimap.ids import IdArray, IdIndex, to_hex_list
 
-I64 = NDArray[np.int64]
 
+def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalReport]:
+    """Remove closures; later searches reject them.
 
-def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, RemovalReport]:
-    """Take back closures; later searches refuse them.
-
-    A merge stays as long as enough other closures speak for it. Where it falls, the landmarks are
-    again what they were before, each at its old place in the body frame of its vertex, with the
-    observations it had (those that have been removed since stay removed).
+    A merge stays as long as enough other closures support it. If it is undone, the landmarks are
+    restored with their positions in the body frames of their vertices and their observations.
+    Observations that were removed since then are not restored.
 
     Args:
         vi_map: A map with a record.
         ids: Ids (N, 2) of closures in the record.
     """
     record = read_record(vi_map)
-    gone = IdIndex(ids).rows(record.closures.id) >= 0
-    relaxed = gone & (record.closures.use == USES.index("relax"))
-    verdict = np.where(gone, REMOVED, record.closures.verdict)
-    closures = record.closures.replace(verdict=verdict, use=np.where(gone, 0, record.closures.use))
+    removed = IdIndex(ids).rows(record.closures.id) >= 0
+    relaxed = removed & (record.closures.use == USES.index("relax"))
+    verdict = np.where(removed, REMOVED, record.closures.verdict)
+    closures = record.closures.replace(
+        verdict=verdict, use=np.where(removed, 0, record.closures.use)
+    )
     edges = IdIndex(ids).rows(vi_map.loop_closure_edges.id) >= 0
     result = remove_loop_closure_edges(vi_map, edges) if edges.any() else vi_map
     pairs = record.pairs.take(IdIndex(ids).rows(record.pairs.closure) < 0)
@@ -50,9 +51,9 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, RemovalReport]:
     result = write_record(result, dataclasses.replace(record, closures=closures, pairs=pairs))
     notes = []
     if relaxed.any():
-        notes.append("the trajectories stay as relax has bent them: run relax again")
-    return result, RemovalReport(
-        closures=tuple(name[:8] for name in to_hex_list(record.closures.id[gone])),
+        notes.append("the trajectories keep their relaxed poses: run relax again")
+    return result, ClosureRemovalReport(
+        closures=tuple(name[:8] for name in to_hex_list(record.closures.id[removed])),
         edges_removed=int(np.count_nonzero(edges)),
         landmarks_restored=restored,
         observations_moved=moved,
@@ -61,7 +62,7 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, RemovalReport]:
 
 
 def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:
-    """Return the pairs that closures of enough query vertices speak for."""
+    """Return the pairs that closures of enough query vertices support."""
     count = len(pairs)
     if count == 0:
         return pairs
@@ -77,7 +78,7 @@ def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:
 
 
 def _groups(landmarks: IdIndex, count: int, pairs: MergePairs) -> I64:
-    """Label recorded landmarks (count,): those that the pairs unite have the same label."""
+    """Label recorded landmarks (count,) by connected component of the pairs."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -89,14 +90,14 @@ def _groups(landmarks: IdIndex, count: int, pairs: MergePairs) -> I64:
 def _restored(
     vi_map: VIMap, record: LoopRecord, pairs: MergePairs
 ) -> tuple[VIMap, int, int, MergePairs]:
-    """Split united landmarks into what the remaining pairs still unite."""
+    """Split merged landmarks into the groups that the remaining pairs connect."""
     lm = _first_of_each(record.landmarks)
     index = IdIndex(lm.id)
-    united = _groups(index, len(lm), record.pairs)  # what is one landmark in the map now
+    united = _groups(index, len(lm), record.pairs)  # landmarks that are merged in the map now
     label = _groups(index, len(lm), pairs)
     present = vi_map.landmark_index.rows(lm.id)  # survivors
     vertex = vi_map.vertex_index.rows(lm.vertex)
-    # a group that has no survivor among its members gets one of them back
+    # a group without surviving member restores one of its members
     alive = np.zeros(len(lm) + 1, dtype=np.bool_)
     alive[label[present >= 0]] = True
     has_survivor = np.zeros(len(lm) + 1, dtype=np.bool_)
@@ -108,7 +109,7 @@ def _restored(
     row_of_label[label[back]] = np.arange(len(back))
     keypoint, original = _recorded_keypoints(vi_map, record, index)
     target = row_of_label[label[original]]
-    # only keypoints that observe what their landmark was merged into follow
+    # move only keypoints that observe the landmark which theirs was merged into
     now = vi_map.keypoints.landmark[keypoint]
     survivor_group = np.full(len(vi_map.landmarks) + 1, -1, dtype=np.int64)
     survivor_group[present[present >= 0]] = united[present >= 0]
@@ -123,7 +124,30 @@ def _restored(
         quality=lm.quality[back],
         feature_type=lm.feature_type[back],
     )
+    is_split = np.bincount(united, minlength=1)[united] > 1
+    is_alone = is_split & (np.bincount(label, minlength=1)[label] == 1)
+    alone = np.flatnonzero(is_alone & (present >= 0) & (vertex >= 0))
+    result = _as_before(result, lm, alone, vertex[alone])
     return result, len(back), int(np.count_nonzero(moves)), pairs
+
+
+def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64) -> VIMap:
+    """Give landmarks that lost all they were merged with their recorded position and quality.
+
+    Args:
+        vi_map: The map.
+        recorded: Landmarks before merging.
+        rows: Rows (N,) of these.
+        vertex: Vertex rows (N,) that the recorded positions are relative to.
+    """
+    landmarks = vi_map.landmark_index.rows(recorded.id[rows])
+    p_G = se3.transform(vi_map.T_G_I[vertex], recorded.p_I[rows])
+    moved = with_p_G(vi_map, landmarks, p_G)
+    stored_there = moved.landmarks.vertex[landmarks] == vertex
+    p_I, quality = np.array(moved.landmarks.p_I), np.array(moved.landmarks.quality)
+    p_I[landmarks[stored_there]] = recorded.p_I[rows[stored_there]]
+    quality[landmarks] = recorded.quality[rows]
+    return moved.replace(landmarks=moved.landmarks.replace(p_I=p_I, quality=quality))
 
 
 def _first_of_each(landmarks: MergedLandmarks) -> MergedLandmarks:
@@ -133,7 +157,7 @@ def _first_of_each(landmarks: MergedLandmarks) -> MergedLandmarks:
 
 
 def _recorded_keypoints(vi_map: VIMap, record: LoopRecord, index: IdIndex) -> tuple[I64, I64]:
-    """Return keypoint rows that are still there, and the recorded landmark each saw at first."""
+    """Return existing keypoint rows and the recorded original landmark of each."""
     frame = IdIndex(vi_map.frames.id).rows(record.keypoints.frame)
     original = index.rows(record.keypoints.landmark)
     good = (frame >= 0) & (original >= 0)

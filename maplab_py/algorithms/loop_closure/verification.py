@@ -1,4 +1,4 @@
-"""Geometric verification: the absolute pose of every query vertex in the place it may have seen."""
+"""Geometric verification: absolute pose of every query vertex in its candidate places."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.candidates import Candidates, Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures, points_in_mission
-from maplab_py.algorithms.loop_closure.recording import closure_ids
+from maplab_py.algorithms.loop_closure.record_updates import closure_ids
+from maplab_py.array_types import I64
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseSearch:
-    """Problems and solutions, and which match each row of a problem is."""
+    """Pose problems and solutions, and the match of each row of a problem."""
 
     solutions: PoseSolutions
     start: I64  # (P + 1,)
@@ -40,7 +38,7 @@ def search_poses(
     max_iterations: int,
     hypotheses: str,
 ) -> PoseSearch:
-    """Find each candidate's pose T_M_I, M being the frame of the place's mission."""
+    """Estimate each candidate's pose T_M_I, where M is the frame of the place's mission."""
     problem = np.repeat(np.arange(len(candidates.query_vertex)), np.diff(candidates.start))
     feature = matches.query[candidates.match]
     landmark = features.descriptors.label[matches.database[candidates.match]]

@@ -77,20 +77,20 @@ class SwitchedOff:
 class RelaxationReport(Report):
     """What a relaxation did."""
 
-    num_loop_closures: int  # used as constraints
-    num_switched_off: int  # of those, given less than half their weight in the end
-    num_ignored: int  # not used at all; `notes` says why
-    num_vertices: int  # that could move
-    num_base_frames: int  # that moved
-    num_clusters: int  # groups of missions held together by closures
-    iterations: int
-    cost_before: float
-    cost_after: float
-    mean_correction_m: float
-    max_correction_m: float
-    mean_correction_deg: float
-    max_correction_deg: float
-    seconds: float
+    num_loop_closures: int = 0  # used as constraints
+    num_switched_off: int = 0  # of those, given less than half their weight in the end
+    num_ignored: int = 0  # not used at all; `notes` says why
+    num_vertices: int = 0  # that could move
+    num_base_frames: int = 0  # that moved
+    num_clusters: int = 0  # groups of missions held together by closures
+    iterations: int = 0
+    cost_before: float = 0.0
+    cost_after: float = 0.0
+    mean_correction_m: float = 0.0
+    max_correction_m: float = 0.0
+    mean_correction_deg: float = 0.0
+    max_correction_deg: float = 0.0
+    seconds: float = 0.0
     worst: tuple[SwitchedOff, ...] = ()  # ten at most
     notes: tuple[str, ...] = ()
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import search_loops
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.recording import with_closures
-from maplab_py.algorithms.loop_closure.report import LoopClosureReport
+from maplab_py.algorithms.loop_closure.record_updates import with_closures
+from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.algorithms.relaxation.relaxation import relax_graph
+from maplab_py.array_types import I64
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
@@ -21,7 +21,7 @@ def relax_over_loops(
     options: RelaxationOptions,
     loop_options: LoopClosureOptions,
     *,
-    missions: NDArray[np.int64] | None = None,
+    missions: I64 | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LoopClosureReport, RelaxationReport]:
     """Relax a map over the closures that are found in it and the edges that it has.
@@ -32,11 +32,11 @@ def relax_over_loops(
     Raises:
         EstimationError: Nothing to recognise places by, or the pose graph has no usable solution.
     """
-    if not vi_map.frames.descriptor_size.any() and len(vi_map.loop_closure_edges):
+    if not vi_map.binary_descriptor_size.any() and len(vi_map.loop_closure_edges):
         relaxed = relax_graph(vi_map, options, missions=missions, progress=progress)
-        note = "the map has no descriptors: only its own loop closure edges count"
+        note = "the map has no binary descriptors: only its own loop closure edges count"
         return relaxed.vi_map, LoopClosureReport(notes=(note,)), relaxed.report
-    search, found = search_loops(vi_map, loop_options, missions=missions, progress=progress)
+    search, search_report = search_loops(vi_map, loop_options, missions=missions, progress=progress)
     new = IdIndex(vi_map.loop_closure_edges.id).rows(search.edges.id) < 0
     relaxed = relax_graph(
         vi_map,
@@ -53,4 +53,4 @@ def relax_over_loops(
         used=(used >= 0) & search.closures.accepted,
         weight=np.append(relaxed.weight, 1.0)[used],
     )
-    return result, found, relaxed.report
+    return result, search_report, relaxed.report

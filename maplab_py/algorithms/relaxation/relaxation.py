@@ -8,9 +8,9 @@ position and heading in M. The optimum is the same for poses in G: it is found f
 divided between base frames and vertices. Landmarks stay where they are in their vertex' body frame,
 so they move rigidly with it; velocities turn with it; biases stay.
 
-False closures are found by graduated non-convexity and a verdict on each (see `robust`, `verdict`),
-or held off by robust weighting (switchable constraints: Suenderhauf and Protzel, IROS 2012; dynamic
-covariance scaling: Agarwal et al., ICRA 2013).
+False closures are found by graduated non-convexity and a test of each (see `robust`,
+`closure_consistency`), or held off by robust weighting (switchable constraints: Suenderhauf and
+Protzel, IROS 2012; dynamic covariance scaling: Agarwal et al., ICRA 2013).
 
 Use: `find_loop_closures` of `algorithms.loop_closure` gives the edges for `loop_closures`; those are
 constraints of this call only and are not added to the map. The map's own loop-closure edges always
@@ -23,30 +23,29 @@ import dataclasses
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.options import (
-    RelaxationOptions,
-    RelaxationReport,
-    SwitchedOff,
-)
-from maplab_py.algorithms.relaxation.pose_graph import (
-    TiltPriors,
-    clusters,
+from maplab_py.algorithms.relaxation.map_edges import (
     has_odometry_backbone,
     loop_edges,
     trajectory_edges,
     usable_loop_closures,
 )
+from maplab_py.algorithms.relaxation.options import (
+    RelaxationOptions,
+    RelaxationReport,
+    SwitchedOff,
+)
 from maplab_py.algorithms.relaxation.robust import Solution, optimize_robustly
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.estimation.problem.gauge import clusters
+from maplab_py.estimation.terms.pose_graph import TiltPriors
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
 from maplab_py.vimap.tables import LoopClosureEdges
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+_NUM_WORST = 10
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ def relax(
     options: RelaxationOptions,
     *,
     loop_closures: LoopClosureEdges | None = None,
-    missions: NDArray[np.int64] | None = None,
+    missions: I64 | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, RelaxationReport]:
     """Relax the pose graph of a map; as `relax_graph`, for those who need no switches.
@@ -83,7 +82,7 @@ def relax_graph(
     options: RelaxationOptions,
     *,
     loop_closures: LoopClosureEdges | None = None,
-    missions: NDArray[np.int64] | None = None,
+    missions: I64 | None = None,
     progress: Progress = SILENT,
 ) -> Relaxed:
     """Relax the pose graph of a map.
@@ -115,11 +114,13 @@ def relax_graph(
     closures, notes = usable_loop_closures(vi_map, offered, missions)
     num_ignored = len(offered) - len(closures)
     if len(closures) == 0:
-        return Relaxed(vi_map, _nothing_done(num_ignored, notes), closures, np.zeros(0))
+        nothing_done = RelaxationReport(num_ignored=num_ignored, notes=tuple(notes))
+        return Relaxed(vi_map, nothing_done, closures, np.zeros(0))
     graph = trajectory_edges(vi_map, options)
     odometry = has_odometry_backbone(vi_map)
     loops = loop_edges(closures, options, as_given=odometry[closures.from_vertex])
-    label = clusters(len(vi_map.vertices), [graph, loops])
+    links = [(edges.from_vertex, edges.to_vertex) for edges in (graph, loops)]
+    label = clusters(len(vi_map.vertices), links)
     is_active = np.isin(label, label[loops.from_vertex])
     graph = graph.take(np.flatnonzero(is_active[graph.from_vertex]))
     anchors = _anchors(label, is_active)
@@ -154,8 +155,8 @@ def _move_base_frames(vi_map: VIMap, rows: I64, anchors: I64, T_G_I: F64) -> tup
     is_moving[vi_map.vertices.mission[rows]] = True
     is_moving[vi_map.vertices.mission[anchors]] = False
     users = np.bincount(missions.baseframe, minlength=len(vi_map.baseframes))
-    is_own = vi_map.baseframes.is_known & (users == 1)
-    mission = np.flatnonzero(is_moving & is_own[missions.baseframe])
+    is_unshared = vi_map.baseframes.is_known & (users == 1)
+    mission = np.flatnonzero(is_moving & is_unshared[missions.baseframe])
     if len(mission) == 0:
         return vi_map, 0
     frame, first = missions.baseframe[mission], start[mission]
@@ -196,7 +197,7 @@ def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
     return vi_map.replace(vertices=vertices.replace(T_M_I=poses, v_M=velocities))
 
 
-def _anchors(label: I64, is_active: NDArray[np.bool_]) -> I64:
+def _anchors(label: I64, is_active: Mask) -> I64:
     """Return the first active vertex of every cluster."""
     active = np.flatnonzero(is_active)
     return np.sort(active[np.unique(label[active], return_index=True)[1]])
@@ -205,7 +206,7 @@ def _anchors(label: I64, is_active: NDArray[np.bool_]) -> I64:
 def _report(
     before: VIMap,
     after: VIMap,
-    is_active: NDArray[np.bool_],
+    is_active: Mask,
     closures: LoopClosureEdges,
     solution: Solution,
 ) -> RelaxationReport:
@@ -213,8 +214,7 @@ def _report(
     moved_m = np.linalg.norm(new[:, 4:] - old[:, 4:], axis=1)
     turn = so3.log(so3.multiply(so3.inverse(old[:, :4]), new[:, :4]))
     turned_deg = np.rad2deg(np.linalg.norm(turn, axis=1))
-    return dataclasses.replace(
-        _NOTHING_DONE,
+    return RelaxationReport(
         num_loop_closures=len(closures),
         num_switched_off=int(np.count_nonzero(solution.weight < 0.5)),
         iterations=solution.iterations,
@@ -243,26 +243,3 @@ def _worst(vi_map: VIMap, closures: LoopClosureEdges, weight: F64) -> tuple[Swit
         )
         for row in np.argsort(-error_m, kind="stable")[:_NUM_WORST].tolist()
     )
-
-
-def _nothing_done(num_ignored: int, notes: list[str]) -> RelaxationReport:
-    return dataclasses.replace(_NOTHING_DONE, num_ignored=num_ignored, notes=tuple(notes))
-
-
-_NUM_WORST = 10
-_NOTHING_DONE = RelaxationReport(
-    num_loop_closures=0,
-    num_switched_off=0,
-    num_ignored=0,
-    num_vertices=0,
-    num_base_frames=0,
-    num_clusters=0,
-    iterations=0,
-    cost_before=0.0,
-    cost_after=0.0,
-    mean_correction_m=0.0,
-    max_correction_m=0.0,
-    mean_correction_deg=0.0,
-    max_correction_deg=0.0,
-    seconds=0.0,
-)

@@ -1,4 +1,4 @@
-"""The robust optimisation of a pose graph: ever stricter losses, then a verdict on every closure.
+"""The robust optimisation of a pose graph: ever stricter losses, then a test of every closure.
 
 Far from the answer a true closure looks as false as a false one. So a loss begins where most closures
 count and becomes stricter step by step (graduated non-convexity: Yang et al., RA-L 2020).
@@ -9,29 +9,59 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.losses import LOSSES
-from maplab_py.algorithms.relaxation.optimizer import PoseGraphOptimizer
-from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.pose_graph import RelativePoses, TiltPriors
-from maplab_py.algorithms.relaxation.verdict import (
+from maplab_py.algorithms.relaxation.closure_consistency import (
     independent_errors,
+    largest_error,
     variance_factor,
     with_tail,
 )
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.array_types import F64, Mask
+from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.loss_values import loss_and_weight
+from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
+from maplab_py.estimation.problem.solver import (
+    SLOW_CONVERGENCE,
+    SolverOptions,
+    optimize_states,
+)
+from maplab_py.estimation.problem.trust_region import Schedule
+from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.progress import Progress
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
-_PRICE_RATIO = 4.0  # from one stage to the next
+_LOSSES = {
+    "none": Loss.NONE,
+    "gnc": Loss.DCS,
+    "dcs": Loss.DCS,
+    "switchable": Loss.GEMAN_MCCLURE,
+    "cauchy": Loss.CAUCHY,
+}
+"""The squared scale of each is the penalty phi of switching a closure off. With the best switch s in
+[0, 1] for each closure, s^2 u + phi (1 - s)^2 (Suenderhauf and Protzel, IROS 2012, with gamma = 1 and
+the linear switch function) is Geman and McClure's loss: s = phi / (phi + u)."""
+_PENALTY_RATIO = 4.0  # from one stage to the next
 _STAGE_ITERATIONS = 4
+_STAGE_TOLERANCE = 1e-7
+_SOLVER = SolverOptions(
+    initial_radius=1e8,
+    min_radius=1e-8,
+    max_radius=1e12,
+    function_tolerance=1e-12,
+    gradient_tolerance=0.0,
+    parameter_tolerance=0.0,
+)
+_NEWTON_RADIUS = 2e3
+"""Second derivatives are seldom positive definite without some damping."""
+_SLOW_RATIO = 0.05
 _STARTS = (1.0, 0.5)
 """Shares of the closures that count in the beginning. All of them: right where drift is large. Half
 of them: right where false ones would turn the graph inside out."""
 _TRUSTED = 0.5  # weight
-_VERDICTS = 8
+_MAX_TESTS = 8
+_SUM_SIGMAS = 3.0
+"""How far above its expectation the sum of squared errors of a graph without false closures may lie."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,9 +75,10 @@ class Solution:
     cost_after: float
 
 
+@single_blas_thread()  # entered once, not at every solution
 def optimize_robustly(
     T_G_I: F64,
-    is_free: NDArray[np.bool_],
+    is_free: Mask,
     trajectory: RelativePoses,
     loops: RelativePoses,
     tilt: TiltPriors,
@@ -68,7 +99,9 @@ def optimize_robustly(
     Raises:
         EstimationError: The poses are not determined, or not finite.
     """
-    graph = _Graph(T_G_I, is_free, trajectory, loops, tilt, options, progress)
+    loss = _LOSSES[options.robustness]
+    problem = PoseGraphProblem(is_free, trajectory, loops, tilt, loss)
+    graph = _Graph(T_G_I, problem, loops, loss, options, progress)
     if options.robustness == "gnc":
         return graph.consistent()
     if options.robustness == "none":
@@ -76,40 +109,30 @@ def optimize_robustly(
     return graph.annealed()
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Graph:
     """What all ways of optimising a graph need."""
 
-    def __init__(
-        self,
-        T_G_I: F64,
-        is_free: NDArray[np.bool_],
-        trajectory: RelativePoses,
-        loops: RelativePoses,
-        tilt: TiltPriors,
-        options: RelaxationOptions,
-        progress: Progress,
-    ) -> None:
-        self.T_G_I = T_G_I
-        self.loops = loops
-        self.options = options
-        self.progress = progress
-        name = "dcs" if options.robustness == "gnc" else options.robustness
-        self.loss = LOSSES[name]
-        self.optimizer = PoseGraphOptimizer(is_free, trajectory, loops, tilt, name)
+    T_G_I: F64
+    problem: PoseGraphProblem
+    loops: RelativePoses
+    loss: Loss
+    options: RelaxationOptions
+    progress: Progress
 
     def plain(self) -> Solution:
-        T, iterations = self._finish(self.optimizer, self.T_G_I, 1.0)
-        return self._solution(T, np.ones(len(self.loops)), iterations, 1.0)
+        T, iterations = self._finish(self.problem, self.T_G_I)
+        return self._solution(T, np.ones(len(self.loops)), iterations)
 
     def annealed(self) -> Solution:
-        """Lower the price of switching off to the one asked for; of all starts the least cost wins."""
-        price = self.options.switch_prior
+        """Lower the switch penalty to the one asked for; of all starts the least cost wins."""
+        penalty = self.options.switch_prior
         solutions: list[Solution] = []
         for share in _STARTS:
-            T, iterations = self._anneal(share, price)
-            T, more = self._finish(self.optimizer, T, price)
-            weight = self.loss(self.loops.squared_errors(T), price)[1]
-            solutions.append(self._solution(T, weight, iterations + more, price))
+            T, iterations = self._anneal(share, penalty)
+            T, more = self._finish(self.problem, T)
+            weight = loss_and_weight(self.loss, penalty, self.loops.squared_errors(T))[1]
+            solutions.append(self._solution(T, weight, iterations + more))
             if np.all(weight > _TRUSTED):
                 break
         return _best(solutions, [s.cost_after for s in solutions])
@@ -120,11 +143,15 @@ class _Graph:
         Begins in several ways, if the first does not trust all. The least truncated cost wins: what
         the trusted ones cost, and the limit for each of the others.
         """
+        plain, spent = self._undisputed()
+        if plain is not None:
+            return plain
         solutions: list[Solution] = []
         limits: list[float] = []
         for share in _STARTS:
             T, iterations = self._anneal(share, self.options.switch_prior)
-            solution, limit = self._judged(T, iterations)
+            solution, limit = self._tested(T, iterations + spent)
+            spent = 0
             solutions.append(solution)
             limits.append(limit)
             if np.all(solution.weight == 1.0):
@@ -132,7 +159,33 @@ class _Graph:
         off = max(limits)
         return _best(solutions, [s.cost_after + off * np.sum(1.0 - s.weight) for s in solutions])
 
-    def _judged(self, T: F64, iterations: int) -> tuple[Solution, float]:
+    def _undisputed(self) -> tuple[Solution | None, int]:
+        """Trust all closures, if nothing speaks against any; also return the iterations.
+
+        Neither a closure against all others, nor the sum of all squared errors, which false closures
+        that agree with one another raise where they bend the trajectories.
+        """
+        everything = np.ones(len(self.loops), dtype=np.bool_)
+        problem = self.problem.without_loss()
+        if problem.redundancy <= 0:
+            return None, 0
+        problem.set_active(everything)
+        T, iterations = self._solve(
+            problem, self.T_G_I, self.options.num_iterations, _STAGE_TOLERANCE
+        )
+        tail = _SUM_SIGMAS * np.sqrt(2.0 * problem.redundancy)
+        if problem.cost(T) > problem.redundancy + tail:
+            return None, iterations
+        uncertainty = problem.closure_uncertainty(T)
+        u = independent_errors(self.loops.errors(T), uncertainty, everything)
+        if u.max() > largest_error(len(u)) * min(variance_factor(u), 1.0):
+            return None, iterations
+        T, more = self._finish(problem, T)
+        first, last = problem.cost(self.T_G_I), problem.cost(T)
+        weight = everything.astype(np.float64)
+        return Solution(T, weight, iterations + more, first, last), iterations
+
+    def _tested(self, T: F64, iterations: int) -> tuple[Solution, float]:
         """Find a set of closures that is the set of those which agree with its own optimum.
 
         Returns:
@@ -140,65 +193,95 @@ class _Graph:
         """
         prior = self.options.switch_prior
         u = self.loops.squared_errors(T)
-        price = prior
-        while True:  # on to the price that the accuracy of this graph deserves
-            wanted = prior * min(variance_factor(u[u < 2.0 * price]), 1.0)
-            if price <= wanted * 1.5:
+        penalty = prior
+        while True:  # on to the penalty that the accuracy of this graph deserves
+            wanted = prior * min(variance_factor(u[u < 2.0 * penalty]), 1.0)
+            if penalty <= wanted * 1.5:
                 break
-            price = max(price / _PRICE_RATIO, wanted)
-            T, used = self._stage(T, price)
+            penalty = max(penalty / _PENALTY_RATIO, wanted)
+            T, used = self._stage(T, penalty)
             iterations += used
             u = self.loops.squared_errors(T)
-        kept = u < 2.0 * price
-        optimizer, limit = self.optimizer.plain(), prior
-        for _ in range(_VERDICTS):
-            T, used, u, limit = self._measured(optimizer, T, kept)
+        kept = u < 2.0 * penalty
+        problem, limit = self.problem.without_loss(), prior
+        for _ in range(_MAX_TESTS):
+            T, used, u, limit = self._measured(problem, T, kept)
             iterations += used
             before, kept = kept, with_tail(u, limit)
             core = u <= limit
-            if np.any(kept & ~core):  # true ones with larger errors, or false ones that bend all?
-                T, used, u, limit = self._measured(optimizer, T, core)
+            # true closures with larger errors, or false ones that distort all?
+            if np.any(kept & ~core):
+                T, used, u, limit = self._measured(problem, T, core)
                 iterations += used
                 kept = with_tail(u, limit)
             if np.array_equal(before, kept):
                 break
-        optimizer.trust(kept)
-        T, used = self._finish(optimizer, T, 1.0)
-        first, last = (optimizer.cost(x, 1.0) for x in (self.T_G_I, T))
+        problem.set_active(kept)
+        T, used = self._finish(problem, T)
+        first, last = problem.cost(self.T_G_I), problem.cost(T)
         return Solution(T, kept.astype(np.float64), iterations + used, first, last), limit
 
     def _measured(
-        self, optimizer: PoseGraphOptimizer, T: F64, kept: NDArray[np.bool_]
+        self, problem: PoseGraphProblem, T: F64, kept: Mask
     ) -> tuple[F64, int, F64, float]:
         """Optimise with some closures; return poses, iterations, independent errors, their limit."""
-        optimizer.trust(kept)
-        T, iterations = optimizer.run(T, 1.0, self.options.num_iterations, self.progress)
-        uncertainty = optimizer.closure_uncertainty(T)
+        problem.set_active(kept)
+        T, iterations = self._solve(problem, T, self.options.num_iterations, _STAGE_TOLERANCE)
+        uncertainty = problem.closure_uncertainty(T)
         u = independent_errors(self.loops.errors(T), uncertainty, kept)
         return T, iterations, u, self.options.switch_prior * variance_factor(u[kept])
 
-    def _anneal(self, share: float, price: float) -> tuple[F64, int]:
-        """Go down in price until just above the one given."""
+    def _anneal(self, share: float, penalty: float) -> tuple[F64, int]:
+        """Lower the switch penalty until just above the one given."""
         highest = float(np.quantile(self.loops.squared_errors(self.T_G_I), share))
-        stages = int(np.ceil(np.log(max(highest / price, 1.0)) / np.log(_PRICE_RATIO)))
+        stages = int(np.ceil(np.log(max(highest / penalty, 1.0)) / np.log(_PENALTY_RATIO)))
         T, iterations = self.T_G_I, 0
         for stage in range(stages, -1, -1):
-            T, used = self._stage(T, price * _PRICE_RATIO**stage)
+            T, used = self._stage(T, penalty * _PENALTY_RATIO**stage)
             iterations += used
             self.progress.step(stages + 1 - stage, stages + 1, "relaxing")
         return T, iterations
 
-    def _stage(self, T: F64, price: float) -> tuple[F64, int]:
-        return self.optimizer.run(T, price, _STAGE_ITERATIONS, self.progress)
+    def _stage(self, T: F64, penalty: float) -> tuple[F64, int]:
+        self.problem.set_squared_scale(penalty)
+        return self._solve(self.problem, T, _STAGE_ITERATIONS, _STAGE_TOLERANCE)
 
-    def _finish(self, optimizer: PoseGraphOptimizer, T: F64, price: float) -> tuple[F64, int]:
+    def _finish(self, problem: PoseGraphProblem, T: F64) -> tuple[F64, int]:
         options = self.options
-        return optimizer.run(
-            T, price, options.num_iterations, self.progress, options.function_tolerance
-        )
+        return self._solve(problem, T, options.num_iterations, options.function_tolerance)
 
-    def _solution(self, T: F64, weight: F64, iterations: int, price: float) -> Solution:
-        before, after = (self.optimizer.cost(x, price) for x in (self.T_G_I, T))
+    def _solve(
+        self, problem: PoseGraphProblem, T: F64, num_iterations: int, tolerance: float
+    ) -> tuple[F64, int]:
+        """Return poses and accepted steps.
+
+        Where residuals stay large Gauss-Newton takes hundreds of steps, and Newton a dozen; far from
+        the optimum Newton leads astray.
+        """
+        problem.set_second_order(False)
+        options = dataclasses.replace(
+            _SOLVER,
+            num_iterations=num_iterations,
+            forecast_tolerance=tolerance,
+            slow_ratio=_SLOW_RATIO if problem.can_have_second_order else 1.0,
+        )
+        T, summary = optimize_states(problem, T, options, self.progress)
+        iterations = summary.iterations - summary.rejected_steps
+        if summary.termination != SLOW_CONVERGENCE:
+            return T, iterations
+        problem.set_second_order(True)
+        rest = dataclasses.replace(
+            options,
+            num_iterations=num_iterations - summary.iterations,
+            initial_radius=_NEWTON_RADIUS,
+            schedule=Schedule.CERES,
+            slow_ratio=1.0,
+        )
+        T, newton = optimize_states(problem, T, rest, self.progress)
+        return T, iterations + newton.iterations - newton.rejected_steps
+
+    def _solution(self, T: F64, weight: F64, iterations: int) -> Solution:
+        before, after = (self.problem.cost(x) for x in (self.T_G_I, T))
         return Solution(T, weight, iterations, before, after)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.relaxation.graph import map_of_graph, optimize_graph
+from maplab_py.algorithms.relaxation.graph_files import map_of_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3
@@ -14,7 +14,7 @@ _POSES = 12
 
 
 def compile_relaxation() -> None:
-    """Relax a square of poses whose ends meet, as a map and as a graph."""
+    """Relax a map of a circle of poses whose ends meet."""
     T_G_V = se3.identity(_POSES)
     T_G_V[:, 4] = np.sin(2.0 * np.pi * np.arange(_POSES) / _POSES)
     T_G_V[:, 5] = np.cos(2.0 * np.pi * np.arange(_POSES) / _POSES)
@@ -31,6 +31,4 @@ def compile_relaxation() -> None:
         information=np.tile(1e4 * np.eye(6), (len(first), 1, 1)),
         fixed=np.zeros(1, dtype=np.int64),
     )
-    options = RelaxationOptions()
-    optimize_graph(graph, options)
-    relax(map_of_graph(graph), options)
+    relax(map_of_graph(graph), RelaxationOptions())

@@ -1,110 +1,86 @@
-"""Two calibrations of a device, side by side."""
+"""Comparison of two calibrations of a device, parameter by parameter."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.reports import CalibrationComparison, ComparedParameter
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, Distortion, Projection, SensorSet
-from maplab_py.sensors.imu import ImuIntrinsics
-
-F64 = NDArray[np.float64]
-
-_DISTORTION = {
-    Distortion.NONE: (),
-    Distortion.RADTAN: ("k1", "k2", "p1", "p2"),
-    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
-    Distortion.FOV: ("w",),
-}
-_PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-_NAMES = ("x scale", "y scale", "z scale", "xy misalignment", "xz misalignment", "yz misalignment")
+from maplab_py.sensors import Camera, SensorSet
+from maplab_py.sensors.calibration_transfer import Device, camera_models
+from maplab_py.sensors.camera import parameter_names
+from maplab_py.sensors.imu import TRIANGLE_NAMES, ImuIntrinsics
+from maplab_py.sensors.projection import back_project, project
 
 
 def compare(
-    first: SensorSet,
-    first_ids: tuple[str, str],
-    second: SensorSet,
-    second_ids: tuple[str, str],
+    first: SensorSet, first_device: Device, second: SensorSet, second_device: Device
 ) -> CalibrationComparison:
-    """Compare IMU and rig (ids) of two sets of sensors, parameter by parameter.
+    """Compare the calibrations of two devices.
 
     Raises:
         UserError: The cameras are of different models.
     """
-    from maplab_py.errors import UserError
-
-    rows, shifts = list[ComparedParameter](), [0.0]
-    cameras = [
-        s.camera_rig(ids[1]).cameras for s, ids in ((first, first_ids), (second, second_ids))
-    ]
-    kinds = [[(c.projection, c.distortion) for c in one] for one in cameras]
-    if kinds[0] != kinds[1]:
+    pairs = ((first, first_device), (second, second_device))
+    rigs = [sensors.camera_rig(device.rig) for sensors, device in pairs]
+    if camera_models(rigs[0]) != camera_models(rigs[1]):
         raise UserError("the calibrations are of different cameras: their number or models differ")
-    for row, (a, b) in enumerate(zip(*cameras, strict=True)):
-        own = f"camera {row} " if len(cameras[0]) > 1 else "camera "
-        rows += _of_cameras(own, a, b)
-        shifts.append(pixel_shift(a, b))
-    poses = [s.T_I_C(*ids) for s, ids in ((first, first_ids), (second, second_ids))]
-    between = se3.relative(poses[0], poses[1])
-    turn_deg = np.rad2deg(so3.log(between[:, :4]))
-    move_m = poses[1][:, 4:] - poses[0][:, 4:]
-    for row in range(len(between)):
-        own = f"camera {row} " if len(between) > 1 else "camera "
+    prefixes = ["camera "]
+    if len(rigs[0].cameras) > 1:
+        prefixes = [f"camera {row} " for row in range(len(rigs[0].cameras))]
+    cameras = list(zip(prefixes, rigs[0].cameras, rigs[1].cameras, strict=True))
+    T_I_C = [sensors.T_I_C(*device) for sensors, device in pairs]
+    turn_deg = np.rad2deg(so3.log(se3.relative(T_I_C[0], T_I_C[1])[:, :4]))
+    shift_m = T_I_C[1][:, 4:] - T_I_C[0][:, 4:]
+    rows = [row for prefix, a, b in cameras for row in _camera_rows(prefix, a, b)]
+    for k, prefix in enumerate(prefixes):
         for axis, name in enumerate("xyz"):
-            values = float(poses[0][row, 4 + axis]), float(poses[1][row, 4 + axis])
-            rows.append(_row(f"{own}position {name}", "m", *values))
+            a, b = (float(poses[k, 4 + axis]) for poses in T_I_C)
+            rows.append(_row(f"{prefix}position {name}", "m", a, b))
         for axis, name in enumerate("xyz"):
-            rows.append(_row(f"{own}rotation about {name}", "deg", 0.0, float(turn_deg[row, axis])))
-    known = [s.imu(ids[0]).intrinsics for s, ids in ((first, first_ids), (second, second_ids))]
-    rows += _of_imus(known[0] or ImuIntrinsics(), known[1] or ImuIntrinsics())
+            rows.append(
+                _row(f"{prefix}rotation about {name}", "deg", 0.0, float(turn_deg[k, axis]))
+            )
+    imus = [sensors.imu(device.imu).intrinsics or ImuIntrinsics() for sensors, device in pairs]
     return CalibrationComparison(
-        tuple(rows),
-        max(shifts),
+        (*rows, *_imu_rows(*imus)),
+        max((pixel_shift(a, b) for _, a, b in cameras), default=0.0),
         float(np.linalg.norm(turn_deg, axis=1).max(initial=0.0)),
-        float(np.linalg.norm(move_m, axis=1).max(initial=0.0)),
+        float(np.linalg.norm(shift_m, axis=1).max(initial=0.0)),
     )
 
 
 def pixel_shift(a: Camera, b: Camera) -> float:
     """Return the largest distance [px] between the images of a ray in two cameras, over a grid."""
-    from maplab_py.sensors.projection import back_project, project
-
     u, v = np.meshgrid(np.linspace(0, a.width_px, 17), np.linspace(0, a.height_px, 13))
     uv = np.stack([u.reshape(-1), v.reshape(-1)], axis=1)
-    ray, known = back_project(a, uv)
-    seen, visible = project(b, ray)
-    both = known & visible
-    return float(np.linalg.norm(seen[both] - uv[both], axis=1).max(initial=0.0))
+    ray, is_known = back_project(a, uv)
+    projected, is_visible = project(b, ray)
+    both = is_known & is_visible
+    return float(np.linalg.norm(projected[both] - uv[both], axis=1).max(initial=0.0))
 
 
-def _of_cameras(own: str, a: Camera, b: Camera) -> list[ComparedParameter]:
-    names = ["focal length u", "focal length v", "centre u", "centre v"]
-    units = ["px"] * 4
-    if a.projection is Projection.UNIFIED:
-        names, units = ["mirror xi", *names], ["", *units]
-    more = _DISTORTION[a.distortion]
-    names += [f"distortion {name}" for name in more]
-    units += [""] * len(more)
+def _camera_rows(prefix: str, a: Camera, b: Camera) -> list[ComparedParameter]:
     values = [np.concatenate([c.intrinsics, c.distortion_parameters]).tolist() for c in (a, b)]
     rows = [
-        _row(own + name, unit, x, y) for name, unit, x, y in zip(names, units, *values, strict=True)
+        _row(prefix + name, unit, x, y)
+        for (name, unit), x, y in zip(
+            parameter_names(a.projection, a.distortion), *values, strict=True
+        )
     ]
-    return [*rows, _row(f"{own}image delay", "s", a.image_delay_s, b.image_delay_s)]
+    return [*rows, _row(f"{prefix}image delay", "s", a.image_delay_s, b.image_delay_s)]
 
 
-def _of_imus(a: ImuIntrinsics, b: ImuIntrinsics) -> list[ComparedParameter]:
-    rows = []
-    for name, x, y in (("gyroscope", a.T_g, b.T_g), ("accelerometer", a.T_a, b.T_a)):
-        rows += [
-            _row(f"{name} {what}", "", float(x[place]), float(y[place]))
-            for what, place in zip(_NAMES, _PLACES, strict=True)
-        ]
-    turns = np.rad2deg(so3.log(so3.from_matrix(np.stack([a.R_A_I, b.R_A_I]))))
-    for axis, name in enumerate("xyz"):
-        values = float(turns[0, axis]), float(turns[1, axis])
-        rows.append(_row(f"accelerometer rotation about {name}", "deg", *values))
+def _imu_rows(a: ImuIntrinsics, b: ImuIntrinsics) -> list[ComparedParameter]:
+    rows = [
+        _row(f"{sensor} {name}", "", float(x[place]), float(y[place]))
+        for sensor, x, y in (("gyroscope", a.T_g, b.T_g), ("accelerometer", a.T_a, b.T_a))
+        for name, place in TRIANGLE_NAMES.items()
+    ]
+    turns_deg = np.rad2deg(so3.log(so3.from_matrix(np.stack([a.R_A_I, b.R_A_I])))).tolist()
+    for axis, x, y in zip("xyz", *turns_deg, strict=True):
+        rows.append(_row(f"accelerometer rotation about {axis}", "deg", x, y))
     return rows
 
 

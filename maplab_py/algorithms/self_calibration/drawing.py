@@ -1,25 +1,23 @@
-"""Where the information is: trajectories from above, coloured by segment, as SVG (thesis fig. 7.1)."""
+"""Trajectories from above, coloured by the information of segments, as SVG (Schneider 2019, figure 7.1)."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.vimap import VIMap
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _SIZE_PX = 640.0
 _MARGIN_PX = 40.0
 _COLOURS = np.array([[26, 120, 60], [240, 200, 60], [190, 30, 40]], dtype=np.float64)
-"""Most, medium and least informative."""
+"""Colours of the most, the medium and the least informative segment."""
 
 
-def draw(vi_map: VIMap, segments: list[I64], information: F64, title: str) -> str:
+def draw(vi_map: VIMap, segments: list[I64], information: Sequence[float], title: str) -> str:
     """Return an SVG of the trajectory; segments (vertex rows) are coloured by rank of their score.
 
     Args:
@@ -82,10 +80,17 @@ def _legend() -> list[str]:
     return [*lines, f'<text x="{right:g}" y="{y:g}">least</text>']
 
 
-def as_csv(rows: list[tuple[str, int, int, float]]) -> str:
-    """Return the file that the viewer reads: mission, begin and end of every segment, information."""
+def as_csv(segments: list[tuple[str, int, int]], information: Sequence[float]) -> str:
+    """Return the CSV file that the viewer reads.
+
+    Args:
+        segments: Mission, begin and end [ns] of every segment.
+        information: Scores (S,).
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("mission", "start_ns", "end_ns", "information"))
-    writer.writerows(rows)
+    writer.writerows(
+        (*segment, score) for segment, score in zip(segments, information, strict=True)
+    )
     return text.getvalue()

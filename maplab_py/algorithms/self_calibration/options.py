@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from maplab_py.errors import UserError
 from maplab_py.options import option
@@ -12,7 +12,7 @@ STATES = ("intrinsics", "extrinsics_rotation", "extrinsics_translation", "imu", 
 """What can be estimated."""
 
 GROUPS = ("imu", "camera", "extrinsics")
-"""Parameter groups, each with its own table of segments; the time offset is one of the extrinsics."""
+"""Parameter groups, each with its own table of segments; the time offset is an extrinsic parameter."""
 
 _STATES_OF = {
     "imu": {"imu"},
@@ -23,14 +23,22 @@ _STATES_OF = {
 METRICS = ("a_optimality", "d_optimality", "e_optimality", "entropy")
 SELECTIONS = ("informative", "least_informative", "random", "information_gain", "all")
 
+_MINIMUM = {
+    "segments_per_group": 1,
+    "segment_keyframes": 3,
+    "num_iterations": 1,
+    "min_shared_landmarks": 0,
+    "min_parallax_deg": 0.0,
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class SelfCalibrationOptions:
-    """What to estimate, from which data, and what is known beforehand.
+    """What to estimate, from which data, and the priors.
 
-    The prior deviations say how far a device may be from its nominal calibration. They serve three
-    ends: a direction that the data determine no better than that counts as unobservable, stays at
-    its prior, and lends a segment no information.
+    The prior deviations say how far a device may be from its nominal calibration. A direction that
+    the data do not determine better counts as unobservable, stays at its prior, and adds nothing to
+    the information of a segment.
     """
 
     flag_prefix: ClassVar[str] = "sc_"
@@ -55,34 +63,33 @@ class SelfCalibrationOptions:
         0.2, help="Selection by information gain keeps a segment above this.", unit="nat"
     )
     min_shared_landmarks: int = option(
-        15, help="Segments that share more landmarks than this hang together."
+        15, help="Segments that share more landmarks than this form one partition."
     )
     min_parallax_deg: float = option(
         1.0,
-        help="Landmarks seen under a smaller parallax do not take part.",
+        help="Landmarks seen under a smaller parallax are not used.",
         unit="deg",
     )
     num_iterations: int = option(40, help="Largest number of iterations.")
     function_tolerance: float = option(
-        1e-6, help="Stop when an iteration lowers the cost by less than this part of it."
+        1e-6, help="Stop when an iteration lowers the cost by less than this share of it."
     )
     loss: str = option(
         "cauchy",
-        help="Robust loss of reprojection errors until outliers are known.",
+        help="Robust loss of reprojection errors until outliers are rejected.",
         choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"),
     )
     inconsistent_probability: float = option(
         0.01,
-        help="Landmarks whose residuals are less probable than this are left out; the others then "
-        "count in full. 0 = keep the robust loss to the end.",
+        help="Landmarks whose residuals are less probable than this are rejected; the others then "
+        "have their full weight. 0 = keep the robust loss to the end.",
     )
     imu_curvature: bool = option(
         True,
-        help="Correct inertial samples for what straight lines between them leave out; otherwise "
-        "the signal runs straight from sample to sample.",
+        help="Correct inertial samples for the bias of linear interpolation between them.",
     )
     gate_reprojection_error_px: float = option(
-        40.0, help="Observations off by more at the beginning do not take part.", unit="px"
+        40.0, help="Observations with a larger initial reprojection error are not used.", unit="px"
     )
     keep_unobservable_at_prior: bool = option(
         False,
@@ -108,16 +115,40 @@ class SelfCalibrationOptions:
     )
 
     prior_gyro_bias_radps: float = option(
-        0.2, help="Prior deviation of the gyroscope's bias where a segment begins.", unit="rad/s"
+        0.2,
+        help="Prior deviation of the gyroscope's bias at the beginning of a run of segments.",
+        unit="rad/s",
     )
     prior_accel_bias_mps2: float = option(
         2.0,
-        help="Prior deviation of the accelerometer's bias where a segment begins.",
+        help="Prior deviation of the accelerometer's bias at the beginning of a run of segments.",
         unit="m/s^2",
     )
     prior_velocity_mps: float = option(
-        20.0, help="Prior deviation of the velocity where a segment begins.", unit="m/s"
+        20.0,
+        help="Prior deviation of the velocity at the beginning of a run of segments.",
+        unit="m/s",
     )
+
+    def checked(self) -> Self:
+        """Return the options if they can be used.
+
+        Raises:
+            UserError: A number is out of its range, or a name is unknown; the message names the flag.
+        """
+        self.grouping()
+        for name, least in _MINIMUM.items():
+            value = getattr(self, name)
+            if not value >= least:
+                raise UserError(f"--{self.flag_prefix}{name}={value:g}: wants at least {least:g}")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name.startswith("prior_") and not value > 0.0:
+                raise UserError(
+                    f"--{self.flag_prefix}{field.name}={value:g}: wants a positive deviation; to "
+                    "hold something, leave it out of --sc_states"
+                )
+        return self
 
     def estimated(self) -> frozenset[str]:
         """Return the states to estimate.
@@ -135,7 +166,7 @@ class SelfCalibrationOptions:
     def grouping(self) -> dict[str, tuple[str, ...]]:
         """Return the basic groups of every table of the database, by the table's name.
 
-        Groups of which nothing is estimated have no table: every segment would be as good there.
+        Groups of which nothing is estimated have no table: all segments would be equal there.
 
         Raises:
             UserError: A name is unknown, or there is none.

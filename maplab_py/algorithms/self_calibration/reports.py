@@ -1,15 +1,16 @@
-"""What the self-calibration commands tell their user."""
+"""Reports of the self-calibration commands."""
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 from maplab_py.report import Report
 
 
 @dataclasses.dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter; poses and rotations as a change from before."""
+    """An estimated parameter; poses and rotations as changes."""
 
     parameter: str
     unit: str
@@ -22,20 +23,20 @@ class ParameterEstimate:
 
 @dataclasses.dataclass(frozen=True)
 class SelfCalibrationReport(Report):
-    """What a calibration found and how far it can be trusted."""
+    """Result of a calibration and its uncertainty."""
 
     parameters: tuple[ParameterEstimate, ...]
     unobservable: tuple[str, ...]  # directions that the data do not determine
-    without_scale: tuple[str, ...]  # left out: the device only turns there and lengths are lost
+    without_scale: tuple[str, ...]  # partitions left out: their metric scale is unobservable
     segments: int
     partitions: int
-    gaps: int  # between segments of a mission, bridged by the walk of the biases
+    gaps: int  # between segments of a mission, bridged by the bias random walk
     keyframes: int
     landmarks: int
     observations: int
-    inconsistent_landmarks: int  # left out: their tracks are not of one point
-    keypoint_noise_factor: float  # noise of the keypoints over what the map says
-    track_deviation_factor: float  # deviations by tracks over those by single observations, median
+    inconsistent_landmarks: int  # rejected: their tracks do not observe one point
+    keypoint_noise_factor: float  # measured keypoint noise over the map's
+    track_deviation_factor: float  # cluster-robust over formal deviations, median
     cost_before: float
     cost_after: float
     chi_square_per_freedom: float  # about 1 when the sigmas of the measurements are right
@@ -47,7 +48,7 @@ class SelfCalibrationReport(Report):
 
 @dataclasses.dataclass(frozen=True)
 class KeptSegment:
-    """A segment that the database keeps."""
+    """A segment of the database."""
 
     mission: str
     begin_s: float  # since the mission's first segment
@@ -62,19 +63,19 @@ class KeptSegment:
 
 @dataclasses.dataclass(frozen=True)
 class CollectionReport(Report):
-    """What collecting found and what the database holds now."""
+    """Segments that were evaluated, and the database afterwards."""
 
     segments_evaluated: int
     segments_kept: int
     from_this_map: int
-    dropped: int  # less informative ones that were in the database before
+    dropped: int  # segments of the database that were less informative
     seconds_per_segment: float
     segments: tuple[KeptSegment, ...]
 
 
 @dataclasses.dataclass(frozen=True)
 class SegmentScore:
-    """The information of one segment; less is more."""
+    """Scores of a segment; less is more informative."""
 
     mission: str
     start_ns: int
@@ -89,7 +90,7 @@ class SegmentScore:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterReference:
-    """The usual deviation of a parameter that one segment leaves."""
+    """Reference deviation of a parameter given one segment."""
 
     parameter: str
     unit: str
@@ -108,7 +109,7 @@ class InformationReport(Report):
 
 @dataclasses.dataclass(frozen=True)
 class ComparedParameter:
-    """One parameter of both."""
+    """A parameter of both calibrations."""
 
     parameter: str
     unit: str
@@ -119,9 +120,66 @@ class ComparedParameter:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationComparison(Report):
-    """What differs between two calibrations."""
+    """Differences between two calibrations."""
 
     parameters: tuple[ComparedParameter, ...]
-    largest_pixel_shift_px: float  # of a ray of the first in the second, over all images
+    largest_pixel_shift_px: float  # between the images of a ray
     largest_camera_turn_deg: float
     largest_camera_shift_m: float
+
+
+@dataclasses.dataclass(frozen=True)
+class DatabaseTable:
+    """A table of a segment database."""
+
+    table: str
+    segments: int
+    best_score: float
+    worst_score: float
+
+
+@dataclasses.dataclass(frozen=True)
+class DatabaseParameter:
+    """Deviations of a parameter given one segment."""
+
+    parameter: str
+    reference_sigma: float  # median over segments
+    best_sigma: float  # given the best segment
+
+
+@dataclasses.dataclass(frozen=True)
+class DatabaseReport(Report):
+    """Contents of a segment database."""
+
+    file: Path
+    metric: str
+    selection: str
+    capacity: int  # segments per table
+    sessions: int
+    keyframes: int
+    landmarks: int
+    imu_samples: int
+    tables: tuple[DatabaseTable, ...]
+    parameters: tuple[DatabaseParameter, ...]
+    segments: tuple[KeptSegment, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class PrunedSegment:
+    """A segment that was tested."""
+
+    mission: str
+    first_vertex: str
+    distance: float
+    limit: float
+    chi_square_per_freedom: float
+    outdated: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class PruneReport(Report):
+    """Removal of segments from a database."""
+
+    segments_before: int
+    segments_after: int
+    tested: tuple[PrunedSegment, ...]

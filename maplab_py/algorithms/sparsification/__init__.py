@@ -1,1 +1,1 @@
-"""Sparsification: which landmarks are worth keeping."""
+"""Sparsification: selection of the landmarks to keep."""

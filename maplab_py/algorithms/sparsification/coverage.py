@@ -1,10 +1,10 @@
-"""Choosing landmarks as a coverage problem: what a choice is worth.
+"""Landmark selection as a coverage problem.
 
-Thesis eq. 4.2, its score to be maximised and with one slack per keyframe: choose exactly n
-landmarks so that the sum of their scores is high and every keyframe sees the wanted number of
-them. Two things are added. A landmark counts by its weight, the chance of being matched again: of
-landmarks that were seen once more are needed. And what a keyframe lacks has a price that may rise
-with the lack: ten keyframes that lack one landmark each are better than one that lacks ten.
+Schneider 2019, eq. 4.2, with the score maximised and one slack per keyframe: select exactly n
+landmarks with a high sum of scores such that every keyframe observes the wanted number of them.
+There are two extensions. Landmarks are weighted by the probability of being matched again. The value
+of the coverage of a keyframe decreases in levels, so that ten keyframes which lack one landmark each
+are better than one keyframe that lacks ten.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.vimap.table import starts_of_counts
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _TINY = 1e-9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CoverageProblem:
-    """K keyframes, L landmarks, which keyframe sees which, and what is wanted."""
+    """K keyframes, L landmarks, their covisibility, and the wanted coverage."""
 
-    keyframe: I64  # (N,) with `landmark`: the pairs that see each other, each pair once
+    keyframe: (
+        I64  # (N,) with `landmark`: pairs of a keyframe and an observed landmark, each pair once
+    )
     landmark: I64  # (N,)
     score: F64  # (L,) in [0, 1]
-    weight: F64  # (L,) in (0, 1], what a landmark adds to the cover of a keyframe that sees it
-    wanted: F64  # (K,) cover that each keyframe should have; never more than can be
-    base: F64  # (K,) cover that each keyframe has in any case
-    price: F64  # (S,) value of a unit of cover in S equal parts of `full`; falling
+    weight: (
+        F64  # (L,) in (0, 1], contribution of a landmark to the cover of keyframes that observe it
+    )
+    wanted: F64  # (K,) wanted cover of each keyframe, at most the possible cover
+    base: F64  # (K,) cover of each keyframe by fixed landmarks
+    level_value: F64  # (S,) decreasing value of a unit of cover in S equal parts of `full`
     full: float  # cover at which the last part ends
     keep: int  # landmarks to choose
 
@@ -51,7 +51,7 @@ class CoverageProblem:
 
     @cached_property
     def seen(self) -> Any:
-        """Sparse matrix (K, L) of ones where a keyframe sees a landmark."""
+        """Sparse matrix (K, L) with ones where a keyframe observes a landmark."""
         from scipy.sparse import csr_array
 
         ones = np.ones(len(self.landmark))
@@ -66,7 +66,7 @@ class CoverageProblem:
         return starts_of_counts(counts), self.keyframe[order]
 
     def cover(self, chosen: Mask) -> F64:
-        """Return the cover (K,) of the keyframes by a choice (L,)."""
+        """Return the cover (K,) of the keyframes by a selection (L,)."""
         mine = chosen[self.landmark]
         added = np.bincount(
             self.keyframe[mine], self.weight[self.landmark[mine]], minlength=self.keyframes
@@ -74,34 +74,34 @@ class CoverageProblem:
         return np.asarray(self.base + added)
 
     def value(self, cover: F64, wanted: F64) -> F64:
-        """Return what covers (N,) are worth to keyframes that want so much (N,)."""
-        edges = np.linspace(0.0, self.full, len(self.price) + 1)
-        worth = np.concatenate([[0.0], np.cumsum(self.price * np.diff(edges))])
+        """Return the values (N,) of covers (N,) of keyframes with wanted cover (N,)."""
+        edges = np.linspace(0.0, self.full, len(self.level_value) + 1)
+        worth = np.concatenate([[0.0], np.cumsum(self.level_value * np.diff(edges))])
         return np.asarray(np.interp(np.minimum(cover, wanted), edges, worth))
 
     def objective(self, chosen: Mask) -> float:
-        """Return score and coverage value of a choice (L,)."""
+        """Return the sum of score and coverage value of a selection (L,)."""
         gained = self.value(self.cover(chosen), self.wanted) - self.value(self.base, self.wanted)
         return float(self.score[chosen].sum() + gained.sum())
 
-    def price_of_more(self, cover: F64) -> F64:
-        """Return the price (K,) of the next bit of cover."""
-        return np.where(cover < self.wanted - _TINY, self._price_at(cover + _TINY), 0.0)
+    def gain_of_more(self, cover: F64) -> F64:
+        """Return the value (K,) of the next unit of cover."""
+        return np.where(cover < self.wanted - _TINY, self._value_at(cover + _TINY), 0.0)
 
-    def price_of_less(self, cover: F64) -> F64:
-        """Return the price (K,) of the last bit of cover."""
-        return np.where(cover <= self.wanted + _TINY, self._price_at(cover - _TINY), 0.0)
+    def loss_of_less(self, cover: F64) -> F64:
+        """Return the value (K,) of the last unit of cover."""
+        return np.where(cover <= self.wanted + _TINY, self._value_at(cover - _TINY), 0.0)
 
-    def _price_at(self, cover: F64) -> F64:
-        part = np.floor(cover * len(self.price) / max(self.full, _TINY)).astype(np.int64)
-        return np.append(self.price, 0.0)[np.clip(part, 0, len(self.price))]
+    def _value_at(self, cover: F64) -> F64:
+        part = np.floor(cover * len(self.level_value) / max(self.full, _TINY)).astype(np.int64)
+        return np.append(self.level_value, 0.0)[np.clip(part, 0, len(self.level_value))]
 
     def restricted(self, landmarks: I64, chosen: Mask) -> CoverageProblem:
-        """Return the problem of choosing anew among some landmarks while the others stay.
+        """Return the subproblem of selecting among some landmarks while the others are fixed.
 
         Args:
             landmarks: Rows (P,), sorted.
-            chosen: The present choice (L,); as many of the rows are to be chosen again.
+            chosen: The current selection (L,); the subproblem selects the same number of the rows.
         """
         inside = np.zeros(self.landmarks, dtype=np.bool_)
         inside[landmarks] = True
@@ -115,16 +115,16 @@ class CoverageProblem:
             weight=self.weight[landmarks],
             wanted=self.wanted[keyframes],
             base=self.cover(chosen & ~inside)[keyframes],
-            price=self.price,
+            level_value=self.level_value,
             full=self.full,
             keep=int(chosen[landmarks].sum()),
         )
 
 
-def prices(levels: int) -> F64:
-    """Return the price (levels,) of cover, part by part: ..., 4, 2, 1.
+def level_values(levels: int) -> F64:
+    """Return the value (levels,) of cover per level: ..., 4, 2, 1.
 
-    A price of 1 is the highest score a landmark can have: no landmark is worth more for its score
-    than one that a keyframe lacks.
+    The lowest value is 1, the highest score of a landmark: no score outweighs a landmark that a
+    keyframe lacks.
     """
     return np.asarray(2.0 ** np.arange(levels - 1, -1, -1), dtype=np.float64)

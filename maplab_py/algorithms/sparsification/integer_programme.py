@@ -1,9 +1,10 @@
-"""The integer programme of sparsification, solved by HiGHS: exactly, or relaxed and rounded.
+"""Integer programme of sparsification, solved with HiGHS: exactly, or relaxed and rounded.
 
-Variables: x (L,) in {0, 1}, whether a landmark stays; u (K, S) >= 0, the cover of a keyframe that
-counts at each of S prices. Maximise score^T x + sum of price u, subject to sum x = keep and
-sum_s u_ks <= (A x)_k, A having a landmark's weight where a keyframe sees it. Prices fall, so the
-dearest level fills first; what u lacks to the wanted cover is thesis eq. 4.2's slack.
+Variables: x (L,) in {0, 1}, whether a landmark is kept; u (K, S) >= 0, the cover of a keyframe at
+each of S levels. Maximise score^T x + sum of level_value u, subject to sum x = keep and
+sum_s u_ks <= (A x)_k, where A holds the weight of a landmark in the rows of keyframes that observe
+it. Level values decrease, so the most valuable level fills first. The difference of u to the wanted
+cover is the slack of Schneider 2019, eq. 4.2.
 """
 
 from __future__ import annotations
@@ -12,29 +13,26 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.sparsification.coverage import CoverageProblem
 from maplab_py.algorithms.sparsification.greedy import choose_greedily, exchange
+from maplab_py.array_types import F64, Mask
 from maplab_py.errors import EstimationError
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _GAP = 1e-4
 """Relative gap at which the exact search stops."""
 _MAX_NODES = 200
-"""Nodes of the exact search; a limit in nodes, unlike one in seconds, is the same on any machine."""
+"""Maximum number of nodes of the exact search; unlike a time limit, it is deterministic."""
 _INTEGRAL = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solution:
-    """A choice and what it is worth."""
+    """A selection and its objective."""
 
     chosen: Mask  # (L,)
     objective: float
-    bound: float  # no choice has a higher objective
+    bound: float  # upper bound on the objective
 
 
 def solve_exactly(problem: CoverageProblem) -> Solution:
@@ -65,10 +63,10 @@ def solve_exactly(problem: CoverageProblem) -> Solution:
 
 
 def solve_relaxed(problem: CoverageProblem) -> Solution:
-    """Solve the linear relaxation, keep what it takes whole, fill up greedily and exchange.
+    """Solve the linear relaxation, keep landmarks with x = 1, fill up greedily and exchange.
 
-    A vertex of the relaxation has at most K + 1 fractional x, few in practice, so rounding costs
-    little; the bound tells how much.
+    A vertex of the relaxation has at most K + 1 fractional x, few in practice, so that the loss by
+    rounding is small; the bound measures it.
 
     Raises:
         EstimationError: HiGHS gives up.
@@ -105,7 +103,7 @@ def _programme(problem: CoverageProblem) -> _Programme:
     from scipy.sparse import csr_array, dia_array, hstack
 
     landmarks, keyframes = problem.landmarks, problem.keyframes
-    edges = np.linspace(0.0, problem.full, len(problem.price) + 1)
+    edges = np.linspace(0.0, problem.full, len(problem.level_value) + 1)
     low = np.maximum(edges[None, :-1], problem.base[:, None])
     width = np.minimum(edges[None, 1:], problem.wanted[:, None]) - low
     keyframe, level = np.nonzero(width > 0.0)
@@ -114,7 +112,7 @@ def _programme(problem: CoverageProblem) -> _Programme:
     weights = dia_array((problem.weight[None], [0]), shape=(landmarks, landmarks))
     count = np.concatenate([np.ones(landmarks), np.zeros(useful)])
     return _Programme(
-        cost=np.concatenate([-problem.score, -problem.price[level]]),
+        cost=np.concatenate([-problem.score, -problem.level_value[level]]),
         upper=np.concatenate([np.ones(landmarks), width[keyframe, level]]),
         rows=hstack([-(problem.seen @ weights), ones]).tocsc(),
         count=csr_array(count[None]),

@@ -1,4 +1,4 @@
-"""Options and report of landmark sparsification; maplab's names and defaults where it has them."""
+"""Options of landmark sparsification; maplab's names and defaults where it has them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
-from maplab_py.report import Report
 
 METHODS = ("ilp", "greedy", "most_observed", "random")
 
 
 @dataclasses.dataclass(frozen=True)
 class SparsificationOptions:
-    """How landmarks are chosen."""
+    """Method and parameters of the selection of landmarks."""
 
     flag_prefix: ClassVar[str] = "sparsification_"
 
@@ -24,17 +23,17 @@ class SparsificationOptions:
         choices=METHODS,
     )
     min_keypoints_per_keyframe: int = option(
-        30, help="Landmarks that every keyframe should still see."
+        30, help="Number of landmarks that every keyframe should still observe"
     )
     weighted: bool = option(
         False,
-        help="Count a landmark by the chance of matching it again, which rises with the number of "
-        "vertices that saw it; otherwise, as in the thesis, all count alike.",
+        help="Weight a landmark by the probability of matching it again, which increases with the number "
+        "of observing vertices; otherwise all weights are equal (Schneider 2019, section 4)",
     )
     slack_levels: int = option(
         2,
-        help="A keyframe that lacks more is lacking worse: the price doubles with every part of so "
-        "many of the wanted number; 1 = one price for all, as in the thesis.",
+        help="Number of levels of the cost of missing landmarks, which doubles from level to level; "
+        "1 = constant cost, as in Schneider 2019",
     )
     descriptor_dev_scoring_threshold: float = option(
         10.0,
@@ -42,10 +41,11 @@ class SparsificationOptions:
         "which its score falls.",
     )
     exact_up_to: int = option(
-        2000, help="Up to so many landmarks the integer programme is solved exactly."
+        2000, help="Largest number of landmarks for which the integer programme is solved exactly"
     )
     landmarks_per_part: int = option(
-        60000, help="Maps with more landmarks are cut into parts along the co-visibility graph."
+        60000,
+        help="Largest number of landmarks of a part; larger maps are split along the co-visibility graph",
     )
     seed: int = option(0, help="Seed of the random choice.")
 
@@ -62,46 +62,3 @@ class SparsificationOptions:
                 raise FlagError(f"--sparsification_{name} must not be negative")
         if self.landmarks_per_part < 100:
             raise FlagError("--sparsification_landmarks_per_part must be at least 100")
-
-
-@dataclasses.dataclass(frozen=True)
-class CoverageOfMission:
-    """Good landmarks per keyframe of one mission."""
-
-    mission: str  # beginning of its id
-    keyframes: int
-    min_before: int
-    median_before: float
-    min_after: int
-    median_after: float
-    below_wanted: int  # keyframes that could have had the wanted number and see fewer
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyframeCoverage:
-    """Good landmarks that one keyframe sees."""
-
-    vertex: str
-    before: int
-    after: int
-
-
-@dataclasses.dataclass(frozen=True)
-class SparsificationReport(Report):
-    """What stays, and how well the keyframes are covered by it."""
-
-    landmarks_before: int
-    good_landmarks: int
-    landmarks_after: int
-    observations_before: int
-    observations_after: int
-    keyframes: int
-    wanted_per_keyframe: int
-    below_wanted: int  # keyframes that could have had the wanted number and see fewer
-    method: str
-    parts: int
-    objective: float  # score and coverage value of what was chosen
-    bound: float  # no choice has a higher objective; NaN where it is not known
-    missions: tuple[CoverageOfMission, ...]
-    worst_keyframes: tuple[KeyframeCoverage, ...]
-    note: str = ""

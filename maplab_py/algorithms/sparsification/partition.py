@@ -1,25 +1,23 @@
-"""Cut large coverage problems into parts that hang together, and improve a choice part by part."""
+"""Partition large coverage problems and improve a selection part by part."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.sparsification.coverage import CoverageProblem
 from maplab_py.algorithms.sparsification.greedy import choose_greedily
 from maplab_py.algorithms.sparsification.integer_programme import Solution, solve_relaxed
+from maplab_py.array_types import I64
 from maplab_py.progress import SILENT, Progress
-
-I64 = NDArray[np.int64]
 
 
 def solve_by_parts(
     problem: CoverageProblem, landmarks_per_part: int, *, progress: Progress = SILENT
 ) -> tuple[Solution, int]:
-    """Choose greedily over the whole, then choose again inside each part while the others stay.
+    """Select greedily over the whole map, then optimise each part while the others are fixed.
 
-    The greedy choice tells how many landmarks each part gets, and what border keyframes see of
-    their neighbours; no part can make it worse.
+    The greedy selection determines the number of landmarks of each part and the cover of border
+    keyframes by neighbouring parts. The objective never decreases.
 
     Returns:
         The solution, whose bound is not known (NaN), and the number of parts.
@@ -40,8 +38,8 @@ def solve_by_parts(
 def split(problem: CoverageProblem, landmarks_per_part: int) -> list[I64]:
     """Return landmark rows of parts of nearly equal size, along the co-visibility graph.
 
-    Keyframes are put in an order in which co-visible ones are close (reverse Cuthill and McKee
-    1969, which minimises the band of the matrix), landmarks follow their median keyframe.
+    Keyframes are ordered such that co-visible ones are close (reverse Cuthill and McKee 1969, which
+    reduces the bandwidth of the matrix). Landmarks are ordered by their median keyframe.
     """
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 

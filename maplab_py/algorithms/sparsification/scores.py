@@ -1,29 +1,26 @@
-"""How much a landmark promises for localisation: seen often, looking alike, in many missions."""
+"""Scores of landmarks for localisation: observation count, descriptor stability, missions."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import observer_counts
-from maplab_py.vimap.table import ragged_rows
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 _OBSERVATIONS_AT_ONCE = 40_000
 _BITS_OF_THRESHOLD = 384
 _TOP_PERCENTILE = 95.0
 _MATCH_CHANCE = 0.3
-"""Of a stable descriptor, that another one of its landmark is matched with it."""
+"""Probability that a stable descriptor is matched with another descriptor of its landmark."""
 
 
 def landmark_scores(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> F64:
     """Return a score (N,) in [0, 1] for each landmark.
 
     It is the product of the number of observing vertices, the stability of the descriptors and
-    the number of observing missions, as part of the 95th percentile; what lies above counts 1.
+    the number of observing missions, each relative to its 95th percentile and at most 1.
 
     Args:
         vi_map: The map.
@@ -39,10 +36,9 @@ def landmark_scores(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> 
 
 
 def landmark_weights(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> F64:
-    """Return the chance (N,) in (0, 1] that a landmark is matched when it is seen again.
+    """Return the probability (N,) in (0, 1] that a landmark is matched when it is observed again.
 
-    Every vertex that observed it has left a descriptor that may be near enough: with a chance of
-    p each, n of them leave 1 - (1 - p)^n.
+    With n descriptors, each of which matches with probability p, it is 1 - (1 - p)^n.
     """
     deviation = descriptor_deviations(vi_map, landmarks) * _BITS_OF_THRESHOLD
     stability = np.minimum(1.0, threshold_bits / np.maximum(deviation, 1e-9))
@@ -51,7 +47,7 @@ def landmark_weights(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) ->
 
 
 def mission_counts(vi_map: VIMap) -> I64:
-    """Return how many missions observe each landmark (L,)."""
+    """Return the number of missions (L,) that observe each landmark."""
     missions = max(len(vi_map.missions), 1)
     rows = vi_map.observations
     landmark = vi_map.keypoints.landmark[rows].astype(np.int64)
@@ -61,15 +57,19 @@ def mission_counts(vi_map: VIMap) -> I64:
 
 
 def descriptor_deviations(vi_map: VIMap, landmarks: I64) -> F64:
-    """Return the mean part of bits (N,) in which descriptors differ from their landmark's majority.
+    """Return the mean fraction of bits (N,) in which descriptors differ from their majority.
 
-    Zero for landmarks with fewer than two observations or without descriptors.
+    Zero for landmarks with fewer than two binary descriptors.
     """
     deviation = np.zeros(len(landmarks))
-    count = np.diff(vi_map.observation_start)[landmarks]
-    size = int(vi_map.keypoints.descriptor.shape[1])
+    sizes = vi_map.binary_descriptor_size
+    size = int(sizes.max(initial=0))
     if size == 0 or len(landmarks) == 0:
         return deviation
+    observations = vi_map.observations[sizes[vi_map.observations] > 0]
+    observed = vi_map.keypoints.landmark[observations]
+    start = starts_of_counts(np.bincount(observed, minlength=len(vi_map.landmarks)))
+    count = np.diff(start)[landmarks]
     chunk = np.cumsum(count) // _OBSERVATIONS_AT_ONCE
     starts = np.flatnonzero(np.diff(chunk, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(landmarks)), strict=True):
@@ -77,8 +77,8 @@ def descriptor_deviations(vi_map: VIMap, landmarks: I64) -> F64:
         mine = mine[count[mine] >= 2]
         if len(mine) == 0:
             continue
-        rows = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks[mine])]
-        bits = np.unpackbits(vi_map.keypoints.descriptor[rows], axis=1)
+        rows = observations[ragged_rows(start, landmarks[mine])]
+        bits = np.unpackbits(vi_map.keypoints.descriptor[rows, :size], axis=1)
         first = np.cumsum(count[mine]) - count[mine]
         ones = np.add.reduceat(bits, first, axis=0, dtype=np.int32)
         minority = np.minimum(ones, count[mine][:, None] - ones).sum(axis=1)

@@ -1,38 +1,37 @@
-"""Keep the landmarks that matter for localisation and remove all others."""
+"""Keep the landmarks that are most useful for localisation and remove all others."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.sparsification import greedy, integer_programme, partition
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem, prices
-from maplab_py.algorithms.sparsification.options import (
+from maplab_py.algorithms.sparsification.coverage import CoverageProblem, level_values
+from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.reports import (
     CoverageOfMission,
     KeyframeCoverage,
-    SparsificationOptions,
     SparsificationReport,
 )
 from maplab_py.algorithms.sparsification.scores import landmark_scores, landmark_weights
+from maplab_py.array_types import I64, Mask
 from maplab_py.errors import UserError
+from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.edits import remove_landmarks
 from maplab_py.vimap.ids import to_hex
 
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
+_BYTES_PER_OBSERVATION = 400
 _WORST = 10
 """Keyframes that the report names."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Coverage:
-    """Landmarks that each keyframe sees before and after."""
+    """Number of landmarks that each keyframe observes before and after."""
 
     vertex: I64  # (K,) vertex rows
     before: I64  # (K,)
@@ -49,13 +48,13 @@ def sparsify(
 ) -> tuple[VIMap, SparsificationReport, Coverage]:
     """Keep exactly `keep` good landmarks and remove all others, bad ones included.
 
-    Landmarks of unknown quality are judged first. A map that has no more good landmarks than are
-    to be kept keeps them all.
+    The quality of landmarks is evaluated first where it is unknown. A map with at most `keep` good
+    landmarks keeps them all.
 
     Args:
         vi_map: The map.
         keep: Landmarks to keep.
-        options: How they are chosen.
+        options: Method and parameters of the selection.
         progress: Progress.
 
     Raises:
@@ -63,7 +62,9 @@ def sparsify(
     """
     if keep <= 0:
         raise UserError("say how many landmarks shall stay: --num_landmarks_to_keep=N, N > 0")
-    judged, notes = with_quality(vi_map, progress)
+    needed = _BYTES_PER_OBSERVATION * float(len(vi_map.observations))
+    require_memory(needed, "choosing among the landmarks")
+    judged, notes = evaluate_unknown_quality(vi_map, progress)
     good = np.flatnonzero(judged.landmarks.quality == LandmarkQuality.GOOD)
     if len(good) == 0:
         raise UserError("no landmark is of good quality: run retriangulate_landmarks first")
@@ -102,7 +103,7 @@ def sparsify(
 def coverage_problem(
     vi_map: VIMap, landmarks: I64, keep: int, options: SparsificationOptions
 ) -> tuple[CoverageProblem, I64]:
-    """Return the problem of choosing among some landmarks, and the keyframes' vertex rows (K,)."""
+    """Return the coverage problem of some landmarks and the vertex rows (K,) of the keyframes."""
     row = np.full(len(vi_map.landmarks) + 1, -1, dtype=np.int64)
     row[landmarks] = np.arange(len(landmarks))
     observed = row[vi_map.keypoints.landmark[vi_map.observations]]
@@ -124,7 +125,7 @@ def coverage_problem(
         weight=weight,
         wanted=np.minimum(available, wanted),
         base=np.zeros(len(vertices)),
-        price=prices(options.slack_levels),
+        level_value=level_values(options.slack_levels),
         full=wanted,
         keep=keep,
     )
@@ -134,7 +135,7 @@ def coverage_problem(
 def _coverage(
     problem: CoverageProblem, vertex: I64, chosen: Mask, options: SparsificationOptions
 ) -> Coverage:
-    """Count the landmarks that keyframes see, every one as one."""
+    """Count the landmarks that each keyframe observes, without weights."""
     size = problem.keyframes
     before = np.bincount(problem.keyframe, minlength=size)
     after = np.bincount(problem.keyframe[chosen[problem.landmark]], minlength=size)
@@ -145,7 +146,7 @@ def _coverage(
 def choose(
     problem: CoverageProblem, options: SparsificationOptions, progress: Progress = SILENT
 ) -> tuple[integer_programme.Solution, int]:
-    """Choose landmarks by the method asked for; also return the number of parts."""
+    """Select landmarks with the given method; also return the number of parts."""
     if options.method == "ilp":
         if problem.landmarks <= options.exact_up_to:
             return integer_programme.solve_exactly(problem), 1
@@ -166,24 +167,24 @@ def _by_mission(vi_map: VIMap, coverage: Coverage) -> tuple[CoverageOfMission, .
     lines = []
     mission = vi_map.vertices.mission[coverage.vertex]
     for row in np.unique(mission):
-        own = mission == row
-        before, after = coverage.before[own], coverage.after[own]
+        in_mission = mission == row
+        before, after = coverage.before[in_mission], coverage.after[in_mission]
         lines.append(
             CoverageOfMission(
                 mission=to_hex(vi_map.missions.id[row])[:8],
-                keyframes=int(own.sum()),
+                keyframes=int(in_mission.sum()),
                 min_before=int(before.min()),
                 median_before=float(np.median(before)),
                 min_after=int(after.min()),
                 median_after=float(np.median(after)),
-                below_wanted=int(np.count_nonzero(after < coverage.wanted[own])),
+                below_wanted=int(np.count_nonzero(after < coverage.wanted[in_mission])),
             )
         )
     return tuple(lines)
 
 
 def _worst(vi_map: VIMap, coverage: Coverage) -> tuple[KeyframeCoverage, ...]:
-    """Name the keyframes that lack most of what they could have had."""
+    """Return the keyframes with the largest lack of cover."""
     lack = coverage.wanted - coverage.after
     rows = np.argsort(-lack, kind="stable")[:_WORST]
     return tuple(

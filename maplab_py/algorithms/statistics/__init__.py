@@ -1,1 +1,1 @@
-"""What a map consists of, in numbers and in bytes."""
+"""Statistics of a map: distributions and memory."""

@@ -1,4 +1,4 @@
-"""How the quantities of a map are distributed."""
+"""Distributions of the quantities of a map."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class QuantityLine:
 
 
 @dataclasses.dataclass(frozen=True)
-class MapStatistics(Report):
-    """Order statistics of everything that tells good maps from bad ones."""
+class MapDistributions(Report):
+    """Order statistics of the quantities that distinguish good maps from bad ones."""
 
     quantities: tuple[QuantityLine, ...]
 
 
-def map_distributions(vi_map: VIMap) -> MapStatistics:
-    """Return the distributions of a map's quantities; those it does not have are left out."""
+def map_distributions(vi_map: VIMap) -> MapDistributions:
+    """Return the distributions of the quantities that the map has."""
     v = vi_map.vertices
     inside = v.mission[1:] == v.mission[:-1]
     step_m = np.linalg.norm(np.diff(v.T_M_I[:, 4:], axis=0), axis=1)[inside]
@@ -50,8 +50,8 @@ def map_distributions(vi_map: VIMap) -> MapStatistics:
     rays = np.where(distance[:, None] > 1e-9, offset, np.array([0.0, 0.0, 1.0]))
     angle = np.degrees(largest_ray_angle(rays, vi_map.observation_start))[seen]
     sampled = vi_map.imu_samples.timestamp_ns
-    own = np.repeat(np.arange(len(vi_map.imu_edges)), vi_map.imu_edges.sample_count)
-    spacing_s = (np.diff(sampled) * 1e-9)[own[1:] == own[:-1]]
+    edge_of_sample = np.repeat(np.arange(len(vi_map.imu_edges)), vi_map.imu_edges.sample_count)
+    spacing_s = (np.diff(sampled) * 1e-9)[edge_of_sample[1:] == edge_of_sample[:-1]]
     speed = np.linalg.norm(v.v_M, axis=1)
     by_mission = np.bincount(v.mission, minlength=len(vi_map.missions))
     quantities: dict[str, ArrayLike] = {
@@ -70,7 +70,7 @@ def map_distributions(vi_map: VIMap) -> MapStatistics:
         "IMU samples per edge": vi_map.imu_edges.sample_count,
     }
     lines = [_line(name, values) for name, values in quantities.items()]
-    return MapStatistics(tuple(line for line in lines if line is not None))
+    return MapDistributions(tuple(line for line in lines if line is not None))
 
 
 def _track_lengths(vi_map: VIMap) -> ArrayLike:

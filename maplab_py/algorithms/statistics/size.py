@@ -1,4 +1,4 @@
-"""What a map's bytes are spent on, and what each command of map maintenance would save."""
+"""Memory of a map by kind of data, and possible savings by map maintenance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from maplab_py.vision.projection import DIMENSIONS
 
 _SPARSE_SHARE = 0.1
 _BYTES_PER_OBSERVATION = 4 * DIMENSIONS + 2 * 4
-"""Of a summary map before packing: projected descriptor, landmark and observer."""
+"""Bytes of an observation in a summary map before compression."""
 _BYTES_PER_POINT = 3 * 4
 
 
@@ -34,17 +34,17 @@ class SizeOfKind:
 
 @dataclasses.dataclass(frozen=True)
 class Saving:
-    """What a command would leave."""
+    """Size of the map after a command."""
 
     command: str
     megabytes: float
-    saved: float  # share of the present size
+    saved: float  # ratio to the current size
     what: str
 
 
 @dataclasses.dataclass(frozen=True)
 class MapSize(Report):
-    """Bytes of a map in memory and on disk, and what could be saved."""
+    """Size of a map in memory and on disk, and possible savings."""
 
     megabytes_in_memory: float
     megabytes_on_disk: float | None  # without resources; None when it has no folder
@@ -60,7 +60,7 @@ def map_size(
     keyframing: KeyframingOptions | None = None,
     progress: Progress = SILENT,
 ) -> MapSize:
-    """Measure a map and what maintenance would make of it.
+    """Measure the size of a map and the savings by map maintenance.
 
     Args:
         vi_map: The map; it is not changed.
@@ -75,7 +75,9 @@ def map_size(
         files = [path for path in folder.rglob("*") if path.is_file()]
         inside = [path.relative_to(folder).parts[0] == "resources" for path in files]
         sizes = [path.stat().st_size * 1e-6 for path in files]
-        resources = float(sum(s for s, own in zip(sizes, inside, strict=True) if own))
+        resources = float(
+            sum(s for s, is_internal in zip(sizes, inside, strict=True) if is_internal)
+        )
         disk = float(sum(sizes)) - resources
     return MapSize(
         megabytes_in_memory=total * 1e-6,
@@ -136,17 +138,19 @@ def _savings(
     keep = round(_SPARSE_SHARE * len(good))
     if keep:
         observed = np.diff(vi_map.observation_start)[good]
-        gone = np.ones(len(vi_map.landmarks), dtype=np.bool_)
-        gone[good[np.argsort(-observed, kind="stable")[:keep]]] = False
+        removed = np.ones(len(vi_map.landmarks), dtype=np.bool_)
+        removed[good[np.argsort(-observed, kind="stable")[:keep]]] = False
         what = f"{keep} landmarks, a tenth of the good ones, stay; their keypoints stay in any case"
         tried(
             f"landmark_sparsify --num_landmarks_to_keep={keep}",
-            remove_landmarks(vi_map, gone),
+            remove_landmarks(vi_map, removed),
             what,
         )
     progress.step(2, 3, "summary map")
     if len(good):
-        observations = int(np.diff(vi_map.observation_start)[good].sum())
+        is_good = np.append(vi_map.landmarks.quality == LandmarkQuality.GOOD, False)
+        described = is_good[vi_map.keypoints.landmark] & (vi_map.binary_descriptor_size > 0)
+        observations = int(np.count_nonzero(described))
         size = observations * _BYTES_PER_OBSERVATION
         size += (len(good) + len(vi_map.vertices)) * _BYTES_PER_POINT
         what = f"{len(good)} landmarks, {observations} observations, before packing"

@@ -1,19 +1,17 @@
-"""Options and reports of summary maps."""
+"""Options of summary maps."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
-from maplab_py.report import Report
 
 
 @dataclasses.dataclass(frozen=True)
 class SummaryMapOptions:
-    """What a summary map holds."""
+    """Content of a summary map."""
 
     flag_prefix: ClassVar[str] = "summary_map_"
 
@@ -46,31 +44,3 @@ class SummaryMapOptions:
                 raise FlagError(f"--summary_map_{name} must not be negative")
         if self.max_observations_per_landmark < 0:
             raise FlagError("--summary_map_max_observations_per_landmark must not be negative")
-
-
-@dataclasses.dataclass(frozen=True)
-class SummaryMapReport(Report):
-    """What went into a summary map."""
-
-    landmarks: int
-    observations: int
-    observers: int
-    descriptor_dimensions: int
-    megabytes: float  # of the file
-    file: Path
-
-
-@dataclasses.dataclass(frozen=True)
-class SummaryMapContent(Report):
-    """What is in a summary map."""
-
-    landmarks: int
-    observations: int
-    observers: int
-    descriptor_dimensions: int
-    has_ids: bool
-    has_projection: bool
-    cameras: int
-    median_position_sigma_m: float | None  # of landmarks, where the file has covariances
-    extent_m: tuple[float, float, float]  # of the observers
-    megabytes: float

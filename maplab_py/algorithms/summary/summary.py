@@ -1,16 +1,16 @@
-"""Make a summary map: good landmarks in G, their projected descriptors, and who saw them."""
+"""Create a summary map: good landmarks in G, their projected descriptors and observers."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.localization.database import features_of_good_landmarks
-from maplab_py.algorithms.loop_closure.closing import with_quality
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.array_types import F32, F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
@@ -18,12 +18,8 @@ from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
 from maplab_py.vision.projection import DescriptorProjection
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _FLAT_DIRECTION_SIGMA_M = 10.0
-"""Standard deviation that the prior gives a landmark along directions nobody observes."""
+"""Standard deviation of the prior of a landmark along unobserved directions."""
 _CURVE_STEP_M, _CURVE_BITS = 0.5, 20
 """Cells of the curve along which landmarks are ordered, and how many there may be along an axis."""
 
@@ -35,25 +31,25 @@ def make_summary_map(
     projection: DescriptorProjection | None = None,
     progress: Progress = SILENT,
 ) -> SummaryMap:
-    """Reduce a map to its good landmarks, as seen from G.
+    """Reduce a map to its good landmarks in G.
 
-    Landmarks of unknown quality are judged first.
+    The quality of landmarks is evaluated first where it is unknown.
 
     Args:
-        vi_map: The map; its base frames say where its missions are in G.
-        options: What the summary holds.
+        vi_map: The map; its base frames must be known.
+        options: Content of the summary map.
         projection: Projection of the descriptors; by default learned from the map's tracks.
         progress: Progress.
 
     Raises:
-        EstimationError: No good landmark has descriptors, or too few tracks to learn from.
+        EstimationError: No good landmark has binary descriptors, or too few tracks to learn from.
     """
-    judged, _ = with_quality(vi_map, progress)
+    judged, _ = evaluate_unknown_quality(vi_map, progress)
     missions = np.arange(len(judged.missions))
     features, projection = map_features(judged, missions, projection=projection)
     rows = features_of_good_landmarks(judged, features)
     if len(rows) == 0:
-        raise EstimationError("no good landmark has descriptors: run rtl")
+        raise EstimationError("no good landmark has binary descriptors: run rtl")
     rows = rows[np.argsort(features.descriptors.label[rows], kind="stable")]
     if options.max_observations_per_landmark:
         rows = _spread(rows, features, options.max_observations_per_landmark)
@@ -84,7 +80,7 @@ def make_summary_map(
 
 
 def rounded(summary: SummaryMap, options: SummaryMapOptions) -> SummaryMap:
-    """Round positions and descriptors as the options say; the zero bits that it leaves pack away."""
+    """Round positions and descriptors as set in the options, so that the file compresses better."""
     return dataclasses.replace(
         summary,
         p_G=_to_multiples(summary.p_G, options.position_step_m),
@@ -104,7 +100,7 @@ def _along_a_curve(p_G: F64) -> I64:
     """Return an order of points (N, 3) in which neighbours in space follow each other.
 
     The curve is Morton's (bits of the coordinates interleaved). Leading bytes of the positions then
-    repeat, and the file packs better; no reader minds the order.
+    repeat and the file compresses better. Readers do not depend on the order.
     """
     cell = np.floor((p_G - p_G.min(axis=0)) / _CURVE_STEP_M).astype(np.int64)
     cell = np.minimum(cell, (1 << _CURVE_BITS) - 1)
@@ -116,10 +112,10 @@ def _along_a_curve(p_G: F64) -> I64:
 
 
 def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:
-    """Return the covariance (L, 3, 3) of landmarks in G, the poses of their observers given [m^2].
+    """Return the covariance (L, 3, 3) [m^2] of landmarks in G given the poses of their observers.
 
-    A ray fixes its landmark across by depth times angle: information (I - d d^T) / (z sigma)^2. A
-    weak prior keeps unobserved directions finite.
+    A ray with direction d, depth z and angular sigma adds the information (I - d d^T) / (z sigma)^2.
+    A weak prior bounds the variance of unobserved directions.
     """
     mine = np.flatnonzero(features.descriptors.label >= 0)
     landmark, vertex = features.descriptors.label[mine], features.vertex[mine]
@@ -140,12 +136,12 @@ def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:
 
 
 def _spread(rows: I64, features: MapFeatures, most: int) -> I64:
-    """Keep at most so many observations of each landmark, evenly over its observers.
+    """Keep a maximum number of observations of each landmark, spread evenly over its observers.
 
     Args:
         rows: Feature rows sorted by landmark.
         features: The features.
-        most: Observations to keep.
+        most: Maximum number of observations per landmark.
     """
     label = features.descriptors.label[rows]
     _, first, count = np.unique(label, return_index=True, return_counts=True)

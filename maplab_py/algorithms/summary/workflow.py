@@ -1,4 +1,4 @@
-"""From raw sessions to a localisation map: maplab's whole workflow, for any number of missions."""
+"""Create a localisation map from raw sessions: maplab's workflow for any number of missions."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.landmarks.triangulation import retriangulate
-from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.algorithms.summary.reports import WorkflowReport, WorkflowStep
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import EstimationError
@@ -31,33 +32,11 @@ from maplab_py.report import Report
 from maplab_py.vimap import VIMap
 
 _FIRST_ITERATIONS, _LAST_ITERATIONS = 10, 25
-"""maplab's; its relaxation in between has limits of its own."""
+"""maplab's limits; the relaxation step has separate limits."""
 _MIN_OBSERVERS = 2
-"""Keyframing takes most observations away, so two that are left must do."""
+"""Minimum number of observers after keyframing, which removes most observations."""
 
 Step = Callable[[VIMap], tuple[VIMap, Report]]
-
-
-@dataclasses.dataclass(frozen=True)
-class WorkflowStep:
-    """What one step left, and how long it took."""
-
-    step: str
-    vertices: int
-    landmarks: int
-    seconds: float
-    note: str
-
-
-@dataclasses.dataclass(frozen=True)
-class WorkflowReport(Report):
-    """All steps of the way to a localisation map."""
-
-    steps: tuple[WorkflowStep, ...]
-    missions: int
-    vertices: int
-    good_landmarks: int
-    summary_map: str = ""  # the file, when one was written
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +54,7 @@ def make_localization_map(
 ) -> tuple[VIMap, WorkflowReport]:
     """Triangulate, keyframe, optimise, anchor, relax, close loops, optimise again, sparsify.
 
-    Missions of unknown base frame are anchored; when none is known, the first one gives the frame.
+    Missions of unknown base frame are anchored; if none is known, the first one defines G.
 
     Raises:
         EstimationError: Nothing can be optimised, or a mission cannot be anchored.
@@ -135,9 +114,9 @@ def _anchored(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> t
 
 
 def _relaxed(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
-    edges, found = find_loop_closures(vi_map, loops, progress=progress)
+    edges, search_report = find_loop_closures(vi_map, loops, progress=progress)
     if len(edges) == 0:
-        return vi_map, found
+        return vi_map, search_report
     return relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
 
 

@@ -1,21 +1,21 @@
-"""The residuals of plugins that `--ba_residuals` names."""
+"""Terms of the plugin residuals that `--ba_residuals` names."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.selection import Selection
+from maplab_py.algorithms.vi_optimization.data_selection import Selection
+from maplab_py.algorithms.vi_optimization.options import DataOptions
 from maplab_py.errors import UserError
-from maplab_py.estimation.extension import REGISTERED, ExpressionTerm, ResidualRows
+from maplab_py.estimation.terms.extension import REGISTERED, ExpressionTerm, ResidualRows
 from maplab_py.progress import Progress
 from maplab_py.vimap import VIMap
 
 
 def extension_terms(
-    vi_map: VIMap, selection: Selection, options: VIOptimizationOptions, progress: Progress
+    vi_map: VIMap, selection: Selection, options: DataOptions, progress: Progress
 ) -> list[ExpressionTerm]:
-    """Return the terms, over measurements at the selected vertices.
+    """Return the terms of measurements at the selected vertices.
 
     Raises:
         UserError: There is no residual of that name, or its rows do not fit.

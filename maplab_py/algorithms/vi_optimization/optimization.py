@@ -1,4 +1,4 @@
-"""Visual-inertial least squares over a map: pose the problem, solve it, write the result back."""
+"""Visual-inertial least squares over a map: build the problem, solve it, apply the result."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.vi_optimization.building import PosedProblem, build
-from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.report import VIOptimizationReport
-from maplab_py.algorithms.vi_optimization.reporting import make_report
-from maplab_py.algorithms.vi_optimization.writing_back import written_back
-from maplab_py.estimation.solver import AfterStep, SolverOptions, optimize_states
+from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build
+from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization.report_building import make_report
+from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
+from maplab_py.algorithms.vi_optimization.solution import apply_states
+from maplab_py.estimation.problem.solver import AfterStep, SolverOptions, optimize_states
+from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
-from maplab_py.estimation.trust_region import Schedule
 from maplab_py.progress import SILENT, Progress, SilentProgress
 from maplab_py.vimap import VIMap
 
 Watch = Callable[[Callable[[], VIMap]], None]
-"""Is shown, between iterations, how to make the map as it is now."""
+"""Called between iterations with a function that returns the current map."""
 
 
 def optimize(
@@ -32,7 +32,7 @@ def optimize(
     progress: Progress = SILENT,
     watch: Watch | None = None,
 ) -> tuple[VIMap, VIOptimizationReport]:
-    """Optimise the states that the options leave free of some missions (rows, None = all).
+    """Optimise the free states of some missions (rows, None = all).
 
     Returns:
         The optimised map and a report of costs, reprojection errors and outliers.
@@ -42,18 +42,18 @@ def optimize(
         MapError: Calibrations that the terms need are missing.
     """
     began = time.perf_counter()
-    posed = build(vi_map, options, missions=missions, progress=progress)
+    map_problem = build(vi_map, options, missions=missions, progress=progress)
     built = time.perf_counter()
     quiet = options.hide_iterations_console_output
     final, summary = optimize_states(
-        posed.problem,
-        posed.states,
+        map_problem.problem,
+        map_problem.states,
         solver_options(options),
         _Quiet(progress) if quiet else progress,
-        _after_step(posed, options, watch),
+        _after_step(map_problem, options, watch),
     )
-    result = written_back(posed, final, options)
-    report = make_report(posed, final, summary)
+    result = apply_states(map_problem, final, options)
+    report = make_report(map_problem, final, summary)
     solved = time.perf_counter()
     return result, dataclasses.replace(
         report,
@@ -64,24 +64,24 @@ def optimize(
 
 
 def _after_step(
-    posed: PosedProblem, options: VIOptimizationOptions, watch: Watch | None
+    map_problem: MapProblem, options: VIOptimizationOptions, watch: Watch | None
 ) -> AfterStep | None:
-    """Return what is done after an accepted step: showing it to a watcher, rejecting outliers."""
-    reject = posed.rejection.after_step if posed.rejection is not None else None
+    """Return the callback after an accepted step: it updates a watcher and rejects outliers."""
+    reject = map_problem.rejection.after_step if map_problem.rejection is not None else None
     every = options.visualize_every_n_iterations
     if watch is None or every < 1:
         return reject
 
     def after_step(iteration: int, states: States) -> bool:
         if iteration % every == 0:
-            watch(lambda: written_back(posed, states, options))
+            watch(lambda: apply_states(map_problem, states, options))
         return reject is not None and reject(iteration, states)
 
     return after_step
 
 
 class _Quiet(SilentProgress):
-    """Passes on cancellation only."""
+    """Progress without output that checks for cancellation."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
@@ -91,8 +91,8 @@ class _Quiet(SilentProgress):
         self._progress.check()
 
 
-def solver_options(options: VIOptimizationOptions) -> SolverOptions:
-    """Return how the solver is to run."""
+def solver_options(options: SolverFlags) -> SolverOptions:
+    """Return the solver options of the flags."""
     return SolverOptions(
         num_iterations=options.num_iterations,
         max_time_seconds=options.max_time_seconds,

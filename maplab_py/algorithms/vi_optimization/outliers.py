@@ -1,4 +1,4 @@
-"""Which observations take part: gates at the beginning, rejection while solving."""
+"""Outlier rejection of observations: initial gate and tests while solving."""
 
 from __future__ import annotations
 
@@ -7,54 +7,53 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.estimation.states import F64, States
-from maplab_py.estimation.visual_terms import VisualTerms
-
-Mask = NDArray[np.bool_]
+from maplab_py.algorithms.vi_optimization.options import RobustnessOptions
+from maplab_py.array_types import F64, Mask
+from maplab_py.estimation.states import States
+from maplab_py.estimation.terms.visual import Observations, VisualTerms
 
 _MIN_OBSERVATIONS = 2
-"""A landmark that keeps fewer does not take part."""
+"""Minimum number of inliers of an active landmark."""
 _OUTLYING = 3.0
-"""An error of fewer medians is no outlier, however large: the states are still far off."""
+"""Minimum error of an outlier in multiples of the median, for states far from the optimum."""
 
 
 class OutlierRejection:
-    """Switches observations off, and on again where better states show that they were right."""
+    """Deactivates outliers and activates them again when their error falls below the gate."""
 
-    def __init__(self, visual: VisualTerms, sigma_px: F64, options: VIOptimizationOptions) -> None:
-        """Begin with all observations of landmarks that have at least two."""
+    def __init__(self, visual: VisualTerms, sigma_px: F64, options: RobustnessOptions) -> None:
+        """Activate all observations of landmarks with at least two."""
         self._visual, self._sigma_px, self._options = visual, sigma_px, options
         self.is_used: Mask = np.ones(len(sigma_px), dtype=np.bool_)
         self._passed_gate: Mask = self.is_used
 
     @property
     def gated(self) -> int:
-        """How many observations were left out from the beginning to now."""
+        """Number of observations rejected before solving that are still inactive."""
         return int(np.count_nonzero(~self._passed_gate & ~self.is_used))
 
     @property
     def rejected(self) -> int:
-        """How many observations that took part at the beginning do no more."""
+        """Number of observations rejected while solving."""
         return int(np.count_nonzero(self._passed_gate & ~self.is_used))
 
     def gate(self, states: States) -> None:
-        """Leave out what is hopeless: behind the camera or off by more than the gate."""
+        """Reject initial outliers: behind the camera or with an error above the gate."""
         self._reject(states, self._options.gate_reprojection_error_px)
         self._passed_gate = self.is_used
 
     def doubtful_landmarks(self) -> NDArray[np.int64]:
-        """Return the landmarks that lost observations to the gate."""
+        """Return the landmarks with rejected observations."""
         data = self._visual.observations
         return np.unique(data.landmark[~self.is_used])
 
     def restart(self) -> None:
-        """Let every observation take part again."""
+        """Activate every observation again."""
         self.is_used = np.ones(len(self._sigma_px), dtype=np.bool_)
         self._visual.use(self._visual.observations.switched(self.is_used, self._sigma_px))
 
     def after_step(self, iteration: int, states: States) -> bool:
-        """Judge all observations anew every n iterations; tell whether anything has changed."""
+        """Test all observations every n iterations; return whether any was switched."""
         options = self._options
         if iteration % max(options.outlier_rejection_reject_every_n_iters, 1):
             return False
@@ -65,12 +64,17 @@ class OutlierRejection:
         self._reject(states, options.outlier_rejection_max_reprojection_error_px)
         return changed or bool(np.any(before != self.is_used))
 
+    def replace_weights(self, observations: Observations) -> None:
+        """Use observations with other weights; observations of weight zero are inactive."""
+        self.is_used = observations.inverse_sigma > 0.0
+        self._visual.use(observations)
+
     def used_landmarks(self) -> Mask:
-        """Tell which landmarks (L,) take part."""
+        """Return which landmarks (L,) are active."""
         return self._used_per_landmark() >= _MIN_OBSERVATIONS
 
     def better_placed(self, states: States, others: States) -> States:
-        """Return the states with every landmark where more of its observations pass the gate."""
+        """Return the states with each landmark at the position where more observations pass the gate."""
         data, limit = self._visual.observations, self._options.gate_reprojection_error_px
         passing = [
             np.bincount(data.landmark, self._agree(s, limit), minlength=len(data.start) - 1)
@@ -80,7 +84,7 @@ class OutlierRejection:
         return dataclasses.replace(states, p_G=np.where(is_better, others.p_G, states.p_G))
 
     def _agree(self, states: States, max_error_px: float) -> Mask:
-        """Tell which observations lie in front of the camera and are not too far off."""
+        """Return which observations lie in front of the camera with an error below the limit."""
         error_px, depth_m = self._visual.errors(states)
         # comparisons with NaN are false: a point that does not project is rejected
         ahead = (depth_m > 0.0) & np.isfinite(error_px)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.vimap import VIMap
-
-F64 = NDArray[np.float64]
 
 
 def angular_velocity_at_vertices(vi_map: VIMap) -> F64:

@@ -6,17 +6,16 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
+from maplab_py.estimation.kernels.imu import EdgeSamples
 from maplab_py.sensors import Imu
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import MissionSensor
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,6 +77,19 @@ class InertialData:
     def __len__(self) -> int:
         return len(self.sample_start) - 1
 
+    def with_biases(self, gyro_bias: ArrayLike, accel_bias: ArrayLike) -> EdgeSamples:
+        """Return what kernels read, with biases (E, 3) or (3,) [rad/s, m/s^2]."""
+        shape = (len(self), 3)
+        return EdgeSamples(
+            self.sample_start,
+            self.timestamp_ns,
+            self.accel_gyro,
+            np.array(np.broadcast_to(gyro_bias, shape), dtype=np.float64),
+            np.array(np.broadcast_to(accel_bias, shape), dtype=np.float64),
+            self.imu_of_edge,
+            *self.corrections,
+        )
+
     def of_edges(self, rows: I64) -> InertialData:
         """Return the samples of some edges (rows, ascending)."""
         samples = ragged_rows(self.sample_start, rows)
@@ -101,7 +113,7 @@ class InertialData:
 
     @cached_property
     def corrections(self) -> tuple[F64, F64]:
-        """T_g^-1 and (T_a R_A_I)^-1 of every IMU, (K, 3, 3) each (thesis eq. 7.7-7.10)."""
+        """T_g^-1 and (T_a R_A_I)^-1 of every IMU, (K, 3, 3) each (Schneider 2019, eq. 7.7-7.10)."""
         gyro = np.tile(np.eye(3), (len(self.imus), 1, 1))
         accel = gyro.copy()
         for row, imu in enumerate(self.imus):
@@ -114,7 +126,7 @@ class InertialData:
     def internal_rotation(self) -> F64:
         """R_A_I (K, 3, 3) of every IMU."""
         known = (imu.intrinsics for imu in self.imus)
-        matrices = [np.eye(3) if one is None else one.R_A_I for one in known]
+        matrices = [np.eye(3) if intrinsics is None else intrinsics.R_A_I for intrinsics in known]
         return np.ascontiguousarray(np.stack(matrices)) if matrices else np.zeros((0, 3, 3))
 
     @cached_property

@@ -21,14 +21,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.estimation.imu import kernels
+from maplab_py.array_types import F64, I64
 from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.kernels import imu as kernels
 from maplab_py.geometry import so3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from maplab_py.sensors import Imu
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,42 +71,41 @@ def integrate(
         accel_bias: Linearisation points (E, 3) or (3,) [m/s^2].
         with_intrinsics: Also differentiate by scale, misalignment and R_A_I (a right perturbation).
     """
-    edges = len(data)
-    b_g = np.array(np.broadcast_to(gyro_bias, (edges, 3)), dtype=np.float64)
-    b_a = np.array(np.broadcast_to(accel_bias, (edges, 3)), dtype=np.float64)
-    rotation, dv, dp = np.zeros((edges, 3, 3)), np.zeros((edges, 3)), np.zeros((edges, 3))
-    covariance, bias_jacobian = (
+    edges, width = len(data), 21 if with_intrinsics else 6
+    samples = data.with_biases(gyro_bias, accel_bias)
+    motion = kernels.EdgeMotion(
+        np.zeros((edges, 3, 3)),
+        np.zeros((edges, 3)),
+        np.zeros((edges, 3)),
         np.zeros((edges, 9, 9)),
-        np.zeros((edges, 9, 21 if with_intrinsics else 6)),
+        np.zeros((edges, 9, width)),
     )
-    kernels.preintegrate(
-        data.sample_start,
-        data.timestamp_ns,
-        data.accel_gyro,
-        b_g,
-        b_a,
-        data.imu_of_edge,
-        *data.corrections,
-        data.internal_rotation,
-        data.noise_variance_density,
-        rotation,
-        dv,
-        dp,
-        covariance,
-        bias_jacobian,
-    )
+    kernels.preintegrate(samples, data.internal_rotation, data.noise_variance_density, motion)
     walk = data.walk_variance_density[data.imu_of_edge] * data.duration_s[:, None]
     return Preintegrated(
         duration_s=data.duration_s,
-        q_A_B=so3.from_matrix(rotation),
-        dv=dv,
-        dp=dp,
-        covariance=covariance,
-        jacobian_gyro_bias=np.ascontiguousarray(bias_jacobian[:, :, :3]),
-        jacobian_accel_bias=np.ascontiguousarray(bias_jacobian[:, :, 3:6]),
-        gyro_bias=b_g,
-        accel_bias=b_a,
+        q_A_B=so3.from_matrix(motion.R_A_B),
+        dv=motion.dv,
+        dp=motion.dp,
+        covariance=motion.covariance,
+        jacobian_gyro_bias=np.ascontiguousarray(motion.jacobian[:, :, :3]),
+        jacobian_accel_bias=np.ascontiguousarray(motion.jacobian[:, :, 3:6]),
+        gyro_bias=samples.gyro_bias,
+        accel_bias=samples.accel_bias,
         gyro_walk_variance=walk[:, 0],
         accel_walk_variance=walk[:, 1],
-        jacobian_intrinsics=bias_jacobian[:, :, 6:].copy() if with_intrinsics else None,
+        jacobian_intrinsics=motion.jacobian[:, :, 6:].copy() if with_intrinsics else None,
     )
+
+
+def compile_kernels() -> None:
+    """Compile the integration on one edge of three samples."""
+    data = InertialData(
+        sample_start=np.array([0, 3], dtype=np.int64),
+        timestamp_ns=np.array([0, 5_000_000, 10_000_000], dtype=np.int64),
+        accel_gyro=np.tile([0.0, 0.0, 9.81, 0.0, 0.0, 0.1], (3, 1)),
+        imus=(Imu(id="0" * 32),),
+        imu_of_edge=np.zeros(1, dtype=np.int64),
+    )
+    for with_intrinsics in (False, True):
+        integrate(data, np.zeros(3), np.zeros(3), with_intrinsics=with_intrinsics)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maplab_py.estimation.imu import kernels
+from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.kernels import imu as kernels
 from maplab_py.geometry import se3, so3
-
-F64 = NDArray[np.float64]
 
 
 def propagate(
@@ -33,7 +32,7 @@ def propagate(
     Returns:
         Poses T_M_I (N, 7) and velocities (N, 3) at the samples.
     """
-    edges, samples = len(data), len(data.timestamp_ns)
+    samples = len(data.timestamp_ns)
     start = np.asarray(T_M_I, dtype=np.float64)
     full = np.diff(data.sample_start) > 0
     first = data.sample_start[:-1][full]
@@ -45,17 +44,7 @@ def propagate(
     rotation[first] = so3.to_matrix(start[full, :4])
     position[first] = start[full, 4:]
     velocity[first] = np.asarray(v_M, dtype=np.float64)[full]
-    kernels.propagate(
-        data.sample_start,
-        data.timestamp_ns,
-        data.accel_gyro,
-        np.array(np.broadcast_to(gyro_bias, (edges, 3)), dtype=np.float64),
-        np.array(np.broadcast_to(accel_bias, (edges, 3)), dtype=np.float64),
-        data.imu_of_edge,
-        *data.corrections,
-        np.asarray(gravity_M, dtype=np.float64),
-        rotation,
-        velocity,
-        position,
-    )
+    gravity = np.asarray(gravity_M, dtype=np.float64)
+    edge_samples = data.with_biases(gyro_bias, accel_bias)
+    kernels.propagate(edge_samples, gravity, rotation, velocity, position)
     return se3.make(so3.from_matrix(rotation), position), velocity

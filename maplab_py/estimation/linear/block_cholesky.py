@@ -1,28 +1,25 @@
-"""The solver of the reduced normal equations: block-sparse Cholesky, analysed once per structure."""
+"""Solvers of matrices that are given as a list of blocks, and the Cholesky one of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maplab_py.estimation.linear import multifrontal
-from maplab_py.estimation.linear.ordering import minimum_degree
-from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
-from maplab_py.estimation.linear.single_solve import solve_single
-from maplab_py.estimation.linear.symbolic import analyse
-from maplab_py.estimation.linear.threads import single_blas_thread
-
-F64 = NDArray[np.float64]
+from maplab_py.array_types import F64, I64
+from maplab_py.estimation.linear.assembled import AssembledSolver
+from maplab_py.estimation.linear.ordering import AUTOMATIC
+from maplab_py.estimation.linear.pattern import BlockPattern, joint_covariance
+from maplab_py.estimation.linear.protocol import FactorStatistics
+from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 
 
-class BlockCholesky:
-    """Supernodal multifrontal Cholesky factorisation; a `protocol.LinearSolver`.
+class BlockListSolver:
+    """A `protocol.LinearSolver` that sums listed blocks in the storage of another solver."""
 
-    The constructor analyses the structure; `factor` may then be called any number of times.
-    """
+    storage: ClassVar[Callable[..., AssembledSolver]]
 
     def __init__(
         self,
@@ -30,25 +27,25 @@ class BlockCholesky:
         block_cols: ArrayLike,
         num_nodes: int,
         node_size: int,
-        ordering: Callable[[BlockPattern], NDArray[np.int64]] = minimum_degree,
+        ordering: Callable[[BlockPattern], I64] = AUTOMATIC,
     ) -> None:
         """Analyse the structure of the lower blocks at (block_rows, block_cols), each (B,).
 
         Raises:
             ValueError: A block lies above the diagonal or outside the matrix.
+            NotEnoughMemory: The factor would not fit into memory.
         """
-        self._pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
-        self._symbolic = symbolic = analyse(self._pattern, ordering)
-        self._factor = np.empty(symbolic.statistics.nonzeros)
-        self._front = np.empty(symbolic.front_size)
-        self._stack = np.empty(symbolic.stack_size)
-        self._blas = multifrontal.Blas.workspace()
+        self._pattern = pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
+        self._solver = type(self).storage(
+            pattern.rows, pattern.cols, num_nodes, node_size, ordering
+        )
+        self._places = self._solver.places(pattern.rows, pattern.cols)
         self._values: F64 | None = None
 
     @property
     def statistics(self) -> FactorStatistics:
         """Size and cost of the factorisation."""
-        return self._symbolic.statistics
+        return self._solver.statistics
 
     def factor(self, values: F64) -> None:
         """Factorise the matrix with blocks (B, d, d); see `protocol.LinearSolver`.
@@ -58,41 +55,47 @@ class BlockCholesky:
         """
         checked = self._pattern.check_values(values)
         self._values = None
-        with single_blas_thread():
-            bad_position = multifrontal.factorise(
-                self._symbolic.plan, checked, self._factor, self._front, self._stack, self._blas
-            )
-        if bad_position >= 0:
-            raise NotPositiveDefinite(int(self._symbolic.plan.order[bad_position]))
+        self._solver.clear()
+        self._solver.add(self._pattern.rows, self._pattern.cols, self._places, checked)
+        self._solver.factorise()
         self._values = checked
 
     def solve(self, right_side: F64, *, refinements: int = 0) -> F64:
         """Return x of A x = b for b (n,) or (n, k); see `protocol.LinearSolver`."""
         values = self._factorised()
-        with single_blas_thread():
-            return self._pattern.refined(self._solve, values, right_side, refinements)
+        return self._pattern.refined(self._solver.solve, values, right_side, refinements)
 
     def marginal_covariance(self, nodes: ArrayLike) -> F64:
         """Return the joint covariance of some nodes; see `protocol.LinearSolver`."""
-        return self._pattern.joint_covariance(self.solve, nodes)
+        return joint_covariance(self.solve, nodes, self._pattern.num_nodes, self._pattern.node_size)
 
     def inverse_blocks(self) -> F64:
         """Return the inverse at every given block; see `protocol.LinearSolver`."""
         self._factorised()
-        plan = self._symbolic.plan
-        with single_blas_thread():
-            panels = multifrontal.invert_panels(plan, self._factor, self._stack, self._blas)
-        return np.asarray(multifrontal.blocks_of_panels(plan, panels))
+        return self._solver.inverse_blocks(self._pattern.rows, self._pattern.cols, self._places)
 
     def _factorised(self) -> F64:
         if self._values is None:
             raise ValueError("factor() has to succeed before the factor can be used")
         return self._values
 
-    def _solve(self, b: F64) -> F64:
-        if b.shape[1] == 1:
-            x = solve_single(self._symbolic.plan, self._factor, b[:, 0].copy())
-            return np.asarray(x[:, None])
-        columns = np.ascontiguousarray(b.T)
-        x = multifrontal.solve(self._symbolic.plan, self._factor, columns, self._blas)
-        return np.ascontiguousarray(x.T)
+
+class BlockCholesky(BlockListSolver):
+    """Supernodal Cholesky factorisation of listed blocks.
+
+    The constructor analyses the structure; `factor` may then be called any number of times.
+    """
+
+    storage = SupernodalCholesky
+
+
+def compile_kernels() -> None:
+    """Compile factorisation and solution on a matrix of two nodes."""
+    solver = BlockCholesky(np.array([0, 1, 1]), np.array([0, 0, 1]), 2, 3)
+    solver.factor(np.stack([4.0 * np.eye(3), np.eye(3), 4.0 * np.eye(3)]))
+    solver.solve(np.ones(6))
+    node = np.zeros(1, dtype=np.int32)
+    matrix = SupernodalCholesky(node, node, 1, 3)
+    matrix.clear()
+    matrix.add_to_diagonal(np.ones((1, 3)))
+    matrix.project(np.ones(1, dtype=np.bool_), np.eye(3)[None], np.ones(1))

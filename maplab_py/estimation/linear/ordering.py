@@ -1,140 +1,101 @@
-"""Fill-reducing order of the nodes: minimum degree on the graph of the block matrix.
+"""The order in which nodes are eliminated: of several candidates the one that takes least work.
 
-Eliminating a node connects all its neighbours; eliminating nodes of few neighbours first keeps the
-factor sparse (Liu 1985, multiple minimum degree). SuperLU inside scipy has that algorithm. An
-INCOMPLETE factorisation that drops every off-diagonal entry makes it hand out the order without
-paying for the fill of a factorisation whose numbers nobody needs.
-
-Nodes with equal closed neighbourhoods (position and orientation of one camera, say) are ordered as
-one: it makes the graph small, and they end up side by side, hence in one supernode.
+Minimum degree suits single sessions; trajectories that overlap want nested dissection. Which of them
+is better is not guessed: the operations that a factorisation would take are counted for both.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import dataclasses
+from enum import Enum
 
-from maplab_py.compilation import compiled
-from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import FlagError
+from maplab_py.estimation.linear.minimum_degree import (
+    exact_minimum_degree,
+    exact_minimum_degree_of_groups,
+    minimum_degree,
+    minimum_degree_of_groups,
+)
+from maplab_py.estimation.linear.nested_dissection import (
+    dissect_by_metis,
+    dissect_by_position,
+    has_metis,
+)
+from maplab_py.estimation.linear.pattern import BlockPattern
+from maplab_py.estimation.linear.quotient_graph import QuotientGraph, indistinguishable_nodes
 
-I64 = NDArray[np.int64]
+__all__ = [
+    "AUTOMATIC",
+    "Ordering",
+    "OrderingKind",
+    "exact_minimum_degree",
+    "indistinguishable_nodes",
+    "minimum_degree",
+]
 
-_SMALL = 2000
-"""Nodes up to which neighbourhoods as rows of bits cost less than SuperLU's detour."""
-
-
-def minimum_degree(pattern: BlockPattern) -> I64:
-    """Return the order (num_nodes,): entry k is the node that is eliminated as number k."""
-    off_diagonal = pattern.rows != pattern.cols
-    rows, cols = pattern.rows[off_diagonal], pattern.cols[off_diagonal]
-    group, num_groups = indistinguishable_nodes(rows, cols, pattern.num_nodes)
-    group_order = _superlu_minimum_degree(group[rows], group[cols], num_groups)
-    position = np.empty(num_groups, dtype=np.int64)
-    position[group_order] = np.arange(num_groups)
-    return np.argsort(position[group], kind="stable")
+_WORTH_ANOTHER = 2e9
+"""Operations of a factorisation, a tenth of a second, from which a second order is worth its time."""
 
 
-def exact_minimum_degree(pattern: BlockPattern) -> I64:
-    """Return the order (num_nodes,) of exact minimum degree; of many nodes, `minimum_degree`'s.
+class OrderingKind(Enum):
+    """Algorithms that order the nodes."""
 
-    For graphs that are solved in a few iterations: a tenth of the time where nodes are few.
+    AUTO = "auto"
+    MINIMUM_DEGREE = "minimum_degree"
+    NESTED_DISSECTION = "nested_dissection"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ordering:
+    """Orders the nodes of a pattern.
+
+    Attributes:
+        kind: Algorithm; AUTO takes the order of fewer predicted operations.
+        position_m: Position (num_nodes, 3) of every node, not-a-number = none: nested dissection cuts
+            there where METIS is not installed.
+        has_few_steps: Whether few factorisations follow: exact minimum degree, and no search for
+            indistinguishable nodes, take less time where nodes are few.
     """
-    if pattern.num_nodes > _SMALL:
-        return minimum_degree(pattern)
-    return np.asarray(_eliminate(pattern.rows, pattern.cols, pattern.num_nodes), dtype=np.int64)
+
+    kind: OrderingKind = OrderingKind.AUTO
+    position_m: F64 | None = None
+    has_few_steps: bool = False
+
+    def __call__(self, pattern: BlockPattern) -> I64:
+        """Return the order (num_nodes,): entry k is the node that is eliminated as number k.
+
+        Raises:
+            FlagError: Nested dissection is asked for, and neither METIS nor positions are there.
+        """
+        make = QuotientGraph.without_groups if self.has_few_steps else QuotientGraph.of
+        graph = make(pattern)
+        return graph.order_of_nodes(self._order(graph, pattern.node_size))
+
+    def _order(self, graph: QuotientGraph, node_size: int) -> I64:
+        """Return the order (groups,)."""
+        if self.kind is OrderingKind.NESTED_DISSECTION:
+            return self._nested_dissection(graph)
+        minimum = exact_minimum_degree_of_groups if self.has_few_steps else minimum_degree_of_groups
+        first = minimum(graph)
+        if self.kind is OrderingKind.MINIMUM_DEGREE or not self._can_dissect:
+            return first
+        work = graph.work(first, node_size)
+        if work < _WORTH_ANOTHER:
+            return first
+        second = self._nested_dissection(graph)
+        return second if graph.work(second, node_size) < work else first
+
+    @property
+    def _can_dissect(self) -> bool:
+        return self.position_m is not None or has_metis()
+
+    def _nested_dissection(self, graph: QuotientGraph) -> I64:
+        if has_metis():
+            return dissect_by_metis(graph)
+        if self.position_m is None:
+            raise FlagError("nested dissection needs METIS here: pip install pymetis")
+        return dissect_by_position(graph, self.position_m)
 
 
-@compiled()
-def _eliminate(rows, cols, num_nodes):  # type: ignore[no-untyped-def]
-    """Eliminate the node of fewest neighbours again and again, the first of equal ones.
-
-    The neighbours of each node are bits of a row.
-    """
-    words = (num_nodes + 63) // 64
-    bits = np.zeros((num_nodes, words), np.uint64)
-    one = np.uint64(1)
-    for block in range(len(rows)):
-        row, col = rows[block], cols[block]
-        if row != col:
-            bits[row, col >> 6] |= one << np.uint64(col & 63)
-            bits[col, row >> 6] |= one << np.uint64(row & 63)
-    degree = np.empty(num_nodes, np.int64)
-    for node in range(num_nodes):
-        degree[node] = _count(bits[node])
-    order = np.empty(num_nodes, np.int64)
-    for place in range(num_nodes):
-        best = np.argmin(degree)
-        order[place] = best
-        degree[best] = num_nodes + 1
-        for word in range(words):
-            left = bits[best, word]
-            while left != 0:
-                lowest = left & (~left + one)
-                node = word * 64 + _count_word(lowest - one)
-                left ^= lowest
-                for k in range(words):
-                    bits[node, k] |= bits[best, k]
-                bits[node, node >> 6] &= ~(one << np.uint64(node & 63))
-                bits[node, best >> 6] &= ~(one << np.uint64(best & 63))
-                degree[node] = _count(bits[node])
-    return order
-
-
-@compiled(forceinline=True)
-def _count_word(x):  # type: ignore[no-untyped-def]
-    """Return how many bits of a word are set."""
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@compiled(forceinline=True)
-def _count(row):  # type: ignore[no-untyped-def]
-    total = 0
-    for word in row:
-        total += _count_word(word)
-    return total
-
-
-def indistinguishable_nodes(rows: I64, cols: I64, num_nodes: int) -> tuple[I64, int]:
-    """Group nodes whose neighbourhoods, themselves included, are equal.
-
-    Neighbourhoods are compared by the sum of 52-bit random numbers drawn for their members; an
-    accidental agreement would cost sparsity, never correctness.
-
-    Returns:
-        Group of every node (num_nodes,) and the number of groups.
-    """
-    label = np.random.default_rng(0).integers(1, 2**52, size=num_nodes).astype(np.uint64)
-    edges = sorted_distinct(rows * num_nodes + cols)
-    row, col = edges // max(num_nodes, 1), edges % max(num_nodes, 1)
-    signature = label.copy()
-    np.add.at(signature, row, label[col])
-    np.add.at(signature, col, label[row])
-    distinct, group = np.unique(signature, return_inverse=True)
-    return np.asarray(group, dtype=np.int64), len(distinct)
-
-
-def _superlu_minimum_degree(rows: I64, cols: I64, num_nodes: int) -> I64:
-    from scipy.sparse import coo_array
-    from scipy.sparse.linalg import spilu
-
-    apart = rows != cols
-    if not np.any(apart):
-        return np.arange(num_nodes)
-    i, j = rows[apart], cols[apart]
-    diagonal = np.arange(num_nodes)
-    # duplicates are summed: the diagonal must dominate by far whatever their number
-    entries = np.concatenate([np.full(2 * len(i), 1.0), np.full(num_nodes, 1e6 * (len(i) + 1.0))])
-    places = (np.concatenate([i, j, diagonal]), np.concatenate([j, i, diagonal]))
-    matrix = coo_array((entries, places), shape=(num_nodes, num_nodes)).tocsc()
-    factors = spilu(
-        matrix,
-        drop_tol=1.0,
-        fill_factor=1.0,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    return np.argsort(factors.perm_c).astype(np.int64)
+AUTOMATIC = Ordering()

@@ -7,18 +7,18 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from maplab_py.array_types import F64, I32, I64
+from maplab_py.compilation import compiled
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BlockPattern:
     """Where the lower blocks of a symmetric block matrix lie (see `protocol.LinearSolver`)."""
 
-    rows: I64
-    cols: I64
+    rows: I32
+    cols: I32
     num_nodes: int
     node_size: int
 
@@ -31,7 +31,7 @@ class BlockPattern:
         Raises:
             ValueError: Shapes differ, a block is above the diagonal or outside the matrix.
         """
-        r, c = np.asarray(rows, dtype=np.int64), np.asarray(cols, dtype=np.int64)
+        r, c = np.asarray(rows, dtype=np.int32), np.asarray(cols, dtype=np.int32)
         if r.ndim != 1 or r.shape != c.shape:
             raise ValueError(f"block rows {r.shape} and columns {c.shape} must be equal vectors")
         if num_nodes < 0 or node_size < 1:
@@ -60,7 +60,7 @@ class BlockPattern:
         return b.reshape(self.size, -1) if b.ndim == 2 or b.size else b.reshape(0, 1)
 
     @cached_property
-    def _by_row(self) -> tuple[I64, I64, I64, I64]:
+    def _by_row(self) -> tuple[I64, I64, I32, I64]:
         """CSR of both triangles: (order into [blocks, transposed blocks], offsets, cols, strict)."""
         strict = np.flatnonzero(self.rows != self.cols)
         rows = np.concatenate([self.rows, self.cols[strict]])
@@ -92,15 +92,17 @@ class BlockPattern:
             x += solve(b - self.multiply(values, x))
         return x.reshape(right_side.shape)
 
-    def joint_covariance(self, solve: Callable[[F64], F64], nodes: ArrayLike) -> F64:
-        """Return the inverse at the rows of some nodes (m d, m d), by solving for their columns."""
-        d = self.node_size
-        chosen = np.asarray(nodes, dtype=np.int64)
-        rows = (chosen[:, None] * d + np.arange(d)).reshape(-1)
-        unit = np.zeros((self.size, len(rows)))
-        unit[rows, np.arange(len(rows))] = 1.0
-        covariance = solve(unit)[rows]
-        return np.asarray(0.5 * (covariance + covariance.T))
+
+def joint_covariance(
+    solve: Callable[[F64], F64], nodes: ArrayLike, num_nodes: int, node_size: int
+) -> F64:
+    """Return the inverse at the rows of some nodes (m d, m d), by solving for their columns."""
+    chosen = np.asarray(nodes, dtype=np.int64)
+    rows = (chosen[:, None] * node_size + np.arange(node_size)).reshape(-1)
+    unit = np.zeros((num_nodes * node_size, len(rows)))
+    unit[rows, np.arange(len(rows))] = 1.0
+    covariance = solve(unit)[rows]
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def symmetric_of_lower(blocks: F64) -> F64:
@@ -115,3 +117,33 @@ def sorted_distinct(keys: I64) -> I64:
     keep = np.ones(len(ordered), dtype=np.bool_)
     np.not_equal(ordered[1:], ordered[:-1], out=keep[1:])
     return ordered[keep]
+
+
+@compiled()
+def upper_columns(rows: I32, cols: I32, position: I64) -> tuple[I64, I32]:
+    """Return the strictly upper pattern by columns: (offsets (n + 1,), rows), duplicates included.
+
+    Blocks are counted, not sorted: beside the result nothing of their number is allocated.
+
+    Args:
+        rows: Block rows (B,).
+        cols: Block columns (B,).
+        position: New number of every node (n,).
+    """
+    n = len(position)
+    start = np.zeros(n + 1, np.int64)
+    for block in range(len(rows)):
+        i, j = position[rows[block]], position[cols[block]]
+        if i != j:
+            start[max(i, j) + 1] += 1
+    for node in range(n):
+        start[node + 1] += start[node]
+    following = start[:-1].copy()
+    upper = np.empty(start[n], np.int32)
+    for block in range(len(rows)):
+        i, j = position[rows[block]], position[cols[block]]
+        if i != j:
+            high = max(i, j)
+            upper[following[high]] = min(i, j)
+            following[high] += 1
+    return start, upper

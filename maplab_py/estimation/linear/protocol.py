@@ -8,10 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError
 from maplab_py.report import Report
-
-F64 = NDArray[np.float64]
 
 
 class NotPositiveDefinite(EstimationError):

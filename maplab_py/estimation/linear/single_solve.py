@@ -1,7 +1,7 @@
 """Solution of L L^T x = b for one right side: plain loops, as BLAS takes longer to be called.
 
 Panels of L are columns of a front, see `symbolic.FrontPlan`; each is read once on the way up the
-tree and once on the way down. Sums run in an order of their own, which is always the same.
+tree and once on the way down. The order of sums is fixed.
 """
 
 from __future__ import annotations
@@ -9,12 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.symbolic import FrontPlan
-
-F64 = NDArray[np.float64]
 
 
 @compiled(fastmath={"reassoc", "contract"})
@@ -69,13 +67,13 @@ def _parts(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> Any:
 @compiled()
 def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
     """One supernode of L y = b: x1 <- L11^-1 x1, then x2 -= L21 x1 in the rows below."""
-    d, w, below, panel, own, rest = _parts(plan, s, factor, x, gathered)
+    d, w, below, panel, front, rest = _parts(plan, s, factor, x, gathered)
     rest[:] = 0.0
     for j in range(w):
         column = panel[j]
-        own[j] /= column[j]
-        _subtract(column[j + 1 : w], own[j], own[j + 1 :])
-        _subtract(column[w:], own[j], rest)
+        front[j] /= column[j]
+        _subtract(column[j + 1 : w], front[j], front[j + 1 :])
+        _subtract(column[w:], front[j], rest)
     for i in range(len(below)):
         for r in range(d):
             x[below[i] * d + r] += rest[i * d + r]
@@ -84,11 +82,11 @@ def _up(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
 @compiled()
 def _down(plan: FrontPlan, s: int, factor: F64, x: F64, gathered: F64) -> None:
     """One supernode of L^T x = y: x1 <- L11^-T (x1 - L21^T x2)."""
-    d, w, below, panel, own, rest = _parts(plan, s, factor, x, gathered)
+    d, w, below, panel, front, rest = _parts(plan, s, factor, x, gathered)
     for i in range(len(below)):
         for r in range(d):
             rest[i * d + r] = x[below[i] * d + r]
     for j in range(w - 1, -1, -1):
         column = panel[j]
-        known = _dot(column[j + 1 : w], own[j + 1 :]) + _dot(column[w:], rest)
-        own[j] = (own[j] - known) / column[j]
+        known = _dot(column[j + 1 : w], front[j + 1 :]) + _dot(column[w:], rest)
+        front[j] = (front[j] - known) / column[j]

@@ -2,73 +2,68 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.estimation.linear.ordering import minimum_degree
-from maplab_py.estimation.linear.pattern import BlockPattern, symmetric_of_lower
+from maplab_py.array_types import F64, I32, I64
+from maplab_py.estimation.linear.block_cholesky import BlockListSolver
+from maplab_py.estimation.linear.ordering import AUTOMATIC
+from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
+from maplab_py.estimation.linear.supernodal_solver import BlockStorage
+from maplab_py.estimation.linear.symbolic import FrontPlan, plan_of_matrix
 
-F64 = NDArray[np.float64]
 
-
-class SuperLUSolver:
-    """Sparse LU without pivoting on the Cholesky solver's order; a `protocol.LinearSolver`."""
+class SuperLU(BlockStorage):
+    """Sparse LU without pivoting on the Cholesky solver's order; a `assembled.AssembledSolver`."""
 
     def __init__(
-        self, block_rows: ArrayLike, block_cols: ArrayLike, num_nodes: int, node_size: int
+        self,
+        rows: I32,
+        cols: I32,
+        num_nodes: int,
+        node_size: int,
+        ordering: Callable[[BlockPattern], I64] = AUTOMATIC,
     ) -> None:
-        """Order the structure of the lower blocks at (block_rows, block_cols), each (B,)."""
-        self._pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
-        d = node_size
-        self._scalar_order = (minimum_degree(self._pattern)[:, None] * d + np.arange(d)).reshape(-1)
-        self._values: F64 | None = None
+        """Order the structure of the lower blocks at rows and cols, each (B,)."""
+        pattern = BlockPattern.checked(rows, cols, num_nodes, node_size)
+        super().__init__(plan_of_matrix(pattern, ordering(pattern)))
+        self._indices, self._start = _columns(self.plan)
         self._factors: Any = None
-
-    @cached_property
-    def _entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        d, p = self._pattern.node_size, self._pattern
-        position = np.empty(p.size, dtype=np.int64)
-        position[self._scalar_order] = np.arange(p.size)
-        row = p.rows[:, None, None] * d + np.arange(d)[:, None] + np.zeros((1, d), dtype=np.int64)
-        col = p.cols[:, None, None] * d + np.arange(d) + np.zeros((d, 1), dtype=np.int64)
-        strict = p.rows != p.cols
-        rows = np.concatenate([row.reshape(-1), col[strict].reshape(-1)])
-        cols = np.concatenate([col.reshape(-1), row[strict].reshape(-1)])
-        return position[rows], position[cols]
+        self._is_factorised = False
 
     @property
     def statistics(self) -> FactorStatistics:
         """Size of the last factorisation; the work is not known to SuperLU."""
         nonzeros = int(self._factors.L.nnz) if self._factors is not None else 0
-        nodes, d = self._pattern.num_nodes, self._pattern.node_size
+        nodes, d = len(self.plan.order), self.plan.node_size
         return FactorStatistics(nodes, d, nonzeros, float("nan"), 0, 0)
 
-    def factor(self, values: F64) -> None:
-        """Factorise the matrix with blocks (B, d, d); see `protocol.LinearSolver`.
+    def clear(self) -> None:
+        """Set the matrix to zero."""
+        self._factors, self._is_factorised = None, False
+        super().clear()
+
+    def factorise(self) -> None:
+        """Factorise what has been added, which is kept.
 
         Raises:
-            NotPositiveDefinite: A pivot is not positive.
+            NotPositiveDefinite: A pivot is not positive (or not a number).
         """
-        from scipy.sparse import coo_array
+        from scipy.sparse import csc_array, tril
         from scipy.sparse.linalg import splu
 
-        p = self._pattern
-        checked = p.check_values(values)
-        self._values = self._factors = None
-        full = checked.copy()
-        on_diagonal = np.flatnonzero(p.rows == p.cols)
-        full[on_diagonal] = symmetric_of_lower(checked[on_diagonal])
-        numbers = np.concatenate([full.reshape(-1), full[p.rows != p.cols].reshape(-1)])
-        matrix = coo_array((numbers, self._entries), shape=(p.size, p.size)).tocsc()
-        if p.size:
-            self._factors = self._factorise(splu, matrix)
-        self._values = checked
+        size = len(self.plan.order) * self.plan.node_size
+        stored = csc_array((self.numbers, self._indices, self._start), shape=(size, size))
+        lower = tril(stored, format="csc")
+        matrix = (lower + tril(lower, -1).T).tocsc()
+        if size:
+            self._factors = self._factorised_matrix(splu, matrix)
+        self._is_factorised = True
 
-    def _factorise(self, splu: Any, matrix: Any) -> Any:
+    def _factorised_matrix(self, splu: Any, matrix: Any) -> Any:
         if not np.all(np.isfinite(matrix.data)):
             bad_columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
             bad = bad_columns[~np.isfinite(matrix.data)]
@@ -92,35 +87,46 @@ class SuperLUSolver:
         return factors
 
     def _node(self, scalar_position: int) -> int:
-        return int(self._scalar_order[scalar_position]) // self._pattern.node_size
+        return int(self.plan.order[scalar_position // self.plan.node_size])
 
-    def solve(self, right_side: F64, *, refinements: int = 0) -> F64:
-        """Return x of A x = b for b (n,) or (n, k); see `protocol.LinearSolver`."""
-        values = self._factorised()
-        return self._pattern.refined(self._solve, values, right_side, refinements)
+    def solve(self, right_side: F64) -> F64:
+        """Return x (n, k) of A x = b for b (n, k)."""
+        if not self._is_factorised:
+            raise ValueError("the matrix has to be factorised before its factor can be used")
+        d = self.plan.node_size
+        order = (self.plan.order[:, None] * d + np.arange(d)).reshape(-1)
+        x = np.empty_like(right_side)
+        if self._factors is not None:
+            x[order] = self._factors.solve(right_side[order])
+        return x
 
-    def marginal_covariance(self, nodes: ArrayLike) -> F64:
-        """Return the joint covariance of some nodes; see `protocol.LinearSolver`."""
-        return self._pattern.joint_covariance(self.solve, nodes)
-
-    def inverse_blocks(self) -> F64:
-        """Return the inverse at every given block, column by column: for small systems."""
-        p, d = self._pattern, self._pattern.node_size
-        values = np.empty((len(p.rows), d, d))
-        for node in range(p.num_nodes):
-            blocks = np.flatnonzero(p.cols == node)
-            unit = np.zeros((p.size, d))
+    def inverse_blocks(self, rows: I32, cols: I32, places: I32) -> F64:  # noqa: ARG002
+        """Return blocks (B, d, d) of the inverse, column by column: for small systems."""
+        n, d = len(self.plan.order), self.plan.node_size
+        values = np.empty((len(rows), d, d))
+        for node in range(n):
+            blocks = np.flatnonzero(cols == node)
+            unit = np.zeros((n * d, d))
             unit[node * d : node * d + d] = np.eye(d)
-            values[blocks] = self.solve(unit).reshape(p.num_nodes, d, d)[p.rows[blocks]]
+            values[blocks] = self.solve(unit).reshape(n, d, d)[rows[blocks]]
         return values
 
-    def _factorised(self) -> F64:
-        if self._values is None:
-            raise ValueError("factor() has to succeed before the factor can be used")
-        return self._values
 
-    def _solve(self, b: F64) -> F64:
-        x = np.empty_like(b)
-        if self._factors is not None:
-            x[self._scalar_order] = self._factors.solve(b[self._scalar_order])
-        return x
+def _columns(plan: FrontPlan) -> tuple[I64, I64]:
+    """Return row indices and offsets of the scalar columns of panels of one node each."""
+    n, d = len(plan.order), plan.node_size
+    height = 1 + np.diff(plan.below_start)
+    indices = [np.zeros(0, dtype=np.int64)]
+    for node in range(n):
+        below = plan.below[plan.below_start[node] : plan.below_start[node + 1]]
+        rows = np.concatenate([[node], below])[:, None] * d + np.arange(d)
+        indices += [rows.reshape(-1)] * d
+    start = np.zeros(n * d + 1, dtype=np.int64)
+    np.cumsum(np.repeat(height * d, d), out=start[1:])
+    return np.concatenate(indices), start
+
+
+class SuperLUSolver(BlockListSolver):
+    """SuperLU for listed blocks."""
+
+    storage = SuperLU

@@ -11,8 +11,8 @@ With nodes numbered in elimination order:
 3. SUPERNODES: neighbouring columns with the same structure are kept as one dense panel (Ng and
    Peyton 1993). Small ones are merged with their parents although that stores some zeros, because
    BLAS likes larger panels (Ashcraft and Grimes 1989).
-4. For the multifrontal method: where every block of the matrix and every row of a child's update
-   matrix goes in the front of its supernode.
+   Wide ones are cut, so that little is stored above the diagonal.
+4. FRONTS: the rows of a supernode's panel, and where the rows below it lie in its parent's front.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import I32, I64
 from maplab_py.compilation import compiled
-from maplab_py.estimation.linear.ordering import minimum_degree
-from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct
+from maplab_py.estimation.linear.ordering import AUTOMATIC
+from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct, upper_columns
 from maplab_py.estimation.linear.protocol import FactorStatistics
-
-I64 = NDArray[np.int64]
+from maplab_py.estimation.linear.quotient_graph import inverse_order
 
 
 class FrontPlan(NamedTuple):
     """What the numeric kernels need to know. S supernodes in postorder.
 
-    A node's position is its place in the elimination order. The front of supernode s is a dense
-    matrix over its own nodes (positions `first_node[s]` .. `first_node[s + 1] - 1`) followed by the
-    nodes below, `below[below_start[s]]` .. `below[below_start[s + 1] - 1]`. Its first columns are
-    kept as a panel of the factor.
+    A node's position is its place in the elimination order. The front of supernode s are its own nodes
+    (positions `first_node[s]` .. `first_node[s + 1] - 1`) followed by the nodes below,
+    `below[below_start[s]]` .. `below[below_start[s + 1] - 1]`. Its panel holds the columns of its
+    own nodes over all rows of the front, one column after another.
     """
 
     node_size: int
@@ -47,87 +47,100 @@ class FrontPlan(NamedTuple):
     below_start: I64  # (S + 1,)
     below: I64  # (R,) positions of nodes below the diagonal block
     below_in_parent: I64  # (R,) the same nodes as local nodes of the parent's front
-    child_count: I64  # (S,)
+    parent: I64  # (S,) -1 = root
     panel_start: I64  # (S + 1,) offsets into the factor's numbers
-    block_of: I64  # (B,) matrix blocks sorted by supernode
-    block_start: I64  # (S + 1,) offsets into block_of
-    block_row: I64  # (B,) local node of the block's row in its front
-    block_col: I64  # (B,)
-    block_is_transposed: NDArray[np.bool_]  # (B,) the order put the block's column below its row
+
+
+_WIDEST = 256
+"""Columns of a panel at most: half of its square on the diagonal is stored in vain."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SymbolicFactor:
-    """Structure of the factor and the room that the numeric kernels need."""
+    """Structure and size of the factor."""
 
     plan: FrontPlan
-    stack_size: int  # numbers that wait on the stack of update matrices at most
-    front_size: int  # numbers of the largest update matrix
     statistics: FactorStatistics
 
 
 def analyse(
-    pattern: BlockPattern, ordering: Callable[[BlockPattern], I64] = minimum_degree
+    pattern: BlockPattern, ordering: Callable[[BlockPattern], I64] = AUTOMATIC
 ) -> SymbolicFactor:
     """Order the nodes and find the factor's structure."""
     order = ordering(pattern)
-    parent = elimination_tree(*_upper_columns(pattern, _inverse(order)))
+    parent = elimination_tree(*upper_columns(pattern.rows, pattern.cols, inverse_order(order)))
     order = order[postorder(parent)]
-    position = _inverse(order)
-    start, upper = _upper_columns(pattern, position)
+    start, upper = upper_columns(pattern.rows, pattern.cols, inverse_order(order))
     parent = elimination_tree(start, upper)
     structure_start, structure = column_structures(start, upper, parent)
     first_node = supernodes(structure_start, parent, pattern.node_size)
-    return _plan_fronts(pattern, order, position, first_node, structure_start, structure)
+    return _plan_fronts(
+        pattern, order, *_fronts(first_node, structure_start, structure, pattern.node_size)
+    )
+
+
+def plan_of_matrix(pattern: BlockPattern, order: I64) -> FrontPlan:
+    """Return a plan whose panels hold the matrix itself in some order, every node one supernode."""
+    n, d = pattern.num_nodes, pattern.node_size
+    start, rows = _lower_columns(pattern, inverse_order(order))
+    return FrontPlan(
+        node_size=d,
+        order=np.asarray(order, dtype=np.int64),
+        first_node=np.arange(n + 1, dtype=np.int64),
+        below_start=start,
+        below=rows,
+        below_in_parent=np.full(len(rows), -1, dtype=np.int64),
+        parent=np.full(n, -1, dtype=np.int64),
+        panel_start=_offsets((1 + np.diff(start)) * d * d),
+    )
+
+
+def _fronts(
+    first_node: I64, structure_start: I64, structure: I64, node_size: int
+) -> tuple[I64, I64, I64]:
+    """Cut wide supernodes; return first nodes (S + 1,), offsets (S + 1,) and nodes (R,) below."""
+    most = max(1, _WIDEST // node_size)
+    count = -(-np.diff(first_node) // most)
+    whole = np.repeat(np.arange(len(count)), count)  # supernode of every piece
+    step = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
+    width = np.diff(first_node)[whole]
+    pieces = first_node[whole] + step * width // count[whole]
+    end = first_node[whole] + (step + 1) * width // count[whole]
+    last = first_node[whole + 1] - 1  # the rows below a supernode are those of its last column
+    outside = structure_start[last + 1] - structure_start[last]
+    below_start = _offsets(last + 1 - end + outside)
+    below = np.empty(below_start[-1], dtype=np.int64)
+    fill_below(end, last, structure_start, structure, below_start, below)
+    return np.append(pieces, first_node[-1]), below_start, below
 
 
 def _plan_fronts(
-    pattern: BlockPattern,
-    order: I64,
-    position: I64,
-    first_node: I64,
-    structure_start: I64,
-    structure: I64,
+    pattern: BlockPattern, order: I64, first_node: I64, below_start: I64, below: I64
 ) -> SymbolicFactor:
     d = pattern.node_size
-    width = np.diff(first_node)
+    width, height = np.diff(first_node), np.diff(below_start)
     count = len(width)
-    last = first_node[1:] - 1  # a supernode's rows below are those of its last column
-    below_start = _offsets(structure_start[last + 1] - structure_start[last])
-    below = _ranges(structure, structure_start[last], below_start)
     supernode_of = np.repeat(np.arange(count), width)
-    height = np.diff(below_start)
     has_parent = height > 0
     parent = np.full(count, -1, dtype=np.int64)
     parent[has_parent] = supernode_of[below[below_start[:-1][has_parent]]]
-    low = np.minimum(position[pattern.rows], position[pattern.cols])
-    high = np.maximum(position[pattern.rows], position[pattern.cols])
-    owner = supernode_of[low]
     rows = (width + height).astype(np.int64)
     wide, tall = (width * d).astype(np.float64), (height * d).astype(np.float64)
     flops = float(np.sum(wide**3 / 3.0 + wide**2 * tall + wide * tall**2))
     panel_start = _offsets(rows * width * d * d)
+    in_parent = local_rows(below, np.repeat(parent, height), first_node, below_start, below)
     plan = FrontPlan(
         node_size=d,
         order=order,
         first_node=first_node,
         below_start=below_start,
         below=below,
-        below_in_parent=local_rows(
-            below, np.repeat(parent, height), first_node, below_start, below
-        ),
-        child_count=np.bincount(parent[has_parent], minlength=count).astype(np.int64),
+        below_in_parent=in_parent,
+        parent=parent,
         panel_start=panel_start,
-        block_of=np.argsort(owner, kind="stable"),
-        block_start=_offsets(np.bincount(owner, minlength=count)),
-        block_row=local_rows(high, owner, first_node, below_start, below),
-        block_col=low - first_node[owner],
-        block_is_transposed=position[pattern.rows] < position[pattern.cols],
     )
     return SymbolicFactor(
         plan=plan,
-        stack_size=int(stack_height(height * d, parent)),
-        front_size=int(height.max(initial=0) * d) ** 2,
         statistics=FactorStatistics(
             num_nodes=pattern.num_nodes,
             node_size=d,
@@ -139,35 +152,23 @@ def _plan_fronts(
     )
 
 
-def _inverse(order: I64) -> I64:
-    position = np.empty(len(order), dtype=np.int64)
-    position[order] = np.arange(len(order))
-    return position
-
-
 def _offsets(counts: NDArray[np.int64]) -> I64:
     start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=start[1:])
     return start
 
 
-def _ranges(items: I64, first: I64, start: I64) -> I64:
-    """Concatenate items[first[i] : first[i] + start[i + 1] - start[i]] over all i."""
-    shift = np.repeat(first - start[:-1], np.diff(start))
-    return np.asarray(items[np.arange(start[-1]) + shift])
-
-
-def _upper_columns(pattern: BlockPattern, position: I64) -> tuple[I64, I64]:
-    """Return the strictly upper pattern by columns: (offsets (n + 1,), rows)."""
+def _lower_columns(pattern: BlockPattern, position: I64) -> tuple[I64, I64]:
+    """Return the strictly lower pattern by columns: (offsets (n + 1,), rows)."""
     r, c = position[pattern.rows], position[pattern.cols]
-    key = np.maximum(r, c) * pattern.num_nodes + np.minimum(r, c)
+    key = np.minimum(r, c) * pattern.num_nodes + np.maximum(r, c)
     key = sorted_distinct(key[r != c])
     col, row = key // max(pattern.num_nodes, 1), key % max(pattern.num_nodes, 1)
     return _offsets(np.bincount(col, minlength=pattern.num_nodes)), row
 
 
 @compiled()
-def elimination_tree(start: I64, upper: I64) -> I64:
+def elimination_tree(start: I64, upper: I32) -> I64:
     """Return the parent (n,) of every node, -1 for roots, of the upper pattern by columns.
 
     `ancestor` shortens the paths that were walked already (Liu 1990).
@@ -220,7 +221,7 @@ def postorder(parent: I64) -> I64:
 
 
 @compiled()
-def column_structures(start: I64, upper: I64, parent: I64) -> tuple[I64, I64]:
+def column_structures(start: I64, upper: I32, parent: I64) -> tuple[I64, I64]:
     """Return the rows below the diagonal of every factor column: (offsets (n + 1,), sorted rows).
 
     Row i of the factor has an entry in every column on the tree's paths from the columns of the
@@ -314,15 +315,33 @@ def local_rows(nodes: I64, fronts: I64, first_node: I64, below_start: I64, below
 
 
 @compiled()
-def stack_height(update_rows: I64, parent: I64) -> int:
-    """Return how many numbers the stack of update matrices holds at most, in postorder."""
-    waiting = np.zeros(len(parent), np.int64)  # numbers of the children of a supernode
-    height = 0
-    highest = 0
-    for front in range(len(parent)):
-        size = update_rows[front] * update_rows[front]
-        height += size - waiting[front]
-        highest = max(highest, height)
-        if parent[front] >= 0:
-            waiting[parent[front]] += size
-    return highest
+def fill_below(
+    end: I64, last: I64, structure_start: I64, structure: I64, below_start: I64, below: I64
+) -> None:
+    """Write the nodes below every piece of a supernode: the supernode's further nodes, then its rows.
+
+    Args:
+        end: First node (S,) that is not a piece's.
+        last: Last node (S,) of the whole supernode.
+        structure_start: Offsets (n + 1,) into structure.
+        structure: Rows below the diagonal of every column.
+        below_start: Offsets (S + 1,) into the result.
+        below: Result (R,).
+    """
+    for piece in range(len(end)):
+        entry = below_start[piece]
+        for node in range(end[piece], last[piece] + 1):
+            below[entry] = node
+            entry += 1
+        for row in structure[structure_start[last[piece]] : structure_start[last[piece] + 1]]:
+            below[entry] = row
+            entry += 1
+
+
+@compiled()
+def most_below(plan: FrontPlan) -> int:
+    """Return the largest number of nodes below a supernode."""
+    most = 0
+    for s in range(len(plan.first_node) - 1):
+        most = max(most, plan.below_start[s + 1] - plan.below_start[s])
+    return most

@@ -4,6 +4,10 @@ With more threads OpenBLAS is 25 to 70 times slower on the small fronts of a spa
 and its sums depend on the thread count. threadpoolctl needs some milliseconds to find the
 libraries, so that is done once; entering the context costs some 20 microseconds, inside another
 one almost nothing.
+
+Parallel loops over a handful of edges do not pay either: the other thread has to be woken first, which on
+a busy machine takes longer than the loop itself (measured: 0.5 ms for 9 inertial edges that need 10
+microseconds).
 """
 
 from __future__ import annotations
@@ -13,6 +17,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
+
+import numba
 
 
 @cache
@@ -45,3 +51,19 @@ def single_blas_thread() -> Iterator[None]:
             _Limit.users -= 1
             if _Limit.users == 0:
                 _Limit.held.restore_original_limits()
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """Run the body with one BLAS thread, and its compiled loops on the calling thread alone.
+
+    For problems of some tens of poses. The number of BLAS threads applies to the whole process, that of
+    compiled loops to the calling thread.
+    """
+    before = numba.get_num_threads()
+    with single_blas_thread():
+        numba.set_num_threads(1)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)

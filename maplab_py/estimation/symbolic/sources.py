@@ -2,53 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from enum import Enum
 from typing import Any
 
 
-def inertial() -> Any:
-    """Make the casadi function of an inertial edge."""
-    from maplab_py.estimation.symbolic import residuals
+class PoseError(Enum):
+    """What the residual of an edge of a pose graph is."""
 
-    return residuals.inertial()
-
-
-def inertial_with_intrinsics() -> Any:
-    """Make the casadi function of an inertial edge whose IMU is being calibrated."""
-    from maplab_py.estimation.symbolic import residuals
-
-    return residuals.inertial(with_intrinsics=True)
+    SPLIT = (
+        "split"  # [p_A_B - p_measured, Log(R_measured^T R_A_B)], as covariances of maps are meant
+    )
+    LOGARITHM = "logarithm"  # Log(T_measured^-1 T_A_B) in SE(3), as public files are meant
 
 
-def relative_pose() -> Any:
-    """Make the casadi function of a relative pose."""
-    from maplab_py.estimation.symbolic import residuals
+def _function(name: str, **settings: bool) -> Callable[[], Any]:
+    """Return what makes the casadi function of a residual, loading casadi only then."""
 
-    return residuals.relative_pose()
+    def make() -> Any:
+        from maplab_py.estimation.symbolic import residuals
 
+        return getattr(residuals, name)(**settings)
 
-def relative_pose_with_mounting() -> Any:
-    """Make the casadi function of a relative pose of a sensor whose mounting is estimated."""
-    from maplab_py.estimation.symbolic import residuals
-
-    return residuals.relative_pose(with_mounting=True)
+    return make
 
 
-def absolute_pose() -> Any:
-    """Make the casadi function of an absolute pose."""
-    from maplab_py.estimation.symbolic import residuals
-
-    return residuals.absolute_pose()
-
-
-def absolute_pose_with_mounting() -> Any:
-    """Make the casadi function of an absolute pose of a sensor whose mounting is estimated."""
-    from maplab_py.estimation.symbolic import residuals
-
-    return residuals.absolute_pose(with_mounting=True)
-
-
-def switched_relative_pose() -> Any:
-    """Make the casadi function of a relative pose with a switch."""
-    from maplab_py.estimation.symbolic import residuals
-
-    return residuals.switched_relative_pose()
+inertial = _function("inertial")
+inertial_with_intrinsics = _function("inertial", with_intrinsics=True)
+relative_pose = _function("relative_pose")
+relative_pose_with_mounting = _function("relative_pose", with_mounting=True)
+absolute_pose = _function("absolute_pose")
+absolute_pose_with_mounting = _function("absolute_pose", with_mounting=True)
+switched_relative_pose = _function("switched_relative_pose")

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64
 from maplab_py.viewer.scene import Extent
-
-F64 = NDArray[np.float64]
 
 FIELD_OF_VIEW_RAD = float(np.radians(45.0))
 _ELEVATIONS_DEG = {"overview": 38.0, "top": 89.9, "side": 8.0}

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from maplab_py.array_types import U8
 from maplab_py.viewer.drawing import axis_lines
 from maplab_py.viewer.scene import (
     WHOLE_MAP,
@@ -20,8 +20,6 @@ from maplab_py.viewer.scene import (
     Segments,
     is_same_part,
 )
-
-U8 = NDArray[np.uint8]
 
 _NodeKey = tuple[str, str]  # layer name, mission id
 

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import U8
+from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes
 from maplab_py.viewer.display.camera import aim
 from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
 from maplab_py.viewer.scene import Extent
-
-U8 = NDArray[np.uint8]
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 HEADLESS_FLAGS = (
@@ -73,7 +75,7 @@ def take_picture(
             f"no page is open and no Chromium is installed: open {url}, or install one "
             "(apt-get install chromium)"
         )
-    with _headless(browser, url, size_px):
+    with headless_browser(browser, url, size_px):
         client = _first_client(server)
         return _render(client, extent, view or "overview", size_px, is_dark=is_dark)
 
@@ -81,6 +83,7 @@ def take_picture(
 def _first_client(server: Any) -> Any:
     deadline = time.monotonic() + _CONNECT_S
     while time.monotonic() < deadline:
+        check_cancelled()
         clients = server.get_clients()
         if clients:
             time.sleep(_SETTLE_S)
@@ -117,10 +120,10 @@ def on_ground(picture: U8, *, is_dark: bool) -> U8:
 
 
 @contextmanager
-def _headless(
+def headless_browser(
     browser: str, url: str, size_px: tuple[int, int]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a Chromium without a window on a page; it keeps nothing and leaves nothing behind."""
+    """Run a Chromium without a window on a page; it stores nothing."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
         width, height = size_px
@@ -132,15 +135,16 @@ def _headless(
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
-        try:
+        with cleaned_up(partial(_end, process)):
             yield process
-        finally:
-            process.terminate()
-            try:
-                process.wait(timeout=5.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and those that it has started."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def save_picture(picture: U8, path: Path) -> None:
@@ -156,5 +160,5 @@ def save_picture(picture: U8, path: Path) -> None:
     except cv2.error:
         ok = False
     if not ok:
-        raise UserError(f"--file={path}: a name ending in .png or .jpg is wanted")
+        raise UserError(f"--file={path}: a name ending in .png or .jpg is expected")
     write_bytes(path, [data.tobytes()], overwrite=True)

@@ -1,6 +1,6 @@
 """The time slider: the map grows in the order in which it was recorded.
 
-What each step brings is a node of its own, made once; moving the slider shows and hides nodes,
+Each step adds a separate node, made once; moving the slider shows and hides nodes,
 which costs a few bytes per step however large the map is.
 """
 
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I64
 from maplab_py.geometry import se3
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.parts import add_part
@@ -22,9 +22,6 @@ from maplab_py.viewer.layers.landmarks import landmark_colours, point_size
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Timeline, make_timeline
 from maplab_py.viewer.subsampling import spread_rows
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _FRUSTUM = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 
@@ -106,13 +103,19 @@ class Player:
         every, _ = landmark_colours(drawing)
         chunks: dict[int, list[Any]] = {}
         p = drawing.p_vertices
-        for step, own in paths.items():
+        for step, members in paths.items():
             path = make_segments(
-                p[own], p[own + 1], drawing.mission_colours[mission[own]], own, 3.0
+                p[members],
+                p[members + 1],
+                drawing.mission_colours[mission[members]],
+                members,
+                3.0,
             )
             chunks.setdefault(step, []).extend(add_part(self._server, f"/play/{step}/path", path))
-        for step, own in clouds.items():
-            cloud = make_points(drawing.p_landmarks[own], every[own], own, point_size(drawing))
+        for step, members in clouds.items():
+            cloud = make_points(
+                drawing.p_landmarks[members], every[members], members, point_size(drawing)
+            )
             chunks.setdefault(step, []).extend(
                 add_part(self._server, f"/play/{step}/landmarks", cloud)
             )
@@ -190,4 +193,4 @@ def _grouped(step: I64, rows: I64) -> dict[int, I64]:
     order = np.argsort(step, kind="stable")
     cuts = np.flatnonzero(np.diff(step[order])) + 1
     groups = np.split(order, cuts) if len(order) else []
-    return {int(step[own[0]]): rows[own] for own in groups}
+    return {int(step[group[0]]): rows[group] for group in groups}

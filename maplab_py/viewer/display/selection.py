@@ -10,7 +10,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.record import read_record
+from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.array_types import U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import add_part
@@ -26,9 +27,6 @@ from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap.table import ragged_rows
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 ImageOf = Callable[[int], "U8 | None"]
 """Gives the image (H, W, 3) of a vertex (row), if there is one."""
@@ -52,21 +50,21 @@ class Selection:
         self.picked: Pick | None = None
         self.distance_m: float | None = None
 
-    def pick(self, drawing: Drawing, found: Pick, image_of: ImageOf) -> None:
+    def pick(self, drawing: Drawing, picked: Pick, image_of: ImageOf) -> None:
         """Mark what was clicked and show its facts."""
-        previous, self.picked, self.distance_m = self.picked, found, None
+        previous, self.picked, self.distance_m = self.picked, picked, None
         self._clear_marks()
         note = ""
         if self.is_measuring and previous is not None:
             self._anchor = previous
-            self.distance_m = float(np.linalg.norm(found.p - previous.p))
+            self.distance_m = float(np.linalg.norm(picked.p - previous.p))
             note = f"distance to the pick before: {self.distance_m:.3f} m"
-        self._mark(drawing, found)
-        image = image_of(found.row) if found.entity is Entity.VERTEX else None
-        self._panel.show_facts(facts(drawing.vi_map, found.entity, found.row), image, note)
+        self._mark(drawing, picked)
+        image = image_of(picked.row) if picked.entity is Entity.VERTEX else None
+        self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
 
     def clear(self) -> None:
-        """Forget the pick."""
+        """Clear the pick."""
         self._clear_marks()
         self.picked = self._anchor = self.distance_m = None
         self._panel.show_facts((), None)
@@ -76,27 +74,27 @@ class Selection:
             handle.remove()
         self._handles = []
 
-    def _mark(self, drawing: Drawing, found: Pick) -> None:
+    def _mark(self, drawing: Drawing, picked: Pick) -> None:
         size = 0.005 * drawing.unit_m
-        row = np.array([found.row])
-        self._add("point", make_points(found.p[None], colours.PICKED, row, size))
-        if found.entity is Entity.VERTEX:
-            self._mark_vertex(drawing, found.row)
-        elif found.entity is Entity.LANDMARK:
-            start, end, vertices = observer_rays(drawing, found.row)
+        row = np.array([picked.row])
+        self._add("point", make_points(picked.p[None], colours.PICKED, row, size))
+        if picked.entity is Entity.VERTEX:
+            self._mark_vertex(drawing, picked.row)
+        elif picked.entity is Entity.LANDMARK:
+            start, end, vertices = observer_rays(drawing, picked.row)
             self._add("rays", make_segments(start, end, colours.PICKED, vertices, 1.0))
             observers = np.unique(vertices)
             every = -(-len(observers) // _MAX_FRUSTA)
             self._add_frusta(drawing, observers[::every], 0.015, 1.0)
-        elif found.entity is Entity.LOOP_CLOSURE:
+        elif picked.entity is Entity.LOOP_CLOSURE:
             edges = drawing.vi_map.loop_closure_edges
-            ends = np.array([edges.from_vertex[found.row], edges.to_vertex[found.row]])
+            ends = np.array([edges.from_vertex[picked.row], edges.to_vertex[picked.row]])
             self._mark_closure(drawing, ends.astype(np.int64))
-        elif found.entity is Entity.CLOSURE:
+        elif picked.entity is Entity.CLOSURE:
             record = read_record(drawing.vi_map).closures.take(row)
             self._mark_closure(drawing, np.concatenate(closure_ends(drawing, record)))
         if self.distance_m is not None and self._anchor is not None:
-            self._mark_distance(found, self._anchor, self.distance_m, size)
+            self._mark_distance(picked, self._anchor, self.distance_m, size)
 
     def _mark_closure(self, drawing: Drawing, ends: NDArray[np.int64]) -> None:
         p = drawing.p_vertices[ends]
@@ -130,12 +128,12 @@ class Selection:
             part = make_segments(ends[:, 0], ends[:, 1], colours.PICKED, rows, width_px)
             self._add("frusta", part)
 
-    def _mark_distance(self, found: Pick, anchor: Pick, distance_m: float, size: float) -> None:
+    def _mark_distance(self, picked: Pick, anchor: Pick, distance_m: float, size: float) -> None:
         row = np.array([0])
         self._add("anchor", make_points(anchor.p[None], colours.SECOND_PICK, row, size))
-        line = make_segments(anchor.p[None], found.p[None], colours.SECOND_PICK, row, 3.0)
+        line = make_segments(anchor.p[None], picked.p[None], colours.SECOND_PICK, row, 3.0)
         self._add("distance", line)
-        middle = 0.5 * (anchor.p + found.p)
+        middle = 0.5 * (anchor.p + picked.p)
         label = self._server.scene.add_label(
             "/pick/distance_label", f"{distance_m:.3f} m", position=middle
         )

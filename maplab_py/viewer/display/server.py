@@ -1,4 +1,4 @@
-"""A viser server that listens on this machine only, shares nothing and keeps off the prompt."""
+"""A viser server that listens on this machine only, shares nothing and prints nothing."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import websockets.asyncio.server
 from maplab_py.errors import UserError
 
 LOOPBACK = "127.0.0.1"
-_OWN_ORIGINS = (None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"))
-"""Pages that may open a connection: our own, whatever port it was forwarded to, and programs."""
+_LOCAL_ORIGINS = (None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"))
+"""Origins that may open a connection: pages of this viewer on any forwarded port, and programs."""
 
 logger = logging.getLogger(__name__)
 _rich_print = rich.print
@@ -35,7 +35,7 @@ def _print_unless_viser(*objects: object, **settings: Any) -> None:
 
 
 class _Forwarder(logging.Handler):
-    """Sends records of a library to our own log, where no traceback disturbs the prompt."""
+    """Sends records of a library to the console's log, so that no traceback disturbs the prompt."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Forward one record."""
@@ -56,7 +56,7 @@ def start_server(port: int) -> viser.ViserServer:
     _hush_libraries()
     with (
         _patching,
-        _patched(websockets.asyncio.server, "serve", _own_serve()),
+        _patched(websockets.asyncio.server, "serve", _restricted_serve()),
     ):
         try:
             server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False, label="maplab")
@@ -67,9 +67,9 @@ def start_server(port: int) -> viser.ViserServer:
     return server
 
 
-def _own_serve() -> Any:
-    """Return the function that opens the socket, restricted to connections of our own pages."""
-    return functools.partial(websockets.asyncio.server.serve, origins=_OWN_ORIGINS)
+def _restricted_serve() -> Any:
+    """Return the function that opens the socket, restricted to connections of the viewer's pages."""
+    return functools.partial(websockets.asyncio.server.serve, origins=_LOCAL_ORIGINS)
 
 
 def _no_sharing(*_: object, **__: object) -> None:

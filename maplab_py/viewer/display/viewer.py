@@ -52,6 +52,7 @@ class Viewer:
     Attributes:
         scene: What is shown.
         subject: What it was made of.
+        show_image: Shows an image (H, W, 3) in the panel, or none.
     """
 
     def __init__(self, port: int = 8080, *, is_dark: bool = False) -> None:
@@ -68,6 +69,7 @@ class Viewer:
         self._server = start_server(port)
         self._nodes = Nodes(self._server)
         self._panel = Panel(self._server, self, self._lock)
+        self.show_image = self._panel.show_image
         self._selection = Selection(self._server, self._panel)
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
@@ -156,7 +158,7 @@ class Viewer:
         return scene
 
     def follow(self, subject: Subject) -> None:
-        """Show another state soon, without waiting for it; only the latest wish counts."""
+        """Show another state soon, without waiting for it; only the latest request counts."""
         with self._lock:
             self._pending = subject
             self._idle.clear()
@@ -187,7 +189,7 @@ class Viewer:
         return True
 
     def wait(self, timeout_s: float = 60.0) -> bool:
-        """Wait until everything asked for is shown; tell whether it is."""
+        """Wait until everything requested is shown; return whether it is."""
         return self._idle.wait(timeout_s)
 
     def look_at_everything(self) -> None:
@@ -287,7 +289,7 @@ class Viewer:
 
     @property
     def player(self) -> Player | None:
-        """What the time slider has begun to play, if anything."""
+        """The mission that the time slider plays, if any."""
         return self._player
 
     def set_layer(self, name: str, is_visible: bool) -> None:
@@ -369,7 +371,7 @@ class Viewer:
             self._panel.show_image(self._image_of(vertex) if vertex >= 0 else None)
 
     def set_playing(self, is_playing: bool) -> None:
-        """Play or pause; playing from the end begins anew."""
+        """Play or pause; playing from the end starts again at the beginning."""
         with self._lock:
             if is_playing and self._player is None:
                 self.set_step(0)
@@ -410,25 +412,25 @@ class Viewer:
         """Forget what was picked."""
         self._selection.clear()
 
-    def select(self, found: Pick) -> None:
+    def select(self, picked: Pick) -> None:
         """Mark a thing and show its facts, as if it had been clicked."""
         with self._lock:
-            self._selection.pick(self.drawing, found, self._image_of)
+            self._selection.pick(self.drawing, picked, self._image_of)
 
     def _clicked(self, event: Any) -> None:
         if self.scene is None:
             return
-        found = pick(
+        picked = pick(
             self.scene, event.ray_origin, event.ray_direction,
             layers=self.visible_layers, missions=self.visible_missions,
         )  # fmt: skip
-        if found is not None:
-            self.select(found)
+        if picked is not None:
+            self.select(picked)
 
     # -- drawing ----------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Build and show what is asked for; the latest wish only."""
+        """Build and show what is asked for; the latest request only."""
         while not self._is_stopped:
             self._wake.wait()
             self._wake.clear()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, SensorSet
@@ -16,9 +16,6 @@ from maplab_py.viewer.drawing import Drawing, make_segments
 from maplab_py.viewer.scene import Axes, Layer, Part
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _FRUSTA_PER_MISSION = 250
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
@@ -113,8 +110,8 @@ def camera_centres(drawing: Drawing, keypoints: I64) -> tuple[F64, I64]:
     mission = vi_map.vertices.mission[vertices]
     for row in np.unique(mission).tolist():
         for camera in mission_cameras(vi_map, row):
-            own = (mission == row) & (index == camera.index)
-            T[own] = se3.compose(T[own], camera.T_I_C)
+            camera_frames = (mission == row) & (index == camera.index)
+            T[camera_frames] = se3.compose(T[camera_frames], camera.T_I_C)
     return T[:, 4:], vertices
 
 
@@ -133,10 +130,16 @@ def landmark_observers(drawing: Drawing, landmarks: I64, limit: int) -> Layer:
     centres, vertices = camera_centres(drawing, keypoints)
     mission = vi_map.vertices.mission[vertices]
     parts: dict[str, Part] = {}
-    for mission_id, own in drawing.by_mission(mission):
-        colour = colours.mixed(drawing.mission_colours[mission[own[0]]], colours.REFERENCE, 0.55)
+    for mission_id, members in drawing.by_mission(mission):
+        colour = colours.mixed(
+            drawing.mission_colours[mission[members[0]]], colours.REFERENCE, 0.55
+        )
         parts[mission_id] = make_segments(
-            centres[own], drawing.p_landmarks[landmark[own]], colour, landmark[own], 0.75
+            centres[members],
+            drawing.p_landmarks[landmark[members]],
+            colour,
+            landmark[members],
+            0.75,
         )
     return Layer("observers", "Landmark observers", parts, int(counts[landmarks].sum()))
 

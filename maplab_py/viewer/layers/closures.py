@@ -1,12 +1,12 @@
-"""The loop closures that the map remembers, accepted and refused, whatever has become of them."""
+"""Recorded loop closures, accepted and refused."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.closures import VERDICTS
-from maplab_py.algorithms.loop_closure.record import ClosureRecord, read_record
-from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.errors import MapError
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments

@@ -7,13 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, Mesh, Part
 from maplab_py.viewer.subsampling import spread_rows
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,9 +32,9 @@ def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) ->
     total = sum(len(cloud.p_G) for cloud in clouds)
     parts: dict[str, Part] = {}
     for mission_id in dict.fromkeys(cloud.mission_id for cloud in clouds):
-        own = [cloud for cloud in clouds if cloud.mission_id == mission_id]
-        p = np.concatenate([cloud.p_G for cloud in own]) - drawing.origin_G
-        colour = np.concatenate([cloud_colours(cloud) for cloud in own])
+        mission_clouds = [cloud for cloud in clouds if cloud.mission_id == mission_id]
+        p = np.concatenate([cloud.p_G for cloud in mission_clouds]) - drawing.origin_G
+        colour = np.concatenate([cloud_colours(cloud) for cloud in mission_clouds])
         limit = max(1, drawing.options.max_points * len(p) // max(total, 1))
         rows = spread_rows(p, limit)
         # the width of a square that each point has for itself on the surface of the map's ball
@@ -56,7 +54,7 @@ def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
 
 
 def cloud_colours(cloud: Cloud) -> U8:
-    """Return the cloud's own colours (N, 3); else by intensity, else by height."""
+    """Return the colours (N, 3) stored with the cloud; else by intensity, else by height."""
     if cloud.colours is not None:
         return cloud.colours
     values = cloud.p_G[:, 2] if cloud.intensity is None else cloud.intensity
@@ -69,7 +67,7 @@ def layers_of_clouds(drawing: Drawing, clouds: tuple[Cloud, ...]) -> list[Layer]
     layers = []
     plain = [cloud for cloud in clouds if cloud.faces is None]
     for number, title in enumerate(dict.fromkeys(cloud.title for cloud in plain)):
-        own = tuple(cloud for cloud in plain if cloud.title == title)
-        layers.append(cloud_layer(drawing, own, number))
+        titled = tuple(cloud for cloud in plain if cloud.title == title)
+        layers.append(cloud_layer(drawing, titled, number))
     meshes = [cloud for cloud in clouds if cloud.faces is not None]
     return layers + [mesh_layer(drawing, mesh, number) for number, mesh in enumerate(meshes)]

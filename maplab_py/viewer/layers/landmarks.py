@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
@@ -12,13 +12,9 @@ from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.queries import observation_counts, observer_counts
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-
 
 def landmarks(drawing: Drawing) -> list[Layer]:
-    """The landmarks, and those of bad quality as a layer of their own."""
+    """The landmarks, and those of bad quality as a separate layer."""
     chosen = _chosen(drawing)
     is_bad = drawing.vi_map.landmarks.quality[chosen] == LandmarkQuality.BAD
     limit = drawing.options.max_points
@@ -32,9 +28,12 @@ def landmarks(drawing: Drawing) -> list[Layer]:
             continue
         shown = rows[spread_rows(drawing.p_landmarks[rows], limit)]
         parts: dict[str, Part] = {}
-        for mission_id, own in drawing.by_mission(drawing.landmark_mission[shown]):
+        for mission_id, members in drawing.by_mission(drawing.landmark_mission[shown]):
             parts[mission_id] = make_points(
-                drawing.p_landmarks[shown[own]], every[shown[own]], shown[own], point_size(drawing)
+                drawing.p_landmarks[shown[members]],
+                every[shown[members]],
+                shown[members],
+                point_size(drawing),
             )
         is_visible = name == "landmarks" or not drawing.options.check_landmark_constrained
         layers.append(Layer(name, title, parts, len(rows), Entity.LANDMARK, is_visible, legend))
@@ -77,14 +76,14 @@ def first_observation_s(vi_map: VIMap) -> F64:
     seen = vertex >= 0
     begin = vi_map.vertices.timestamp_ns[vi_map.vertex_start[:-1].clip(0, len(vi_map.vertices) - 1)]
     seconds = np.full(len(vertex), np.nan)
-    own = vertex[seen]
-    since = vi_map.vertices.timestamp_ns[own] - begin[vi_map.vertices.mission[own]]
+    observers = vertex[seen]
+    since = vi_map.vertices.timestamp_ns[observers] - begin[vi_map.vertices.mission[observers]]
     seconds[seen] = 1e-9 * since
     return seconds
 
 
 def first_observer(vi_map: VIMap) -> I64:
-    """Return the first observing vertex row (L,) of each landmark in its own mission, else any; or -1."""
+    """Return the first observing vertex row (L,) of each landmark in its mission, else any; or -1."""
     vertex = vi_map.keypoint_vertex[vi_map.observations].astype(np.int64)
     landmark = vi_map.keypoints.landmark[vi_map.observations]
     home = vi_map.vertices.mission[vi_map.landmarks.vertex]

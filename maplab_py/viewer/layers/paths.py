@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maplab_py.array_types import I32
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, axis_lines, make_points, make_segments
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, Part
 from maplab_py.vimap import TransformationKind
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _EDGE_COLOURS = colours.from_hex("#7f9cc0", "#5fa39a", "#b08a5a", "#9a86b8")
 
@@ -23,8 +19,8 @@ def trajectories(drawing: Drawing) -> Layer:
     start = np.flatnonzero(mission[1:] == mission[:-1])
     p = drawing.p_vertices
     parts: dict[str, Part] = {}
-    for mission_id, own in drawing.by_mission(mission[start]):
-        rows = start[own]
+    for mission_id, members in drawing.by_mission(mission[start]):
+        rows = start[members]
         colour = drawing.mission_colours[mission[rows[0]]]
         parts[mission_id] = make_segments(p[rows], p[rows + 1], colour, rows, 3.0)
     return Layer("trajectories", "Trajectories", parts, len(drawing.vi_map.missions))
@@ -73,9 +69,13 @@ def _edge_parts(drawing: Drawing, start: I32, end: I32, colour: int) -> dict[str
     known = np.flatnonzero((start >= 0) & (end >= 0))
     return {
         mission_id: make_segments(
-            p[start[known[own]]], p[end[known[own]]], _EDGE_COLOURS[colour], known[own], 2.0
+            p[start[known[members]]],
+            p[end[known[members]]],
+            _EDGE_COLOURS[colour],
+            known[members],
+            2.0,
         )
-        for mission_id, own in drawing.by_mission(mission[start[known]])
+        for mission_id, members in drawing.by_mission(mission[start[known]])
     }
 
 

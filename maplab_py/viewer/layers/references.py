@@ -1,14 +1,14 @@
-"""What the map is held against: another state of it, ground truth; and marked segments."""
+"""References to compare the map with: another state, ground truth; and marked segments."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.trajectory_evaluation import match
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
@@ -19,9 +19,6 @@ from maplab_py.viewer.layers.landmarks import point_size
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +130,7 @@ def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
 
 
 def marked_segments(drawing: Drawing, segments: MarkedSegments) -> Layer:
-    """Pieces of the trajectories, coloured by their number (thesis, figures 7.1 and 7.10)."""
+    """Pieces of the trajectories, coloured by their number (Schneider 2019, figures 7.1 and 7.10)."""
     part, low, high = colours.normalised(segments.value)
     colour = colours.ramp(part, colours.HEAT)
     lengths = np.maximum(segments.last_vertex - segments.first_vertex, 0)
@@ -144,9 +141,13 @@ def marked_segments(drawing: Drawing, segments: MarkedSegments) -> Layer:
     mission = drawing.vi_map.vertices.mission
     parts: dict[str, Part] = {
         mission_id: make_segments(
-            p[start[own]], p[start[own] + 1], colour[owner[own]], owner[own], 7.0
+            p[start[members]],
+            p[start[members] + 1],
+            colour[owner[members]],
+            owner[members],
+            7.0,
         )
-        for mission_id, own in drawing.by_mission(mission[start])
+        for mission_id, members in drawing.by_mission(mission[start])
     }
     codes = tuple(colours.hex_codes(colours.HEAT))
     legend = LegendEntry(segments.title, codes, f"{low:.3g}", f"{high:.3g}")

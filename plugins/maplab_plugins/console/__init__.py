@@ -1,4 +1,4 @@
-"""The console's own commands: help, lasting flags, aliases, jobs, timing, transcript, plugins."""
+"""Commands of the console itself: help, lasting flags, aliases, jobs, timing, transcript, plugins."""
 
 from maplab_plugins.console.aliases import alias, unalias
 from maplab_plugins.console.help import list_plugins, show_help

@@ -1,4 +1,4 @@
-"""Names for command lines of one's own."""
+"""Aliases of command lines."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def alias(
     The line may be several commands. Words behind the alias are put behind its line.
 
     Args:
-        definition: NAME='COMMANDS', in quotes where there are blanks.
-        keep: Also remember it for later sessions.
+        definition: NAME='COMMANDS', quoted if it contains blanks.
+        keep: Also store it for later sessions.
     """
-    from maplab_py.console.aliases import check_name
+    from maplab_py.console.scripts.aliases import check_name
 
     aliases = context.session.aliases
     if not definition:
@@ -56,9 +56,16 @@ def alias(
     return Message(f"{name} stands for: {text.strip()}")
 
 
-@command("unalias", example="unalias tidy", see_also=("alias",), needs_map=False, acts_outside=True)
+@command(
+    "unalias",
+    example="unalias tidy",
+    see_also=("alias",),
+    needs_map=False,
+    acts_outside=True,
+    completes={"name": "alias"},
+)
 def unalias(context: CommandContext, name: str) -> Message:
-    """Forget an alias, also for later sessions.
+    """Remove an alias, also for later sessions.
 
     Args:
         name: The alias.
@@ -68,13 +75,13 @@ def unalias(context: CommandContext, name: str) -> Message:
         raise UserError(f"unalias: no alias '{name}' (there are: {', '.join(aliases) or 'none'})")
     del aliases[name]
     _keep(name, None)
-    return Message(f"alias '{name}' is gone")
+    return Message(f"removed alias '{name}'")
 
 
 def _keep(name: str, text: str | None) -> None:
-    """Write an alias to the user's file, or take it out there."""
-    from maplab_py.console.aliases import read_aliases, write_aliases
-    from maplab_py.console.paths import user_aliases
+    """Write an alias to the user's file, or remove it from there."""
+    from maplab_py.console.scripts.aliases import read_aliases, write_aliases
+    from maplab_py.console.session.paths import user_aliases
 
     kept = read_aliases(user_aliases())
     if text is not None:

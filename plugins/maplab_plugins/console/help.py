@@ -47,7 +47,7 @@ class CommandPage(Report):
     usage: str
     example: str
     see_also: str
-    flags: tuple[FlagLine, ...]
+    flags: tuple[FlagLine, ...] = dataclasses.field(metadata={"are_entries": True})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ class PluginLine:
 
 @dataclasses.dataclass(frozen=True)
 class PluginList(Report):
-    """All plugins, the broken ones with the reason."""
+    """All plugins; those that failed to load with the reason."""
 
     plugins: tuple[PluginLine, ...]
     names_claimed_twice: tuple[str, ...]
@@ -120,36 +120,36 @@ def show_help(
 
 def _page(context: CommandContext, name: str) -> CommandPage:
     registry = context.session.registry
-    found = registry.find(name)
-    words = [f"<{name}>" for name in found.positional if found.flags[name].is_required]
-    words += [f"[{name}]" for name in found.positional if not found.flags[name].is_required]
-    words += ["..."] if found.variadic else []
+    described = registry.find(name)
+    words = [f"<{name}>" for name in described.positional if described.flags[name].is_required]
+    words += [f"[{name}]" for name in described.positional if not described.flags[name].is_required]
+    words += ["..."] if described.variadic else []
     required = [
         f"--{name}=..."
-        for name, flag in found.flags.items()
-        if flag.is_required and name not in found.positional
+        for name, flag in described.flags.items()
+        if flag.is_required and name not in described.positional
     ]
-    flags = ["[--FLAG=VALUE ...]"] if found.flags else []
+    flags = ["[--FLAG=VALUE ...]"] if described.flags else []
     lines = tuple(
         FlagLine(f"--{flag.name}", flag.type.text, flag.default_text, flag.unit, flag.help)
-        for flag in found.flags.values()
+        for flag in described.flags.values()
     )
     return CommandPage(
-        found.name,
-        found.summary,
-        found.description,
-        ", ".join(found.aliases),
-        registry.owner(found),
-        " ".join([found.name, *words, *required, *flags]),
-        found.example,
-        ", ".join(found.see_also),
+        described.name,
+        described.summary,
+        described.description,
+        ", ".join(described.aliases),
+        registry.owner(described),
+        " ".join([described.name, *words, *required, *flags]),
+        described.example,
+        ", ".join(described.see_also),
         lines,
     )
 
 
 @command("plugins", needs_map=False)
 def list_plugins(context: CommandContext) -> PluginList:
-    """List the plugins with their versions, and the broken ones with the reason."""
+    """List the plugins with their versions; those that failed to load with the reason."""
     registry = context.session.registry
     lines = tuple(
         PluginLine(p.name, p.version, len(p.commands), p.module, p.error) for p in registry.plugins

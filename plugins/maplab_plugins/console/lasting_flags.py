@@ -1,4 +1,4 @@
-"""Flags that last: set, unset, flags."""
+"""Session-wide flags: set, unset, flags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SettingList(Report):
     acts_outside=True,
 )
 def set_flags(context: CommandContext, *assignments: str) -> SettingList | Message:
-    """Give flags values that last for the session; without arguments list them.
+    """Set flags for the rest of the session; without arguments list them.
 
     Args:
         assignments: --name=value, name=value, --name or --noname, any number of them.
@@ -53,13 +53,13 @@ def set_flags(context: CommandContext, *assignments: str) -> SettingList | Messa
     acts_outside=True,
 )
 def unset_flags(context: CommandContext, *names: str) -> Message:
-    """Take back what `set` or --keep_gflags gave to flags.
+    """Remove the values that `set` or --keep_gflags gave to flags.
 
     Args:
         names: Names of flags.
     """
     if not names:
-        raise UserError("unset: name the flags to take back (see: flags)")
+        raise UserError("unset: no flag is given (see: flags)")
     for name in names:
         if context.session.settings.unset(name) is None:
             raise UserError(f"unset: --{name.lstrip('-')} has not been set")
@@ -82,9 +82,13 @@ def list_flags(context: CommandContext, filter_: str = "") -> SettingList | Mess
     for name in sorted(names):
         owners = registry.flags_named(name)
         setting = current.get(name)
-        value = setting.text if setting else owners[0][1].default_text
+        value = setting.text if setting else registry.all_flags()[name].default_text
         origin = setting.origin if setting else "default"
-        lines.append(SettingLine(f"--{name}", value, origin, _names(c.name for c, _ in owners)))
+        lines.append(
+            SettingLine(
+                f"--{name}", value, origin, _names(c.name for c, _ in owners) or "the console"
+            )
+        )
     if not lines:
         return Message("no such flag" if wanted else "all flags have their defaults")
     return SettingList(tuple(lines))

@@ -1,4 +1,4 @@
-"""The beginning of a plugin of one's own."""
+"""Create the package of a new plugin."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from maplab_py.plugin import CommandContext, Report, UserError, command
 
 @dataclasses.dataclass(frozen=True)
 class NewPlugin(Report):
-    """What was made, and what to do with it."""
+    """Files of the new package, and the next steps."""
 
     folder: Path
     files: tuple[str, ...]
@@ -22,39 +22,28 @@ class NewPlugin(Report):
     example="new_plugin path_lengths",
     see_also=("plugins",),
     needs_map=False,
-    acts_outside=True,
+    writes_files=True,
 )
-def new_plugin(
-    context: CommandContext, name: str, *, folder: Path | None = None, dry_run: bool = False
-) -> NewPlugin:
-    """Make an installable plugin with one command, one test and a README.
+def new_plugin(context: CommandContext, name: str, *, folder: Path | None = None) -> NewPlugin:
+    """Create an installable plugin with one command, one test and a README.
 
     Args:
         name: Name of the plugin and of its first command.
-        folder: Where to put it; empty = maplab_NAME in the current folder. It must not exist.
-        dry_run: Only tell which files would be written.
+        folder: Folder to create; empty = maplab_NAME in the current folder. It must not exist.
     """
     from importlib.metadata import version
 
-    from maplab_py.console.plugin_template import plugin_files
+    from maplab_py.console.commands.plugin_template import plugin_files
+    from maplab_py.output_files import write_text
 
     files = plugin_files(name, version("maplab-py"))
     name = name.replace("-", "_")
     if name in context.session.registry.names:
-        raise UserError(f"new_plugin: '{name}' is a command already; give another name")
+        raise UserError(f"new_plugin: '{name}' is already a command; give another name")
     target = folder or Path(f"maplab_{name}")
     if target.exists():
         raise UserError(f"new_plugin: {target} exists; give another --folder")
-    if not dry_run:
-        _write(target, files)
+    for path, text in files.items():
+        write_text(target / path, [text])
     steps = (f"pip install {target}", f"maplab help {name}", f"pytest {target}/tests")
     return NewPlugin(target, tuple(files), steps)
-
-
-def _write(target: Path, files: dict[str, str]) -> None:
-    try:
-        for path, text in files.items():
-            (target / path).parent.mkdir(parents=True, exist_ok=True)
-            (target / path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{target}: cannot be written: {error.strerror}") from None

@@ -30,7 +30,7 @@ def show_schema(context: CommandContext, command_name: str = "") -> SchemaReport
     Args:
         command_name: Command or alias; empty = all commands.
     """
-    from maplab_py.console.schema import line_schema
+    from maplab_py.console.commands.schema import line_schema
 
     registry = context.session.registry
     commands = [registry.find(command_name)] if command_name else registry.commands

@@ -1,4 +1,4 @@
-"""The course of a session: time spent, repetition, transcript, sheep."""
+"""Commands about the session: timing, repetition, transcript, sheep."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import dataclasses
 import time
 from pathlib import Path
 
+from maplab_py.cancellation import current_token
 from maplab_py.plugin import Cancelled, CommandContext, Message, Report, UserError, command
+from maplab_py.report import counted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +24,7 @@ class TimingLine:
 
 @dataclasses.dataclass(frozen=True)
 class TimingTable(Report):
-    """Time spent in commands in this session, most expensive first."""
+    """Time spent in the commands of this session, longest first."""
 
     timings: tuple[TimingLine, ...]
 
@@ -57,10 +59,10 @@ def watch(
     Args:
         command: The command with its flags, in quotes.
         every: Pause between two runs in seconds.
-        repetitions: Stop after so many runs; 0 = only at Ctrl-C.
+        repetitions: Number of runs; 0 = until Ctrl-C.
     """
     if not command.strip():
-        raise UserError("watch: --command is empty; say what to repeat")
+        raise UserError("watch: --command is empty; give the command to repeat")
     if every < 0 or repetitions < 0:
         raise UserError("watch: --every and --repetitions cannot be negative")
     runs = 0
@@ -71,12 +73,13 @@ def watch(
             context.session.run_line(command, context.terminal)
             runs += 1
     except Cancelled:
-        return Message(f"stopped after {runs} runs")
-    return Message(f"{runs} runs")
+        current_token().cancelled = False  # it is how this command is meant to end
+        return Message(f"stopped after {counted(runs, 'run')}")
+    return Message(counted(runs, "run"))
 
 
 def _sleep(context: CommandContext, seconds: float) -> None:
-    """Wait, but notice Ctrl-C at once."""
+    """Wait; Ctrl-C ends the wait immediately."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         context.progress.check()
@@ -86,10 +89,10 @@ def _sleep(context: CommandContext, seconds: float) -> None:
 
 @command("transcript", example="transcript session.txt", needs_map=False, acts_outside=True)
 def transcript(context: CommandContext, file: Path | None = None) -> Message:
-    """Copy everything that is typed and printed from now on to a file.
+    """Copy all further input and output to a file.
 
     Args:
-        file: File to append to; without one the copying ends.
+        file: File to append to; empty = stop copying.
     """
     context.terminal.transcribe(file)
     return Message(f"transcript goes to {file}" if file else "transcript ended")
@@ -97,7 +100,7 @@ def transcript(context: CommandContext, file: Path | None = None) -> Message:
 
 @command("enable_sheep", "sheep", needs_map=False, acts_outside=True)
 def enable_sheep(context: CommandContext) -> Message:
-    """Put a sheep into the prompt; once more to let it go."""
+    """Show a sheep in the prompt, or remove it again."""
     marks = context.session.marks
     marks["sheep"] = "" if marks.get("sheep") else "\N{SHEEP}"
     return Message("baa")

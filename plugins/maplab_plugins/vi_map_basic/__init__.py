@@ -1,6 +1,7 @@
-"""maplab's vi_map_basic plugin: maps in memory and on disk, what is in them, undo."""
+"""maplab's vi_map_basic plugin: maps in memory and on disk, their content, undo."""
 
-from maplab_plugins.vi_map_basic.history import redo, restore, snapshot, undo
+from maplab_plugins.vi_map_basic.cells import split_map
+from maplab_plugins.vi_map_basic.history import history, redo, restore, snapshot, undo
 from maplab_plugins.vi_map_basic.information import (
     check_map_consistency,
     map_stats,
@@ -29,20 +30,26 @@ from maplab_plugins.vi_map_basic.memory import (
     select_map,
 )
 from maplab_plugins.vi_map_basic.resources import (
+    clean_up_resource_folders,
     list_resource_folders,
+    remove_resources,
+    resource_cache_statistics,
     resource_statistics,
     use_external_resource_folder,
     use_map_resource_folder,
 )
 from maplab_plugins.vi_map_basic.saving import get_map_folder, save, save_all, set_map_folder
+from maplab_plugins.vi_map_basic.why import why
 
 __all__ = [
     "check_map_consistency",
+    "clean_up_resource_folders",
     "clear_storage",
     "copy_map",
     "create_new_map",
     "delete_map",
     "get_map_folder",
+    "history",
     "join_all_maps",
     "list_maps",
     "list_maps_on_file_system",
@@ -59,7 +66,9 @@ __all__ = [
     "print_baseframes",
     "print_camera_calibrations",
     "redo",
+    "remove_resources",
     "rename_map",
+    "resource_cache_statistics",
     "resource_statistics",
     "restore",
     "save",
@@ -67,7 +76,9 @@ __all__ = [
     "select_map",
     "set_map_folder",
     "snapshot",
+    "split_map",
     "undo",
     "use_external_resource_folder",
     "use_map_resource_folder",
+    "why",
 ]

@@ -1,4 +1,4 @@
-"""What is in the selected map, and whether it is consistent."""
+"""Content and consistency of the selected map."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.plugin import CommandContext, Report, UserError, command
+from maplab_py.plugin import (
+    ALL_MISSIONS,
+    CommandContext,
+    MissionChoice,
+    Report,
+    UserError,
+    command,
+)
 from maplab_py.vimap.ids import to_hex_list
 
 if TYPE_CHECKING:
     from maplab_py.vimap.consistency import ConsistencyReport
-    from maplab_py.vimap.statistics import CoobservabilityReport, MapStatistics
+    from maplab_py.vimap.statistics import CoobservabilityReport, MapDetails, MapStatistics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,12 +63,28 @@ class CameraList(Report):
     cameras: tuple[CameraLine, ...]
 
 
-@command("map_stats", "ms")
-def map_stats(context: CommandContext) -> MapStatistics:
-    """Count what is in the map, mission by mission."""
-    from maplab_py.vimap.statistics import map_statistics
+@command("map_stats", "ms", example="map_stats", see_also=("statistics", "map_size"))
+def map_stats(
+    context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
+) -> MapStatistics | MapDetails:
+    """Show one row per mission; all counts of a mission if one is given.
 
-    return map_statistics(context.vi_map)
+    `good`, `bad` and `unknown` are the landmarks stored in the mission, `closures` the recorded loop
+    closures that were accepted; `known` says whether the base frame T_G_M is known.
+    """
+    from maplab_py.algorithms.loop_closure.listing import accepted_by_mission
+    from maplab_py.vimap.statistics import MapDetails, map_statistics
+
+    vi_map = context.vi_map
+    rows = chosen.rows(vi_map)
+    report = map_statistics(vi_map)
+    missions = [
+        dataclasses.replace(mission, closures=int(count))
+        for mission, count in zip(report.missions, accepted_by_mission(vi_map), strict=True)
+    ]
+    if rows is None:
+        return dataclasses.replace(report, missions=tuple(missions))
+    return MapDetails(tuple(missions[row] for row in rows), None, report.memory_megabytes)
 
 
 @command("mission_coobservability_stats", "mcs")
@@ -121,7 +144,12 @@ def print_camera_calibrations(context: CommandContext) -> CameraList:
 
 @command("check_map_consistency")
 def check_map_consistency(context: CommandContext) -> ConsistencyReport:
-    """Check that everything in the map fits together; fails when something does not."""
+    """Check the consistency of the map; fails if a rule is violated.
+
+    Resources whose files are missing are errors. Files in the map's resource folder that no resource
+    refers to are warnings; `clean_up_resource_folders` deletes them.
+    """
+    from maplab_py.storage.resource_files import with_file_checks
     from maplab_py.vimap.consistency import check_consistency
 
-    return check_consistency(context.vi_map)
+    return with_file_checks(check_consistency(context.vi_map), context.vi_map, context.map_folder)

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from maplab_py.input_files import SizeOptions
 from maplab_py.options import option
-from maplab_py.plugin import CommandContext, Report, UserError, command, key_of_folder
-from maplab_py.vimap import VIMap
+from maplab_py.plugin import (
+    CommandContext,
+    Message,
+    Report,
+    UserError,
+    command,
+    key_of_folder,
+)
+from maplab_py.report import counted
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
 
 
 @dataclasses.dataclass(frozen=True)
 class FolderList(Report):
-    """Map folders found below a folder."""
+    """Map folders below a folder."""
 
     maps_folder: Path
     map_folders: tuple[str, ...]
@@ -36,6 +48,28 @@ class LoadedMaps(Report):
     maps: tuple[LoadedMap, ...]
     details: tuple[Report, ...]
 
+    def display(self) -> Message | LoadedMapsTable:
+        """Return a sentence on one map, else a table."""
+        notes = tuple(note for report in self.details for note in getattr(report, "notes", ()))
+        if len(self.maps) != 1:
+            return LoadedMapsTable(self.maps, notes)
+        (loaded,) = self.maps
+        contents = (
+            f"{counted(loaded.missions, 'mission')}, "
+            f"{counted(loaded.vertices, 'vertex', 'vertices')}, "
+            f"{counted(loaded.landmarks, 'landmark')}"
+        )
+        sentence = f"map '{loaded.map_key}': {contents}, from {loaded.folder}"
+        return Message("\n".join((sentence, *notes)))
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedMapsTable:
+    """What is shown of several loaded maps."""
+
+    maps: tuple[LoadedMap, ...] = dataclasses.field(metadata={"title": ""})
+    notes: tuple[str, ...]
+
 
 @dataclasses.dataclass(frozen=True)
 class MergedMaps(Report):
@@ -48,16 +82,38 @@ class MergedMaps(Report):
     merged_folders: tuple[str, ...]
     details: tuple[Report, ...]
 
+    def display(self) -> MergedMapsTable:
+        """Return the result without what every single merge added."""
+        notes = (note for report in self.details for note in getattr(report, "notes", ()))
+        return MergedMapsTable(
+            self.map_key,
+            self.missions,
+            self.vertices,
+            self.landmarks,
+            len(self.merged_folders),
+            tuple(dict.fromkeys(notes)),
+        )
+
 
 @dataclasses.dataclass(frozen=True)
-class ReadingOptions:
+class MergedMapsTable:
+    """What is shown of merged maps."""
+
+    map_key: str
+    missions: int
+    vertices: int
+    landmarks: int
+    merged_folders: int
+    notes: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadingOptions(SizeOptions):
     """How map files are read."""
 
-    proto_max_size_megabytes: int = option(
-        2000, help="Refuse map files that unpack to more than this.", unit="MB"
-    )
     repair: bool = option(
-        False, help="Keep what both copies of an observation say instead of refusing the map."
+        False,
+        help="Keep the observations that both of their copies agree on instead of refusing the map.",
     )
 
 
@@ -72,7 +128,7 @@ def list_maps_on_file_system(
     """List the map folders below a folder.
 
     Args:
-        maps_folder: Where to look, in all sub-folders.
+        maps_folder: Folder to search, with all sub-folders.
     """
     return FolderList(maps_folder, tuple(str(p) for p in _folders_below(maps_folder)))
 
@@ -93,21 +149,23 @@ def load(
         map_key: Key of the map in memory; empty = the folder's name.
         assign_new_ids: Give missions, vertices, landmarks and edges new ids.
     """
-    from maplab_py.storage.native import load_map
+    from maplab_py.storage.mission_names import with_folder_names
+    from maplab_py.storage.native import disk_copy, load_map
     from maplab_py.vimap.edits import with_new_ids
 
     key = context.maps.check_new_key(map_key or key_of_folder(map_folder))
+    before = disk_copy(map_folder)
     vi_map, report = load_map(
         map_folder,
         max_size_megabytes=reading.proto_max_size_megabytes,
         repair=reading.repair,
         progress=context.progress,
     )
+    vi_map = with_folder_names(vi_map, map_folder)
     if assign_new_ids:
         vi_map = with_new_ids(vi_map)
-    context.maps.add(
-        key, vi_map, folder=map_folder, is_saved=not (assign_new_ids or reading.repair)
-    )
+    is_saved = not (assign_new_ids or reading.repair)
+    context.maps.add(key, vi_map, folder=map_folder, is_saved=is_saved, disk_copy=before)
     return LoadedMaps((_loaded(key, vi_map, map_folder),), (report,))
 
 
@@ -122,9 +180,10 @@ def load_all(
     """Load every map below a folder, each under the name of its folder; the last is selected.
 
     Args:
-        maps_folder: Where to look, in all sub-folders.
+        maps_folder: Folder to search, with all sub-folders.
         assign_new_ids: Give missions, vertices, landmarks and edges new ids.
     """
+    from maplab_py.storage.native import disk_copy
     from maplab_py.vimap.edits import with_new_ids
 
     folders = _folders_below(maps_folder)
@@ -132,18 +191,20 @@ def load_all(
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
         raise UserError(
-            f"load_all: two folders would get the map key '{twice[0]}'; load them singly"
+            f"load_all: two folders would get the map key '{twice[0]}'; load them one by one"
         )
+    before = [disk_copy(folder) for folder in folders]
     loaded = _load_each(context, folders, reading)
+    is_saved = not (assign_new_ids or reading.repair)
     lines = []
-    for key, folder, (vi_map, _) in zip(keys, folders, loaded, strict=True):
+    for key, copy, folder, (vi_map, _) in zip(keys, before, folders, loaded, strict=True):
         value = with_new_ids(vi_map) if assign_new_ids else vi_map
-        context.maps.add(key, value, folder=folder, is_saved=not (assign_new_ids or reading.repair))
+        context.maps.add(key, value, folder=folder, is_saved=is_saved, disk_copy=copy)
         lines.append(_loaded(key, value, folder))
     return LoadedMaps(tuple(lines), ())
 
 
-@command("load_merge_map", example="load_merge_map --map_folder=maps/v1_02")
+@command("load_merge_map", example="load_merge_map --map_folder=maps/v1_02", needs_map=False)
 def load_merge_map(
     context: CommandContext,
     map_folder: Path,
@@ -153,11 +214,14 @@ def load_merge_map(
 ) -> MergedMaps:
     """Load a map and merge its missions into the selected map.
 
+    Without a selected map it is loaded as a new map.
+
     Args:
         map_folder: Folder of the map.
         assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids.
     """
-    return _merge_all(context, [map_folder], "", reading, assign_new_ids=assign_new_ids)
+    key = _target_key(context, map_folder, "")
+    return _merge_all(context, [map_folder], key, reading, assign_new_ids=assign_new_ids)
 
 
 @command("load_merge_all_maps", example="load_merge_all_maps --maps_folder=maps", needs_map=False)
@@ -172,7 +236,7 @@ def load_merge_all_maps(
     """Load every map below a folder and merge all missions into the selected map or a new one.
 
     Args:
-        maps_folder: Where to look, in all sub-folders.
+        maps_folder: Folder to search, with all sub-folders.
         target_map_key: Key of a new map for the result; empty = the selected map, or if there is
             none a new map named after the folder.
         assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids, so that
@@ -191,13 +255,13 @@ def load_merge_submap(
     assign_new_ids: bool = False,
     reading: ReadingOptions = _READING,
 ) -> MergedMaps:
-    """Load a piece of a mission and append it to that mission in the selected map.
+    """Load a part of a mission and append it to that mission in the selected map.
 
-    Without a selected map the piece is loaded as a new map.
+    Without a selected map the part is loaded as a new map.
 
     Args:
         map_folder: Folder of the submap.
-        assign_new_ids: Give the piece new ids: it becomes a mission of its own.
+        assign_new_ids: Give the part new ids: it becomes a separate mission.
     """
     key = _target_key(context, map_folder, "")
     if assign_new_ids:
@@ -218,10 +282,10 @@ def load_merge_all_submaps(
     assign_new_ids: bool = False,
     reading: ReadingOptions = _READING,
 ) -> MergedMaps:
-    """Load the pieces of missions below a folder in time order and join them.
+    """Load the parts of missions below a folder in time order and join them.
 
     Args:
-        maps_folder: Where to look, in all sub-folders.
+        maps_folder: Folder to search, with all sub-folders.
         target_map_key: Key of a new map for the result; empty = the selected map, or if there is
             none a new map named after the folder.
         assign_new_ids: Give the joined missions, vertices, landmarks and edges new ids.
@@ -264,7 +328,7 @@ def _append_all(
     *,
     assign_new_ids: bool,
 ) -> MergedMaps:
-    """Load folders in time order and append each to its mission, which the first of it begins."""
+    """Load folders in time order and append each to its mission; the first part starts it."""
     from maplab_py.vimap.edits import with_new_ids
     from maplab_py.vimap.merge import merge_maps
     from maplab_py.vimap.submaps import append_submap
@@ -315,7 +379,7 @@ def _hand_over(
 
 
 def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> str:
-    """Return the key of the new map that shall take the result, empty for the selected map."""
+    """Return the key of the new map for the result, empty for the selected map."""
     if target_map_key == "" and context.maps.selected_key:
         return ""
     return context.maps.check_new_key(target_map_key or key_of_folder(folder))
@@ -324,13 +388,15 @@ def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> s
 def _load_each(
     context: CommandContext, folders: list[Path], reading: ReadingOptions
 ) -> list[tuple[VIMap, Report]]:
+    from maplab_py.storage.mission_names import with_folder_names
     from maplab_py.storage.native import load_map
 
     loaded: list[tuple[VIMap, Report]] = []
     for done, folder in enumerate(folders):
         context.progress.step(done, len(folders), f"load {folder.name}")
         limit, repair = reading.proto_max_size_megabytes, reading.repair
-        loaded.append(load_map(folder, max_size_megabytes=limit, repair=repair))
+        vi_map, report = load_map(folder, max_size_megabytes=limit, repair=repair)
+        loaded.append((with_folder_names(vi_map, folder), report))
     return loaded
 
 

@@ -1,4 +1,4 @@
-"""The maps in memory: list, select, make, copy, rename, merge, drop."""
+"""The maps in memory: list, select, create, copy, rename, merge, remove."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.report import counted
 from maplab_py.vimap import VIMap
 
 if TYPE_CHECKING:
@@ -31,6 +32,23 @@ class MapList(Report):
 
     selected: str
     maps: tuple[MapLine, ...]
+
+    def display(self) -> MapTable:
+        """Return one table in which the selected map is marked."""
+        lines = tuple(
+            dataclasses.replace(map_, state=f"selected, {map_.state}")
+            if map_.map_key == self.selected
+            else map_
+            for map_ in self.maps
+        )
+        return MapTable(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class MapTable:
+    """What is shown of the maps in memory."""
+
+    maps: tuple[MapLine, ...] = dataclasses.field(metadata={"title": ""})
 
 
 @command("list", "ls", "list_maps", needs_map=False)
@@ -60,52 +78,52 @@ def select_map(context: CommandContext, map_key: str) -> Message:
         map_key: Key of the map.
     """
     context.maps.select(map_key)
-    return Message(f"map '{map_key}' is selected")
+    return Message(f"selected map '{map_key}'")
 
 
 @command("create_new_map", example="create_new_map merged", needs_map=False)
 def create_new_map(context: CommandContext, map_key: str) -> Message:
-    """Make an empty map and select it.
+    """Create an empty map and select it.
 
     Args:
-        map_key: Its key: letters, digits, - and _.
+        map_key: Key of the new map: letters, digits, - and _.
     """
     context.maps.add(map_key, VIMap())
-    return Message(f"new map '{map_key}' is selected")
+    return Message(f"created and selected map '{map_key}'")
 
 
 @command("delete_map", "delete", example="delete_map --yes", see_also=("clear_storage",))
 def delete_map(context: CommandContext, map_key: str = "", *, yes: bool = False) -> Message:
-    """Drop a map from memory; its files stay.
+    """Remove a map from memory; its files stay.
 
     Args:
         map_key: Key of the map; empty = the selected one.
-        yes: Do not ask.
+        yes: Do not ask for confirmation.
     """
     key = map_key or context.map_key
     entry = context.maps.get(key)
     note = "" if entry.is_saved else " with its unsaved changes"
-    context.confirm(f"drop map '{key}'{note} from memory?", yes=yes)
+    context.confirm(f"remove map '{key}'{note} from memory?", yes=yes)
     context.maps.remove(key)
-    return Message(f"map '{key}' is dropped{_selection(context)}")
+    return Message(f"removed map '{key}' from memory{_selection(context)}")
 
 
 @command("clear_storage", example="clear_storage --yes", see_also=("delete_map",), needs_map=False)
 def clear_storage(context: CommandContext, *, yes: bool = False) -> Message:
-    """Drop all maps from memory; their files stay.
+    """Remove all maps from memory; their files stay.
 
     Args:
-        yes: Do not ask.
+        yes: Do not ask for confirmation.
     """
     count = len(context.maps)
     if not count:
         return Message("no maps in memory")
     unsaved = ", ".join(entry.key for entry in context.maps.unsaved)
     note = f" (unsaved: {unsaved})" if unsaved else ""
-    context.confirm(f"drop all {count} maps from memory{note}?", yes=yes)
+    context.confirm(f"remove {counted(count, 'map')} from memory{note}?", yes=yes)
     for key in context.maps.keys:
         context.maps.remove(key)
-    return Message(f"{count} maps are dropped")
+    return Message(f"removed {counted(count, 'map')} from memory")
 
 
 @command("rename_map", "rename", example="rename_map --map_key=v1_01")
@@ -117,18 +135,18 @@ def rename_map(context: CommandContext, map_key: str) -> Message:
     """
     old = context.map_key
     context.maps.rename(old, map_key)
-    return Message(f"map '{old}' is now '{map_key}'")
+    return Message(f"renamed map '{old}' to '{map_key}'")
 
 
 @command("copy_map", example="copy_map --target_map_key=experiment")
 def copy_map(context: CommandContext, target_map_key: str) -> Message:
-    """Copy the selected map in memory; the copy is not selected and has no folder of its own.
+    """Copy the selected map in memory; the copy is not selected and has no folder.
 
     Args:
         target_map_key: Key of the copy.
     """
     context.maps.add(target_map_key, context.vi_map, select=False)
-    return Message(f"map '{context.map_key}' is copied to '{target_map_key}'")
+    return Message(f"copied map '{context.map_key}' to '{target_map_key}'")
 
 
 @command("merge_map", example="merge_map --map_key=v1_02", see_also=("join_all_maps",))
@@ -155,7 +173,7 @@ def merge_map(
 def join_all_maps(
     context: CommandContext, target_map_key: str, *, assign_new_ids: bool = False
 ) -> MergeReport:
-    """Merge all maps in memory into a new one and drop them.
+    """Merge all maps in memory into a new map and remove the originals from memory.
 
     Args:
         target_map_key: Key of the new map, which is selected.
@@ -165,7 +183,7 @@ def join_all_maps(
 
     entries = list(context.maps)
     if len(entries) < 2:
-        raise UserError(f"join_all_maps: two or more maps are wanted, {len(entries)} in memory")
+        raise UserError(f"join_all_maps: needs two or more maps, {len(entries)} in memory")
     if target_map_key not in context.maps:
         context.maps.check_new_key(target_map_key)
     joined = entries[0].vi_map
@@ -180,4 +198,4 @@ def join_all_maps(
 
 def _selection(context: CommandContext) -> str:
     key = context.maps.selected_key
-    return f"; '{key}' is selected now" if key else ""
+    return f"; selected: '{key}'" if key else ""

@@ -26,6 +26,7 @@ from maplab_plugins.visualization.maps import (
     visualize_sensor_extrinsics,
     visualize_sequentially,
 )
+from maplab_plugins.visualization.meshes import visualize_mesh
 from maplab_plugins.visualization.output import export_view, save_view, viewer_stop
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "visualize_disparity_maps",
     "visualize_landmark_observers",
     "visualize_loop_closures",
+    "visualize_mesh",
     "visualize_optimized_depth_map_pointclouds",
     "visualize_optimized_depth_maps",
     "visualize_raw_color_images",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.plugin import CommandContext, command
 from maplab_py.viewer.options import PlaybackOptions, PointCloudOptions, VisualizationOptions
 
 if TYPE_CHECKING:
@@ -20,7 +20,12 @@ _CLOUDS = PointCloudOptions()
 _PLAYBACK = PlaybackOptions()
 
 
-@command("visualize_xyz_pointclouds", example="visualize_xyz_pointclouds", acts_outside=True)
+@command(
+    "visualize_xyz_pointclouds",
+    example="visualize_xyz_pointclouds",
+    acts_outside=True,
+    guards_effects=True,
+)
 def visualize_xyz_pointclouds(
     context: CommandContext,
     *,
@@ -32,7 +37,12 @@ def visualize_xyz_pointclouds(
     return _show(context, "point_cloud", clouds, options, viewer)
 
 
-@command("visualize_xyzi_pointclouds", example="visualize_xyzi_pointclouds", acts_outside=True)
+@command(
+    "visualize_xyzi_pointclouds",
+    example="visualize_xyzi_pointclouds",
+    acts_outside=True,
+    guards_effects=True,
+)
 def visualize_xyzi_pointclouds(
     context: CommandContext,
     *,
@@ -44,7 +54,7 @@ def visualize_xyzi_pointclouds(
     return _show(context, "point_cloud_w_intensity", clouds, options, viewer)
 
 
-@command("visualize_xyzi_pointclouds_from_mission", acts_outside=True)
+@command("visualize_xyzi_pointclouds_from_mission", acts_outside=True, guards_effects=True)
 def visualize_xyzi_pointclouds_from_mission(
     context: CommandContext,
     *,
@@ -56,13 +66,13 @@ def visualize_xyzi_pointclouds_from_mission(
     """Show the clouds with intensities of one mission.
 
     Args:
-        map_mission: Mission id or unambiguous prefix; may be left out when there is only one.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     row = context.mission_row(map_mission)
     return _show(context, "point_cloud_w_intensity", clouds, options, viewer, np.array([row]))
 
 
-@command("visualize_xyzi_pointclouds_sequentially", acts_outside=True)
+@command("visualize_xyzi_pointclouds_sequentially", acts_outside=True, guards_effects=True)
 def visualize_xyzi_pointclouds_sequentially(
     context: CommandContext,
     *,
@@ -76,7 +86,10 @@ def visualize_xyzi_pointclouds_sequentially(
 
 
 @command(
-    "visualize_xyzrgbn_pointclouds", example="visualize_xyzrgbn_pointclouds", acts_outside=True
+    "visualize_xyzrgbn_pointclouds",
+    example="visualize_xyzrgbn_pointclouds",
+    acts_outside=True,
+    guards_effects=True,
 )
 def visualize_xyzrgbn_pointclouds(
     context: CommandContext,
@@ -89,7 +102,7 @@ def visualize_xyzrgbn_pointclouds(
     return _show(context, "color_point_cloud", clouds, options, viewer)
 
 
-@command("visualize_raw_depth_map_pointclouds", acts_outside=True)
+@command("visualize_raw_depth_map_pointclouds", acts_outside=True, guards_effects=True)
 def visualize_raw_depth_map_pointclouds(
     context: CommandContext,
     *,
@@ -101,7 +114,7 @@ def visualize_raw_depth_map_pointclouds(
     return _show(context, "raw_depth_maps", clouds, options, viewer)
 
 
-@command("visualize_optimized_depth_map_pointclouds", acts_outside=True)
+@command("visualize_optimized_depth_map_pointclouds", acts_outside=True, guards_effects=True)
 def visualize_optimized_depth_map_pointclouds(
     context: CommandContext,
     *,
@@ -126,7 +139,7 @@ def _show(
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.resource_clouds import load_clouds
 
-    folder = _map_folder(context)
+    folder = context.map_folder or Path()
     loaded = load_clouds(
         context.vi_map, folder, name, clouds, missions=missions, progress=context.progress
     )
@@ -134,14 +147,6 @@ def _show(
         _write(loaded, Path(clouds.export_accumulated_pc_to_ply_path))
     subject = Subject(context.vi_map, context.map_key, options, clouds=loaded)
     return show(context, subject, viewer, playback=playback, plays=playback is not None)
-
-
-def _map_folder(context: CommandContext) -> Path:
-    if context.map_folder is None:
-        raise UserError(
-            f"map '{context.map_key}' was never loaded or saved: it has no resource files"
-        )
-    return context.map_folder
 
 
 def _write(clouds: tuple[Cloud, ...], path: Path) -> None:

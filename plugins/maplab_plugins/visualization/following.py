@@ -9,16 +9,17 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
+from maplab_py.cancellation import check_cancelled, lasting_effect
 from maplab_py.options import option
-from maplab_py.plugin import CommandContext, Report, UserError
-from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.vimap import VIMap
+from maplab_py.plugin import Cancelled, CommandContext, Report, UserError
 
 if TYPE_CHECKING:
-    from maplab_py.console.maps import MapManager
+    from maplab_py.console.session.maps import MapManager
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.display.selection import ImageOf
     from maplab_py.viewer.display.viewer import Viewer
+    from maplab_py.viewer.options import PlaybackOptions
+    from maplab_py.vimap import VIMap
 
 NAME = "viewer"
 
@@ -108,9 +109,13 @@ def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
     if following is not None and not following.viewer.is_stopped:
         return following.viewer
     viewer = Viewer(options.port, is_dark=options.dark)
-    context.session.watchers.set(NAME, Following(viewer))
-    context.announce(NAME, viewer.url)
-    context.announce(NAME, viewer.url)
+    try:
+        with lasting_effect():
+            context.session.watchers.set(NAME, Following(viewer))
+            context.announce(NAME, viewer.url)
+    except Cancelled:
+        viewer.stop()
+        raise
     if options.open_page and context.terminal.is_interactive and _has_desktop():
         import webbrowser
 
@@ -140,6 +145,7 @@ def show(
     began = time.perf_counter()
     viewer = ensure_viewer(context, viewer_options)
     images = image_of or images_of_map(context, subject.vi_map)
+    check_cancelled()
     viewer.show(subject, playback=playback, image_of=images)
     if plays:
         viewer.set_playing(True)

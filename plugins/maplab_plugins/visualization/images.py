@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.plugin import CommandContext, command
 from maplab_py.viewer.options import PlaybackOptions
 
 _VIEWER = ViewerOptions()
@@ -24,7 +25,9 @@ def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewRe
         return _show(context, resource, playback, viewer)
 
     play.__doc__ = f"Play the missions with {what}."
-    return command(f"visualize_{resource}", example=example, acts_outside=True)(play)
+    return command(
+        f"visualize_{resource}", example=example, acts_outside=True, guards_effects=True
+    )(play)
 
 
 visualize_raw_images = _player(
@@ -46,11 +49,7 @@ def _show(
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.resource_clouds import VertexImages, resource_rows
 
-    if context.map_folder is None:
-        raise UserError(
-            f"map '{context.map_key}' was never loaded or saved: it has no resource files"
-        )
     resource_rows(context.vi_map, name)
-    images = VertexImages(context.vi_map, context.map_folder, name)
+    images = VertexImages(context.vi_map, context.map_folder or Path(), name)
     subject = Subject(context.vi_map, context.map_key)
     return show(context, subject, viewer, playback=playback, image_of=images, plays=True)

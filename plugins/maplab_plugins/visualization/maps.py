@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
-from maplab_py.plugin import CommandContext, Report, UserError, command
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, Report, UserError, command
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
-from maplab_py.vimap import VIMap
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
 
 _OPTIONS = VisualizationOptions()
 _VIEWER = ViewerOptions()
@@ -35,6 +38,7 @@ class DifferenceReport(Report):
     example="visualize --vis_color_landmarks_by_height",
     see_also=("visualize_sequentially", "save_view", "export_view", "viewer_stop"),
     acts_outside=True,
+    guards_effects=True,
 )
 def visualize(
     context: CommandContext,
@@ -74,30 +78,30 @@ def visualize(
     example="visualize_sequentially",
     see_also=("visualize",),
     acts_outside=True,
+    guards_effects=True,
 )
 def visualize_sequentially(
     context: CommandContext,
     *,
-    map_mission: str = "",
-    map_mission_list: str = "",
+    chosen: MissionChoice = ALL_MISSIONS,
     options: VisualizationOptions = _OPTIONS,
     playback: PlaybackOptions = _PLAYBACK,
     viewer: ViewerOptions = _VIEWER,
 ) -> ViewReport:
-    """Play the missions in the browser: the map grows as it was recorded.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; empty = all missions.
-        map_mission_list: Several missions, separated by commas.
-    """
+    """Play the missions in the browser: the map grows as it was recorded."""
     from maplab_py.viewer.building import Subject
 
-    chosen = context.mission_rows(map_mission, map_mission_list)
-    subject = Subject(_only(context.vi_map, chosen), context.map_key, options)
+    missions = chosen.rows(context.vi_map)
+    subject = Subject(_only(context.vi_map, missions), context.map_key, options)
     return show(context, subject, viewer, playback=playback, plays=True)
 
 
-@command("visualize_landmark_observers", example="visualize_landmark_observers", acts_outside=True)
+@command(
+    "visualize_landmark_observers",
+    example="visualize_landmark_observers",
+    acts_outside=True,
+    guards_effects=True,
+)
 def visualize_landmark_observers(
     context: CommandContext,
     *,
@@ -111,7 +115,12 @@ def visualize_landmark_observers(
     return show(context, subject, viewer)
 
 
-@command("visualize_sensor_extrinsics", example="visualize_sensor_extrinsics", acts_outside=True)
+@command(
+    "visualize_sensor_extrinsics",
+    example="visualize_sensor_extrinsics",
+    acts_outside=True,
+    guards_effects=True,
+)
 def visualize_sensor_extrinsics(
     context: CommandContext, *, viewer: ViewerOptions = _VIEWER
 ) -> ViewReport:
@@ -122,7 +131,12 @@ def visualize_sensor_extrinsics(
     return show(context, Subject(context.vi_map, title, shows_sensors=True), viewer)
 
 
-@command("visualize_loop_closures", example="visualize_loop_closures", acts_outside=True)
+@command(
+    "visualize_loop_closures",
+    example="visualize_loop_closures",
+    acts_outside=True,
+    guards_effects=True,
+)
 def visualize_loop_closures(
     context: CommandContext,
     *,
@@ -131,9 +145,9 @@ def visualize_loop_closures(
 ) -> ViewReport:
     """Show loop closures on the trajectories: edges by switch value, remembered ones by weight.
 
-    A click on one tells what lc_report does: query, target, inliers, correction, verdict.
+    A click on a closure shows the line of lc_report: query, target, inliers, correction, verdict.
     """
-    from maplab_py.algorithms.loop_closure.record import read_record
+    from maplab_py.algorithms.loop_closure.closure_record import read_record
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.closures import ACCEPTED
 
@@ -154,6 +168,7 @@ def visualize_loop_closures(
     example="visualize_difference --with_snapshot=before",
     see_also=("snapshot", "undo"),
     acts_outside=True,
+    guards_effects=True,
 )
 def visualize_difference(
     context: CommandContext,

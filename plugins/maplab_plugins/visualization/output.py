@@ -28,7 +28,11 @@ class ExportedView(Report):
 
 
 @command(
-    "save_view", example="save_view --file=map.png", see_also=("export_view",), acts_outside=True
+    "save_view",
+    example="save_view --file=map.png",
+    see_also=("export_view",),
+    acts_outside=True,
+    guards_effects=True,
 )
 def save_view(
     context: CommandContext,
@@ -74,7 +78,9 @@ def export_view(context: CommandContext, *, file: Path, overwrite: bool = False)
     return ExportedView(file, running_viewer(context).export(file) * 1e-6)
 
 
-@command("viewer_stop", needs_map=False, see_also=("visualize",), acts_outside=True)
+@command(
+    "viewer_stop", needs_map=False, see_also=("visualize",), acts_outside=True, guards_effects=True
+)
 def viewer_stop(context: CommandContext) -> Message:
     """Stop the viewer; its page stays open and shows nothing new."""
     url = running_viewer(context).url

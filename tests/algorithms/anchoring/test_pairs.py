@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.anchoring.alignment import Sightings
+from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
-from maplab_py.algorithms.anchoring.pairs import USED, align_pairs, consistent
+from maplab_py.algorithms.anchoring.pairs import USED, align_pairs, consistent, strongest_pairs
 from maplab_py.geometry import yaw
 
 OPTIONS = AnchoringOptions()
@@ -35,14 +35,13 @@ def sightings(counts, wrong=(), seed=0):
     )  # fmt: skip
 
 
-def verdicts(counts, wrong=(), missions=4):
-    none = np.zeros((missions, missions), dtype=np.int64)
-    pairs = consistent(align_pairs(sightings(counts, wrong), none, OPTIONS), OPTIONS, list("wxyz"))
+def verdicts(counts, wrong=()):
+    pairs = consistent(align_pairs(sightings(counts, wrong), {}, OPTIONS), OPTIONS, list("wxyz"))
     return {(p.a, p.b): p.verdict for p in pairs}
 
 
 def test_alignments_are_where_the_missions_are():
-    pairs = align_pairs(sightings({(0, 1): 20, (1, 2): 20}), np.zeros((4, 4), int), OPTIONS)
+    pairs = align_pairs(sightings({(0, 1): 20, (1, 2): 20}), {}, OPTIONS)
     for p in pairs:
         expected = yaw.compose(yaw.inverse(PLACES[p.b]), PLACES[p.a])
         np.testing.assert_allclose(p.T_B_A, expected, atol=0.06)
@@ -64,28 +63,74 @@ def test_one_wrong_pair_among_four_missions_is_found_even_when_it_is_the_stronge
 
 
 def test_three_missions_that_contradict_leave_only_what_is_clearly_stronger():
-    equal = verdicts({(0, 1): 20, (1, 2): 20, (0, 2): 18}, wrong=[(0, 2)], missions=3)
+    equal = verdicts({(0, 1): 20, (1, 2): 20, (0, 2): 18}, wrong=[(0, 2)])
     assert USED not in equal.values()
-    strong = verdicts({(0, 1): 50, (1, 2): 50, (0, 2): 10}, wrong=[(0, 2)], missions=3)
+    strong = verdicts({(0, 1): 50, (1, 2): 50, (0, 2): 10}, wrong=[(0, 2)])
     assert strong[0, 1] == strong[1, 2] == USED
     assert "contradicts the others among w, x, y" in strong[0, 2]
 
 
 def test_pairs_that_only_look_alike_are_named():
-    alike = np.zeros((4, 4), dtype=np.int64)
-    alike[2, 3] = 17
-    pairs = align_pairs(sightings({(0, 1): 20}), alike, OPTIONS)
+    undecided = {(2, 3): "17 places that look alike"}
+    pairs = align_pairs(sightings({(0, 1): 20}), undecided, OPTIONS)
     verdict = {(p.a, p.b): p.verdict for p in pairs}
     assert verdict[0, 1] == USED
-    assert verdict[2, 3].startswith("17 closures with places that look like other places")
+    assert verdict[2, 3] == "17 places that look alike"
 
 
 def test_too_few_or_too_divided_closures_are_no_alignment():
-    few = align_pairs(sightings({(0, 1): 3}), np.zeros((4, 4), int), OPTIONS)
-    assert few[0].verdict == "3 closures agree, 4 are wanted"
+    few = align_pairs(sightings({(0, 1): 3}), {}, OPTIONS)
+    assert few[0].verdict == "3 closures agree, 4 are needed"
     T = sightings({(0, 1): 30})
     moved = T.T_B_I.copy()
     moved[::2, 4:] += np.random.default_rng(1).uniform(5, 50, (15, 3))
     moved[::3, 4:] -= np.random.default_rng(2).uniform(5, 50, (10, 3))
     divided = Sightings(T.mission_A, T.mission_B, T.T_A_I, moved, T.weight)
-    assert "closures agree" in align_pairs(divided, np.zeros((4, 4), int), OPTIONS)[0].verdict
+    assert "closures agree" in align_pairs(divided, {}, OPTIONS)[0].verdict
+
+
+def test_few_missions_keep_all_their_pairs():
+    every = dict.fromkeys(itertools.combinations(range(4), 2), 20)
+    assert strongest_pairs(sightings(every), 4) == set(every)
+
+
+def test_of_many_missions_each_keeps_its_strongest_pairs_and_none_is_cut_off():
+    # 30 missions that all see each other, and a chain of three that hangs on by weak pairs
+    count = 30
+    pairs = list(itertools.combinations(range(count), 2))
+    chain = [(count - 1, count), (count, count + 1), (count + 1, count + 2)]
+    A, B = np.array(pairs + chain).T
+    weight = np.append(np.random.default_rng(0).uniform(10.0, 50.0, len(pairs)), [1.0, 1.0, 1.0])
+    T = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(A), 1))
+    chosen = strongest_pairs(Sightings(A, B, T, T, weight), count + 3)
+    assert set(chain) <= chosen
+    assert 10 * count / 2 <= len(chosen) <= 10 * count + 3
+    strongest = max(range(len(pairs)), key=lambda i: weight[i])
+    assert pairs[strongest] in chosen
+
+
+def test_the_joint_fit_is_a_minimum():
+    T = sightings({(0, 1): 30, (1, 2): 30, (0, 2): 10}, wrong=[(0, 2)])
+    fixed = np.array([True, False, False, True])
+    fitted = fit_missions(T, PLACES + 0.05, fixed)
+    np.testing.assert_array_equal(fitted[fixed], PLACES[fixed] + 0.05)
+    lowest = cost(T, fitted)
+    for mission, column in itertools.product((1, 2), range(4)):
+        for step in (-1e-3, 1e-3):
+            moved = fitted.copy()
+            moved[mission, column] += step
+            assert cost(T, moved) > lowest
+
+
+def cost(s, T_G_M):
+    """Return the robust cost as it is defined, closure by closure."""
+    total = 0.0
+    for a, b, T_A_I, T_B_I, weight in zip(
+        s.mission_A, s.mission_B, s.T_A_I, s.T_B_I, s.weight, strict=True
+    ):
+        gap = yaw.transform(T_G_M[a], T_A_I[4:]) - yaw.transform(T_G_M[b], T_B_I[4:])
+        measured = yaw.from_pose(T_B_I)[3] - yaw.from_pose(T_A_I)[3]
+        turn = yaw.wrap(T_G_M[a, 3] - T_G_M[b, 3] - measured)
+        whitened = np.append(gap / 0.1, turn / 0.02) * np.sqrt(weight / s.weight.mean())
+        total += np.sum(2.0 * (np.sqrt(1.0 + whitened**2) - 1.0))
+    return total

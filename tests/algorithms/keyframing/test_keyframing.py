@@ -4,6 +4,8 @@ import pytest
 from maplab_py.algorithms.keyframing.heuristic import Reason, choose_keyframes, keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.errors import FlagError
+from maplab_py.geometry import se3, so3
+from maplab_py.vimap import AbsolutePoses, LoopClosureEdges
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.merge import merge_maps
 from tests.vimap.builders import walk_map
@@ -41,14 +43,6 @@ def test_keyframing_keeps_ends_and_chains_and_counts():
     assert report.observations_removed == len(m.observations) - len(thin.observations)
 
 
-def test_a_dry_run_changes_nothing():
-    m = walk_map()
-    same, report = keyframe(m, KeyframingOptions(**LOOSE), dry_run=True)
-    assert same is m
-    assert report.vertices_after == 6
-    assert report.dry_run
-
-
 def test_other_missions_are_left_alone():
     m, _ = merge_maps(walk_map(), walk_map(seed=1))
     thin, _ = keyframe(m, KeyframingOptions(**LOOSE), missions=np.array([1]))
@@ -60,3 +54,52 @@ def test_bad_thresholds_are_refused():
         KeyframingOptions(every_nth_vertex=0)
     with pytest.raises(FlagError, match="distance"):
         KeyframingOptions(distance_threshold_m=-1.0)
+
+
+def straight_map(step_m=0.25, turn_deg=0.0):
+    """Return a walk whose vertices are exactly as far apart as is said."""
+    m = walk_map()
+    steps = np.arange(len(m.vertices))
+    turn = np.deg2rad(turn_deg) * steps[:, None] * [0.0, 0.0, 1.0]
+    T_M_I = se3.make(so3.exp(turn), steps[:, None] * [step_m, 0.0, 0.0])
+    return m.replace(
+        vertices=m.vertices.replace(T_M_I=T_M_I),
+        loop_closure_edges=LoopClosureEdges.empty(),
+        absolute_poses=AbsolutePoses.empty(),
+    )
+
+
+def test_distances_of_exactly_the_threshold_are_not_enough():
+    # multiples of 0.25 m are exact in floating point: 0.75 m is reached at the third vertex
+    chosen = choose_keyframes(
+        straight_map(), KeyframingOptions(**{**LOOSE, "distance_threshold_m": 0.75})
+    )
+    assert np.flatnonzero(chosen == Reason.DISTANCE).tolist() == [4, 8]
+
+
+def test_rotations_of_exactly_the_threshold_are_not_enough():
+    turned = straight_map(step_m=0.0, turn_deg=3.0)
+    T = turned.vertices.T_M_I
+    exact_deg = float(np.rad2deg(np.linalg.norm(se3.local(T[0], T[2])[3:])))
+    chosen = choose_keyframes(
+        turned, KeyframingOptions(**{**LOOSE, "rotation_threshold_deg": exact_deg})
+    )
+    assert np.flatnonzero(chosen == Reason.ROTATION)[0] == 3
+
+
+def test_the_nth_vertex_itself_is_a_keyframe():
+    chosen = choose_keyframes(straight_map(), KeyframingOptions(**{**LOOSE, "every_nth_vertex": 4}))
+    assert np.flatnonzero(chosen == Reason.EVERY_NTH).tolist() == [4, 8]
+
+
+def test_as_many_shared_landmarks_as_wanted_are_enough():
+    m = straight_map()
+    observed = [
+        set(m.keypoints.landmark[(m.keypoint_vertex == row) & (m.keypoints.landmark >= 0)])
+        for row in (0, 1)
+    ]
+    shared = len(observed[0] & observed[1])
+    assert shared > 0
+    for wanted, reason in ((shared, Reason.NONE), (shared + 1, Reason.FEW_SHARED_LANDMARKS)):
+        options = KeyframingOptions(**{**LOOSE, "min_shared_landmarks_obs": wanted})
+        assert choose_keyframes(m, options)[1] == reason

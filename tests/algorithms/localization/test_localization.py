@@ -22,7 +22,8 @@ from maplab_py.algorithms.localization.localization import (
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.localization.queries import queries, query_vertices
-from maplab_py.algorithms.localization.reference import ground_truth, own_trajectory
+from maplab_py.algorithms.localization.reference import ground_truth, trajectory_of_queries
+from maplab_py.algorithms.localization.result_file import csv_lines
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.errors import EstimationError, FlagError, UserError
@@ -30,8 +31,10 @@ from maplab_py.geometry import se3, so3
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import IdIndex
 from maplab_py.vision.descriptors import pack_words
+from tests.support.noiseless import without_noise
 
 OPTIONS = LocalizationOptions()
 
@@ -47,7 +50,7 @@ def sessions() -> tuple[VIMap, VIMap, np.ndarray, np.ndarray]:
             SessionOptions(duration_s=5.0, turns=0.3, start_turn=0.2, height_m=1.7),
         ),
     )
-    scenario = dataclasses.replace(scenario, drift=scenario.without_noise().drift)
+    scenario = dataclasses.replace(scenario, drift=without_noise(scenario).drift)
     data = simulate(scenario)
     truth = [data.truth.T_G_I[IdIndex(data.truth.vertex_id).rows(m.vertices.id)] for m in data.maps]
     # the stored base frame means nothing: put the mission where it was
@@ -250,12 +253,12 @@ def test_references_align_the_frames():
 def test_an_unknown_base_frame_is_laid_on_the_answers():
     _, query, _, _ = sessions()
     found = localize_missions(database("full"), query, OPTIONS)
-    reference, T_R_G = own_trajectory(query, found)
+    reference, T_R_G = trajectory_of_queries(query, found)
     assert not query.baseframes.is_known.any()
     assert T_R_G is not None
     assert np.nanmedian(pose_errors(found, reference, T_R_G)[0]) < 0.05
     known = query.replace(baseframes=query.baseframes.replace(is_known=[True]))
-    _, T_R_G = own_trajectory(known, found)
+    _, T_R_G = trajectory_of_queries(known, found)
     np.testing.assert_array_equal(T_R_G, se3.identity())
 
 
@@ -277,6 +280,22 @@ def test_nonsense_is_refused():
     with pytest.raises(UserError, match="projection"):
         database_of_summary(dataclasses.replace(summary, projection=None))
     short = query.keypoints.replace(descriptor=query.keypoints.descriptor[:, :32])
-    sizes = query.frames.replace(descriptor_size=np.full(len(query.frames), 32))
+    sizes = query.frames.replace(descriptor_blocks=binary_blocks(query.frames.keypoint_count, 32))
     with pytest.raises(EstimationError, match="32"):
         localize_missions(database("full"), query.replace(keypoints=short, frames=sizes), OPTIONS)
+
+
+def test_errors_are_empty_in_the_table_where_the_frames_are_not_aligned():
+    query = sessions()[1]
+    answers = localize_missions(database("full"), query, OPTIONS)
+    reference, T_R_G = trajectory_of_queries(query, answers)
+    assert T_R_G is not None
+    header, *lines = csv_lines(query, answers, reference, T_R_G)
+    columns = header.strip().split(",")
+    error = columns.index("position_error_m")
+    assert len(lines) == len(answers.vertex)
+    has_error = [line.split(",")[error] != "" for line in lines]
+    assert has_error == (answers.is_localized & reference.is_known).tolist()
+    for line in csv_lines(query, answers, reference, None)[1:]:
+        assert len(line.split(",")) == len(columns)
+        assert line.split(",")[error] == ""

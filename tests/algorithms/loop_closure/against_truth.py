@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.geometry import se3
 from maplab_py.simulation.merge_evaluation import sightings
 from maplab_py.simulation.scenario import Scenario
@@ -40,7 +40,7 @@ def flip(vi_map: VIMap, share: float, seed: int) -> VIMap:
     rng = np.random.default_rng(seed)
     descriptor = vi_map.keypoints.descriptor
     mask = np.packbits(rng.random((len(descriptor), 8 * descriptor.shape[1])) < share, axis=1)
-    size = vi_map.frames.descriptor_size[vi_map.keypoint_frame]
+    size = vi_map.binary_descriptor_size
     mask[np.arange(descriptor.shape[1])[None] >= size[:, None]] = 0
     return vi_map.replace(keypoints=vi_map.keypoints.replace(descriptor=descriptor ^ mask))
 

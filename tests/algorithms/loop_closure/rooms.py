@@ -22,6 +22,7 @@ from maplab_py.vimap import (
     Vertices,
     VIMap,
 )
+from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import from_hex, random_ids
 
 IMU_ID, RIG_ID, CAMERA_ID = "1" * 32, "2" * 32, "3" * 32
@@ -173,7 +174,7 @@ class _Recorder:
                 vertex=np.arange(count),
                 timestamp_ns=self.time_ns,
                 keypoint_count=keypoints,
-                descriptor_size=np.full(count, 48),
+                descriptor_blocks=binary_blocks(keypoints, 48),
             ),
             "keypoints": Keypoints.filled(
                 sum(keypoints),

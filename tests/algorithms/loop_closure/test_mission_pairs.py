@@ -1,3 +1,5 @@
+"""Alignments that closures between two missions vote for, and when one of them wins."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -5,78 +7,207 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure.mission_pairs import (
-    PairedClosures,
-    PairRule,
-    without_alignment,
+from maplab_py.algorithms.loop_closure.alignment_contest import (
+    AlignmentChoice,
+    ContestRule,
+    decide,
+    listed_alignments,
+    with_choice,
 )
+from maplab_py.algorithms.loop_closure.mission_alignment import (
+    AgreementRule,
+    PairedClosures,
+    alignments_of_pairs,
+)
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3, yaw
+from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap
+from maplab_py.vimap.ids import random_ids
 
-RULE = PairRule(drift_offset_m=0.5, drift_ratio=0.1, max_share=0.25)
+RULE = AgreementRule()
+CONTEST = ContestRule(max_share=0.1)
+LENGTH_M = 60.0
+HERE, THERE = [1.0, 2.0, 0.0, 0.4], [21.0, 2.0, 0.0, 0.4]  # 20 m apart in frame B
 
 
-def closures(alignments, *, seed=0, mission=(0, 1), noise_m=0.05):
-    """Return closures whose queries walk a line; each tells the given T_B_A (N, 4)."""
-    rng = np.random.default_rng(seed)
-    T_B_A = np.asarray(alignments, dtype=float)
-    count = len(T_B_A)
-    way = np.linspace(0.0, 10.0, count)
-    p_A = np.stack([way, np.sin(way), np.zeros(count)], axis=1)
-    T_A_I = se3.make(yaw.quaternion(0.1 * way), p_A)
+def lines(missions: int) -> VIMap:
+    """Return missions that walk a line of 60 m."""
+    rng = np.random.default_rng(0)
+    p = np.stack([np.arange(LENGTH_M), np.zeros(60), np.zeros(60)], axis=1)
+    T_M_I = np.tile(se3.make(so3_identity(60), p), (missions, 1))
+    return VIMap(
+        missions=Missions.filled(
+            missions,
+            id=random_ids(missions, rng),
+            baseframe=np.arange(missions),
+            root_vertex=60 * np.arange(missions),
+        ),
+        baseframes=BaseFrames.filled(missions, id=random_ids(missions, rng)),
+        vertices=Vertices.filled(
+            60 * missions,
+            id=random_ids(60 * missions, rng),
+            mission=np.repeat(np.arange(missions), 60),
+            T_M_I=T_M_I,
+            timestamp_ns=np.tile(np.arange(60) * 10**9, missions),
+        ),
+    )
+
+
+def so3_identity(count: int) -> np.ndarray:
+    return np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+
+
+def closures(way_m, alignment, *, mission=(0, 1), noise_m=0.05, drift=0.0) -> PairedClosures:
+    """Return closures of queries that walk frame A's x axis; each tells the given T_B_A."""
+    way = np.asarray(way_m, dtype=float)
+    rng = np.random.default_rng(len(way))
+    T_B_A = np.tile(np.asarray(alignment, dtype=float), (len(way), 1))
+    T_B_A[:, 1] += drift * way
+    T_A_I = se3.make(so3_identity(len(way)), np.stack([way, 0 * way, 0 * way], axis=1))
     T_B_I = se3.compose(yaw.to_pose(T_B_A), T_A_I)
-    T_B_I[:, 4:] += rng.normal(scale=noise_m, size=(count, 3))
-    ends = tuple(np.full(count, m) for m in mission)
-    return PairedClosures.of(ends, (T_A_I, T_B_I), (way, way), np.full(count, 40.0))
+    way_B = T_B_I[:, 4] / np.cos(0.4)
+    T_B_I[:, 4:] += rng.normal(scale=noise_m, size=(len(way), 3))
+    stretch = tuple(
+        (100 * m + np.floor(w)).astype(np.int64) for m, w in zip(mission, (way, way_B), strict=True)
+    )
+    ends = tuple(np.full(len(way), m) for m in mission)
+    return PairedClosures.of(ends, (T_A_I, T_B_I), (way, way_B), stretch, np.full(len(way), 40.0))
 
 
-def refused(c, looks_alike=0):
-    count = len(c.weight)
-    alike = np.arange(count) < looks_alike
-    return without_alignment(c, ~alike, alike, RULE)[looks_alike:]
+def join(*parts: PairedClosures) -> PairedClosures:
+    names = [field.name for field in dataclasses.fields(PairedClosures)]
+    return PairedClosures(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
-HERE, THERE = [1.0, 2.0, 0.0, 0.4], [10.0, 2.0, 0.0, 0.4]
+def contests(c: PairedClosures, missions: int = 2):
+    vi_map = lines(missions)
+    pairs = alignments_of_pairs(c, np.ones(len(c.weight), dtype=bool), RULE)
+    stretch = np.concatenate([100 * m + np.arange(60) for m in range(missions)])
+    return decide(vi_map, pairs, stretch, CONTEST, [f"m{i}" for i in range(missions)])
 
 
-def test_closures_of_one_alignment_stay():
-    assert not refused(closures([HERE] * 40)).any()
+def metres(begin: float, end: float) -> np.ndarray:
+    return np.arange(begin, end, 0.5)
+
+
+def test_closures_of_one_alignment_win():
+    (contest,) = contests(closures(metres(0, 20), HERE))
+    assert contest.winner == 0
+    np.testing.assert_allclose(contest.pair.alignments[0].T_B_A, HERE, atol=0.2)
+    assert contest.accepted.tolist() == list(range(40))
 
 
 def test_a_few_that_contradict_are_refused_alone():
-    result = refused(closures([HERE] * 36 + [THERE] * 4))
-    assert result.tolist() == [False] * 36 + [True] * 4
+    (contest,) = contests(join(closures(metres(0, 30), HERE), closures([3.0, 3.5, 3.9], THERE)))
+    assert contest.winner == 0
+    assert contest.accepted.tolist() == list(range(60))
 
 
-@pytest.mark.parametrize("rivals", [12, 20])
-def test_two_alignments_with_a_following_refuse_each_other(rivals):
-    assert refused(closures([HERE] * (40 - rivals) + [THERE] * rivals)).all()
+def test_the_alignment_that_explains_both_rooms_wins_against_those_that_exchange_them():
+    # rooms at 0 to 15 and 20 to 35 m, a corridor between; closures of each room with the other too
+    truth = closures(metres(0, 35), HERE)
+    forth = closures(metres(0, 15), THERE)
+    back = closures(metres(20, 35), (yaw.compose(HERE, [-20.0, 0, 0, 0])))
+    (contest,) = contests(join(truth, forth, back))
+    assert contest.winner == 0
+    assert contest.accepted.tolist() == list(range(70))
+    assert len(contest.pair.alignments) == 3
 
 
-def test_many_queries_that_fit_several_places_refuse_the_whole_pair():
-    assert not refused(closures([HERE] * 50), looks_alike=9).any()
-    assert refused(closures([HERE] * 50), looks_alike=20).all()
+def test_a_mission_of_one_room_is_not_aligned_with_one_of_both():
+    # mission 0 was in one room, mission 1 in both: its queries fit the two equally well
+    both = join(closures(metres(0, 15), HERE), closures(metres(0, 15), THERE))
+    (contest,) = contests(both)
+    assert contest.winner == -1
+    assert "look like other places" in contest.reason
+    assert len(contest.accepted) == 0
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_time_spent_in_either_room_is_no_evidence(share):
+    rows = metres(0, 15)
+    part = closures(rows[: round(share * len(rows))], THERE)
+    (contest,) = contests(join(closures(rows, HERE), part))
+    assert contest.winner == -1
+
+
+def test_a_third_mission_reveals_that_places_look_alike():
+    # 0 and 1 agree on one alignment, but 2 saw two rooms that 0 cannot distinguish
+    pair = closures(metres(0, 15), HERE)
+    third = [closures(metres(0, 15), to, mission=(0, 2)) for to in (HERE, THERE)]
+    first, second = contests(join(pair, *third), missions=3)
+    assert first.winner == second.winner == -1
+    assert "mission m2 shows" in first.reason
 
 
 def test_drift_along_the_way_is_no_contradiction():
-    bent = np.array([HERE] * 40)
-    bent[:, 0] += np.linspace(0.0, 1.2, 40)
-    assert not refused(closures(bent)).any()
+    (contest,) = contests(closures(metres(0, 40), HERE, drift=0.03))
+    assert len(contest.accepted) == 80
 
 
 def test_direction_of_the_search_does_not_matter():
-    one = closures([HERE] * 30 + [THERE] * 3)
-    other = closures([HERE] * 30 + [THERE] * 3, mission=(1, 0))
-    assert other.mission_A.tolist() == one.mission_A.tolist()
-    np.testing.assert_array_equal(other.T_A_I, one.T_B_I)
-    assert refused(other).tolist() == refused(one).tolist()
+    forth = closures(metres(0, 20), HERE)
+    ends = (forth.mission_B, forth.mission_A)
+    back = PairedClosures.of(
+        ends,
+        (forth.T_B_I, forth.T_A_I),
+        (forth.way_B_m, forth.way_A_m),
+        (forth.stretch_B, forth.stretch_A),
+        forth.weight,
+    )
+    for field in dataclasses.fields(PairedClosures):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(forth, field.name))
 
 
 def test_pairs_are_judged_one_by_one():
-    good, bad = closures([HERE] * 20), closures([HERE] * 10 + [THERE] * 10, mission=(0, 2))
-    both = PairedClosures(
-        *(
-            np.concatenate([getattr(good, field.name), getattr(bad, field.name)])
-            for field in dataclasses.fields(PairedClosures)
-        )
-    )
-    assert refused(both).tolist() == [False] * 20 + [True] * 20
+    bad = [closures(metres(0, 15), to, mission=(0, 2)) for to in (HERE, THERE)]
+    good = closures(metres(30, 50), HERE)
+    assert [c.winner for c in contests(join(good, *bad), missions=3)] == [0, -1]
+
+
+def test_the_order_of_the_closures_does_not_matter():
+    c = join(closures(metres(0, 30), HERE), closures(metres(0, 15), THERE))
+    order = np.random.default_rng(3).permutation(len(c.weight))
+    (one,), (other,) = contests(c), contests(c.take(order))
+    assert one.winner == other.winner
+    assert [a.support for a in one.pair.alignments] == [a.support for a in other.pair.alignments]
+
+
+def test_a_person_decides_by_number_or_by_pose():
+    undecided = contests(join(closures(metres(0, 15), HERE), closures(metres(0, 15), THERE)))
+    assert listed_alignments(undecided) == [(0, 0), (0, 1)]
+    for number in (1, 2):
+        (chosen,) = with_choice(undecided, AlignmentChoice(number))
+        assert chosen.winner == number - 1
+        assert len(chosen.accepted) == 30
+    near = AlignmentChoice(missions=(0, 1), T_B_A=np.array([20.0, 2.5, 0.0, 0.3]))
+    (chosen,) = with_choice(undecided, near)
+    np.testing.assert_allclose(chosen.pair.alignments[chosen.winner].T_B_A, THERE, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (AlignmentChoice(3), "--anchor_hypothesis=3: the alignments are from 1 to 2"),
+        (AlignmentChoice(-1), "--anchor_hypothesis=-1"),
+        (AlignmentChoice(missions=(0, 1), T_B_A=np.array([8.0, 2, 0, 0.4])), "the nearest is [67]"),
+        (AlignmentChoice(missions=(1, 2)), "no verified closure joins"),
+    ],
+)
+def test_an_impossible_choice_is_refused(choice, message):
+    undecided = contests(join(closures(metres(0, 15), HERE), closures(metres(0, 15), THERE)))
+    with pytest.raises(UserError, match=message):
+        with_choice(undecided, choice)
+
+
+def test_a_choice_without_doubt_is_refused():
+    with pytest.raises(UserError, match="no alignment is in doubt"):
+        with_choice(contests(closures(metres(0, 20), HERE)), AlignmentChoice(1))
+
+
+def test_closures_that_contain_no_number_support_nothing():
+    c = closures(metres(0, 20), HERE)
+    c.T_B_I[5] = np.nan
+    (contest,) = contests(c)
+    assert contest.winner == 0
+    assert 5 not in contest.accepted

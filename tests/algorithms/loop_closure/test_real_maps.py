@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import close_loops, find_loop_closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3, so3

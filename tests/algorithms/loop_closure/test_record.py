@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure.closing import close_loops, insert_edges
+from maplab_py.algorithms.loop_closure.closure_record import FIELD_NUMBER, drop_record, read_record
 from maplab_py.algorithms.loop_closure.listing import find_closures, list_closures, write_closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record import FIELD_NUMBER, drop_record, read_record
 from maplab_py.algorithms.loop_closure.removal import remove_closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 from maplab_py.errors import MapError, UserError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from maplab_py.algorithms.loop_closure.closing import search_loops
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from tests.algorithms.loop_closure.against_truth import score, sessions
 
 pytestmark = pytest.mark.slow

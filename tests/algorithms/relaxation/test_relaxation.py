@@ -70,7 +70,7 @@ def test_false_edges_of_the_scenario(seed):
     distance = [off.error_m for off in report.worst]
     assert distance == sorted(distance, reverse=True)
     assert min(distance) > 0.5
-    told = report.as_json()
+    told = report.as_dict()
     assert told["worst"][0]["closure"] == report.worst[0].closure
     assert told["num_switched_off"] == 20
     assert 0.0 < told["mean_correction_m"] < told["max_correction_m"]

@@ -9,9 +9,13 @@ import pytest
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
 from maplab_py.algorithms.self_calibration.comparison import compare
-from maplab_py.algorithms.self_calibration.database import device_of
-from maplab_py.algorithms.self_calibration.problem import pose
-from maplab_py.algorithms.self_calibration.segments import cut, restricted
+from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
+from maplab_py.algorithms.self_calibration.segments.splitting import (
+    extract_submap,
+    split_into_segments,
+)
+from maplab_py.algorithms.self_calibration.uncertainty.model import Verdict
 from maplab_py.errors import EstimationError
 from maplab_py.sensors import Distortion
 from maplab_py.vimap.edits import with_new_ids
@@ -45,8 +49,8 @@ def test_only_the_missions_that_were_asked_for_take_part() -> None:
 def test_without_noise_segments_alone_are_enough() -> None:
     truth = scene_map(vertices=61)
     start = uncalibrated(truth)
-    rows = cut(start, None, 20)
-    result, report = calibrate(restricted(start, np.concatenate([rows[0], rows[2]])), EXACT)
+    rows = split_into_segments(start, None, 20)
+    result, report = calibrate(extract_submap(start, np.concatenate([rows[0], rows[2]])), EXACT)
     assert report.gaps == 1
     ids = device_of(truth)
     compared = compare(truth.sensors, ids, result.sensors, ids)
@@ -60,8 +64,8 @@ def error_and_covariance(seed: int) -> tuple[np.ndarray, np.ndarray]:
     # no prior: the device's deviations are the same in all seeds, so it would shrink the errors
     options = dataclasses.replace(EXACT, num_iterations=30, function_tolerance=1e-7)
     result, _ = calibrate(uncalibrated(truth, seed), options)
-    true = pose(truth, options).posed.states.blocks
-    return result.parameters.difference(result.states.blocks, true), result.covariance
+    true = build_segment_problem(truth, options).states.blocks
+    return result.parameters.difference(result.blocks, true), result.uncertainty.formal
 
 
 @pytest.mark.slow
@@ -105,7 +109,8 @@ def test_unobservable_directions_stay_at_their_prior() -> None:
     result, report = calibrate(standing(), OPTIONS_ALL)
     assert len(report.unobservable) >= 8
     moved = np.abs(result.change) / result.parameters.prior_sigma
-    unknown = [k for k, one in enumerate(report.parameters) if "not excited" in one.verdict]
+    not_excited = Verdict.NOT_EXCITED.text()
+    unknown = [k for k, one in enumerate(report.parameters) if one.verdict == not_excited]
     assert unknown
     assert moved[unknown].max() <= 0.2
 

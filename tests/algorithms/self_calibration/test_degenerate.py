@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
-from maplab_py.algorithms.self_calibration.collection import collect
+from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.problem import pose
+from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.errors import EstimationError
 from maplab_py.simulation.scenario import MotionOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
@@ -53,6 +53,8 @@ def test_turning_among_other_motion_does_not_spoil_the_calibration() -> None:
     options = SelfCalibrationOptions()
     database, _ = collect(data.maps[0], options)
     result, _ = calibrate(database.vi_map, options)
-    truth = pose(true_map(data.maps[0], data.truth), options, robust=False).posed.states.blocks
-    off = result.parameters.difference(result.states.blocks, truth)
-    assert np.abs(off / np.sqrt(np.diag(result.covariance))).max() <= 3.5
+    truth = build_segment_problem(
+        true_map(data.maps[0], data.truth), options, robust=False
+    ).states.blocks
+    off = result.parameters.difference(result.blocks, truth)
+    assert np.abs(off / np.sqrt(np.diag(result.uncertainty.formal))).max() <= 3.5

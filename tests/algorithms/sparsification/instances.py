@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem, prices
+from maplab_py.algorithms.sparsification.coverage import CoverageProblem, level_values
 
 
 def corridor(
@@ -46,7 +46,7 @@ def corridor(
         weight=weight,
         wanted=np.minimum(available, wanted),
         base=np.zeros(keyframes),
-        price=prices(levels),
+        level_value=level_values(levels),
         full=float(wanted),
         keep=keep,
     )

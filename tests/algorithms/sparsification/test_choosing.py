@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.sparsification.coverage import prices
+from maplab_py.algorithms.sparsification.coverage import level_values
 from maplab_py.algorithms.sparsification.greedy import (
     choose_greedily,
     choose_most_observed,
@@ -96,7 +96,7 @@ def test_a_restricted_problem_counts_what_the_others_cover():
 
 
 def test_prices_double_from_part_to_part():
-    assert prices(3).tolist() == [4.0, 2.0, 1.0]
+    assert level_values(3).tolist() == [4.0, 2.0, 1.0]
     problem = corridor(50, 10, 5, wanted=6, levels=3)
     worth = problem.value(np.array([0.0, 1.0, 2.0, 3.0, 6.0, 9.0]), np.full(6, 6.0))
     assert worth.tolist() == [0.0, 4.0, 8.0, 10.0, 14.0, 14.0]

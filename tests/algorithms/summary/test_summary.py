@@ -15,6 +15,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
 from tests.simulation.small import SMALL, simulated
+from tests.support.noiseless import without_noise
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +111,7 @@ def test_observations_can_be_limited(vi_map):
 
 def test_covariances_tell_how_far_landmarks_err():
     """Errors of landmarks seen from true poses, whitened by their covariances, are of unit size."""
-    true_poses = dataclasses.replace(SMALL, drift=SMALL.without_noise().drift)
+    true_poses = dataclasses.replace(SMALL, drift=without_noise(SMALL).drift)
     data = simulated(true_poses)
     vi_map = data.maps[0]
     baseframes = vi_map.baseframes.replace(T_G_M=data.truth.T_G_M[:1])

@@ -11,7 +11,7 @@ import pytest
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.report import VIOptimizationReport
+from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.progress import SilentProgress
 from maplab_py.vimap import VIMap

@@ -43,7 +43,7 @@ def test_errors_against_truth_fall() -> None:
 
 def test_only_position_and_heading_of_one_vertex_are_fixed() -> None:
     result, report = optimize(session(), OPTIONS)
-    assert report.gauge == "position and heading of 1 cluster(s)"
+    assert report.gauge == "position and heading of 1 cluster"
     first = session().T_G_I[0], result.T_G_I[0]
     np.testing.assert_array_equal(first[0][4:], first[1][4:])
     turned = so3.log(so3.multiply(first[1][:4], so3.inverse(first[0][:4])))
@@ -120,9 +120,9 @@ def test_nothing_to_optimise_is_said() -> None:
 
 
 def test_failed_factorisations_are_named_by_the_map() -> None:
-    from maplab_py.algorithms.vi_optimization.building import build
-    from maplab_py.algorithms.vi_optimization.reporting import make_report
-    from maplab_py.estimation.solver import SolverSummary
+    from maplab_py.algorithms.vi_optimization.map_problem import build
+    from maplab_py.algorithms.vi_optimization.report_building import make_report
+    from maplab_py.estimation.problem.solver import SolverSummary
     from maplab_py.estimation.states import NODES_PER_VERTEX, VELOCITY
     from maplab_py.vimap.ids import to_hex
 

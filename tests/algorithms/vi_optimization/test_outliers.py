@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.vi_optimization.data_selection import observations, select
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.selection import observations, select
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.edits import remove_observations
 from tests.support.scene import Scene, corrupted

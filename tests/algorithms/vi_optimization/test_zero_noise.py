@@ -88,7 +88,7 @@ def test_samples_fit_the_discrete_integration(name: str) -> None:
 def test_disturbed_map_returns_to_the_truth(name: str) -> None:
     truth = SCENES[name].make()
     result, report = optimize(disturbed(truth), EXACT)
-    assert report.gauge == "position and heading of 1 cluster(s)"
+    assert report.gauge == "position and heading of 1 cluster"
     assert report.observations_not_used == report.observations_rejected == 0
     T_G_I = aligned(result.T_G_I, truth.T_G_I)
     assert np.abs(se3.local(truth.T_G_I, T_G_I)).max() <= 1e-8
@@ -102,7 +102,7 @@ def test_disturbed_map_returns_to_the_truth(name: str) -> None:
 def test_images_alone_return_the_truth_up_to_a_similarity() -> None:
     truth = Scene().make()
     result, report = optimize(disturbed(truth), dataclasses.replace(EXACT, include_inertial=False))
-    assert report.gauge == "pose and scale of 1 cluster(s)"
+    assert report.gauge == "pose and scale of 1 cluster"
     got, wanted = camera_poses(result), camera_poses(truth)
     # the camera centres are what images know up to scale: the lever arm to the IMU does not scale
     offset, offset_wanted = got[:, 4:] - got[0, 4:], wanted[:, 4:] - wanted[0, 4:]

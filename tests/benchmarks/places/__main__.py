@@ -18,6 +18,7 @@ from tests.support.machine import slowness
 
 _WHAT = {
     "aliased": "rooms that look alike, by seeds",
+    "alike": "two rooms that look alike and a corridor: sessions that visit both or one, by seeds",
     "scrambled": "EuRoC submaps in scrambled base frames, by seeds",
     "pairs": "frame pairs of the handheld walk's loop, against an exhaustive search",
     "gap": "what is left of that loop after optvi, relax, lc, optvi",
@@ -53,7 +54,15 @@ def main() -> None:
 
 
 def _measure(what: str, seeds: list[int]) -> Iterator[Any]:
-    from tests.benchmarks.places import aliased, ambiguity, euroc, scrambled, simulated, tango
+    from tests.benchmarks.places import (
+        aliased,
+        alike,
+        ambiguity,
+        euroc,
+        scrambled,
+        simulated,
+        tango,
+    )
 
     whole: dict[str, Callable[[], Iterator[Any]]] = {
         "pairs": tango.measure_pairs,
@@ -65,7 +74,11 @@ def _measure(what: str, seeds: list[int]) -> Iterator[Any]:
         return whole[what]()
     if what == "scrambled":
         return scrambled.measure(seeds)
-    by_seed = {"sessions": simulated.measure, "ambiguity": ambiguity.measure}
+    by_seed = {
+        "alike": alike.measure,
+        "sessions": simulated.measure,
+        "ambiguity": ambiguity.measure,
+    }
     if what in by_seed:
         return itertools.chain.from_iterable(by_seed[what](seed) for seed in seeds)
     return map(simulated.measure_long if what == "long" else aliased.measure, seeds)

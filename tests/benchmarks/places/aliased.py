@@ -11,11 +11,11 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.algorithms.loop_closure.closing import close_loops
-from maplab_py.algorithms.loop_closure.closures import VERDICTS
+from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record import read_record
-from maplab_py.algorithms.loop_closure.report import Verdict
+from maplab_py.algorithms.loop_closure.reports import Verdict
+from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
@@ -56,18 +56,18 @@ def measure(seed: int) -> AliasedFigures:
     flags = np.arange(len(vi_map.baseframes)) == vi_map.missions.baseframe[known]
     vi_map = vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=flags))
     anchored, report = anchor_missions(vi_map)
-    farthest_m = _farthest_m(anchored, data.truth, known)
+    away_m = farthest_m(anchored, data.truth, known)
     relaxed, _, _ = relax_over_loops(anchored, RelaxationOptions(), LoopClosureOptions())
     closed, _ = close_loops(relaxed)
-    accepted, wrong = _wrong_closures(closed, data.truth)
+    accepted, wrong = wrong_closures(closed, data.truth)
     optimised, _ = optimize(closed, VIOptimizationOptions())
-    merges, wrong_merges = _wrong_merges(optimised, data.truth)
+    merges, merged_wrong = wrong_merges(optimised, data.truth)
     return AliasedFigures(
-        seed, known, len(report.anchored), farthest_m, accepted, wrong, merges, wrong_merges
+        seed, known, len(report.anchored), away_m, accepted, wrong, merges, merged_wrong
     )
 
 
-def _farthest_m(vi_map: VIMap, truth: Truth, known: int) -> float:
+def farthest_m(vi_map: VIMap, truth: Truth, known: int) -> float:
     """Return how far the middle of an anchored mission is from its place beside the known one."""
     row = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
     own = vi_map.vertices.mission == known
@@ -84,7 +84,7 @@ def _farthest_m(vi_map: VIMap, truth: Truth, known: int) -> float:
     return farthest
 
 
-def _wrong_closures(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
+def wrong_closures(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
     """Count the accepted closures of the map's record, and those of them that are not true."""
     closures = read_record(vi_map).closures
     closures = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
@@ -96,7 +96,7 @@ def _wrong_closures(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
     return len(closures), int(np.count_nonzero(far | turned))
 
 
-def _wrong_merges(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
+def wrong_merges(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
     """Count tracks that were joined to others, and those joined to a point far from theirs.
 
     Of a landmark's tracks those of the most frequent point are right together.

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
-from unittest import mock
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure import gates, mission_pairs
-from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
+from maplab_py.algorithms.loop_closure.alignment_contest import Contest
 from maplab_py.algorithms.loop_closure.detection import detect
-from maplab_py.algorithms.loop_closure.mission_pairs import PairClarity, clarity_of_pairs
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
@@ -24,25 +21,32 @@ from tests.e2e.test_real_workflows import SUBMAPS
 from tests.support.data import shared_data
 
 
-def clarity(vi_map: VIMap, options: LoopClosureOptions | None = None) -> list[PairClarity]:
-    """Search closures as anchoring does, and return what decides whether pairs are believed."""
-    judged, _ = with_quality(vi_map)
-    seen: list[PairClarity] = []
-    decide = mission_pairs.without_alignment
+def clarity(vi_map: VIMap, options: LoopClosureOptions | None = None) -> list[Contest]:
+    """Search closures as anchoring does, and return the alignments of all pairs of missions."""
+    judged, _ = evaluate_unknown_quality(vi_map)
+    detection = detect(
+        judged,
+        options or LoopClosureOptions(),
+        missions=np.arange(len(judged.missions)),
+        only_other_missions=True,
+        trust_base_frames=False,
+    )
+    return list(detection.contests)
 
-    def listen(*arguments: Any) -> Any:
-        seen.extend(clarity_of_pairs(*arguments))
-        return decide(*arguments)
 
-    with mock.patch.object(gates, "without_alignment", listen):
-        detect(
-            judged,
-            options or LoopClosureOptions(),
-            missions=np.arange(len(judged.missions)),
-            only_other_missions=True,
-            trust_base_frames=False,
-        )
-    return seen
+def share(contest: Contest) -> float:
+    """Return the stretches that only a rival explains per stretch that only the best one explains.
+
+    The largest of both missions and all rivals; it is compared with --lc_max_ambiguous_ratio.
+    """
+    best, *rivals = contest.pair.alignments
+    shares = [0.0]
+    for rival in rivals:
+        for side in (0, 1):
+            ours = len(np.setdiff1d(best.stretches(side), rival.stretches(side)))
+            theirs = len(np.setdiff1d(rival.stretches(side), best.stretches(side)))
+            shares.append(theirs / max(ours, 1))
+    return max(shares)
 
 
 def aliased_rooms(seed: int, rate_hz: float = 5.0) -> VIMap:
@@ -65,6 +69,7 @@ class ClarityFigures:
 
     map: str
     pairs: int
+    decided: int
     smallest: float
     largest: float
     shares: tuple[float, ...]
@@ -78,5 +83,7 @@ def measure(seed: int) -> Iterator[ClarityFigures]:
         "EuRoC": flight,
     }
     for name, make in maps.items():
-        shares = sorted(pair.share for pair in clarity(make()) if len(pair.rows) >= 4)
-        yield ClarityFigures(name, len(shares), shares[0], shares[-1], tuple(shares))
+        contests = [c for c in clarity(make()) if len(c.pair.rows) >= 4]
+        decided = sum(c.winner >= 0 for c in contests)
+        shares = sorted(share(c) for c in contests)
+        yield ClarityFigures(name, len(shares), decided, shares[0], shares[-1], tuple(shares))

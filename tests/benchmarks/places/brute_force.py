@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import with_quality
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
@@ -61,7 +61,7 @@ def search(
 
     With `later_only` a query is compared with earlier places only, so that each pair counts once.
     """
-    judged, _ = with_quality(vi_map)
+    judged, _ = evaluate_unknown_quality(vi_map)
     features, _ = map_features(judged, np.arange(len(judged.missions)))
     raw = judged.keypoints.descriptor[features.keypoint, : features.descriptor_bits // 8]
     start = np.searchsorted(features.vertex, np.arange(len(judged.vertices) + 1))

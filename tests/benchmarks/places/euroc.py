@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import search_loops
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.vimap import VIMap

@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closures import Closures
+from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.triangulation import triangulate

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import yaw
 from maplab_py.vimap import VIMap
 from tests.e2e.test_real_workflows import C_TRUTH, O_TRUTH, SUBMAPS, ape_m, scrambled

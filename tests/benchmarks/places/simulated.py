@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Iterator
 
-from maplab_py.algorithms.loop_closure.closing import close_loops, search_loops
+from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
 from tests.algorithms.loop_closure.against_truth import score, sessions
 from tests.benchmarks.places.timing import Times, timed
 from tests.support.machine import slowness

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closing import close_loops, search_loops
-from maplab_py.algorithms.loop_closure.closures import Closures
-from maplab_py.console.registry import load_registry
-from maplab_py.console.session import Session
+from maplab_py.algorithms.loop_closure.closure_table import Closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows

@@ -10,11 +10,11 @@ import pytest
 from maplab_py.errors import MapError
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.estimation.inertial_terms import SPEEDED_MPS, TURNED_RAD
+from maplab_py.estimation.terms.inertial import SPEEDED_MPS, TURNED_RAD
 from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
-from maplab_py.sensors.imu_model import distort_imu
 from tests.estimation.imu.motion import one_edge, sampled, truth
+from tests.support.imu_model import distort_imu
 from tests.support.machine import slowness
 
 ZERO = np.zeros(3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.estimation.linear.ordering import indistinguishable_nodes, minimum_degree
-from maplab_py.estimation.linear.pattern import BlockPattern
+from maplab_py.estimation.linear.pattern import BlockPattern, upper_columns
 from maplab_py.estimation.linear.symbolic import analyse, postorder
 from tests.estimation.linear.systems import STRUCTURES, system
 
@@ -31,7 +31,7 @@ def test_fronts_hold_the_factor_and_few_zeros_more(name):
     symbolic = analyse(pattern).plan
     assert sorted(symbolic.order) == list(range(n))
     held = np.zeros((n, n), dtype=bool)
-    for s in range(len(symbolic.child_count)):
+    for s in range(len(symbolic.parent)):
         own = np.arange(symbolic.first_node[s], symbolic.first_node[s + 1])
         below = symbolic.below[symbolic.below_start[s] : symbolic.below_start[s + 1]]
         assert np.all(np.diff(below) > 0)
@@ -64,8 +64,10 @@ def test_postorder_puts_every_subtree_in_one_piece():
 
 def test_nodes_with_equal_neighbourhoods_are_one_group():
     # nodes 0 and 1 see each other and 2; 2 sees 3 as well
-    rows, cols = np.array([1, 2, 2, 3]), np.array([0, 0, 1, 2])
-    group, count = indistinguishable_nodes(rows, cols, 5)
+    rows, cols = np.array([1, 2, 2, 3, 3]), np.array([0, 0, 1, 2, 2])
+    pattern = BlockPattern.checked(rows, cols, 5, 1)
+    start, upper = upper_columns(pattern.rows, pattern.cols, np.arange(5))
+    group, count = indistinguishable_nodes(start, upper)
     assert count == 4
     assert group[0] == group[1]
     assert len({group[0], group[2], group[3], group[4]}) == 4

@@ -87,7 +87,7 @@ def import_positions(file: Path, *, period_s: float = 1.0) -> VIMap:
     except ValueError as error:
         raise UserError(f"{file}: {error}") from None
     if p_M.shape[1] != 3 or len(p_M) < 2:
-        raise UserError(f"{file}: two or more rows of three numbers are wanted, not {p_M.shape}")
+        raise UserError(f"{file}: two or more rows of three numbers are expected, not {p_M.shape}")
     count, rng = len(p_M), np.random.default_rng(0)
     no_turn = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))  # x y z w
     steps = np.concatenate([no_turn[1:], np.diff(p_M, axis=0)], axis=1)

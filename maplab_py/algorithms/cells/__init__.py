@@ -1,0 +1,1 @@
+"""Cells of a map: parts by position that overlap."""

@@ -1,0 +1,1 @@
+"""Loop closures between point clouds of a lidar."""

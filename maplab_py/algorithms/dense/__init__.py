@@ -1,0 +1,1 @@
+"""Dense maps: depth of stereo images, fusion into one surface, meshes."""

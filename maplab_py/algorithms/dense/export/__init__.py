@@ -1,0 +1,1 @@
+"""Export of images, poses and landmarks for programs of multi-view stereo."""

@@ -1,0 +1,190 @@
+"""Undistorted images of frames with their cameras, poses and landmarks, for multi-view stereo."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.algorithms.dense.pinhole import (
+    ImageMap,
+    Pinhole,
+    inscribed,
+    map_to_camera,
+    undistorted,
+)
+from maplab_py.algorithms.dense.resources import (
+    IMAGES,
+    FrameImages,
+    FrameResources,
+    check_size,
+)
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import UserError
+from maplab_py.geometry import se3
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors import Camera
+from maplab_py.sensors.projection import back_project
+from maplab_py.vimap import LandmarkQuality, ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.resource_queries import resources_of
+
+
+@dataclasses.dataclass(frozen=True)
+class UndistortionOptions:
+    """Size of undistorted images."""
+
+    alpha: float = 0.0  # 0 = valid pixels only, 1 = all pixels of the recorded image
+    scale: float = 1.0
+    max_size_px: int = 0  # of the longer side; 0 = no limit
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PointTracks:
+    """Landmarks and where they appear in the V exported images."""
+
+    p_G: F64  # (L, 3)
+    landmark: I64  # (O,) row of p_G
+    view: I64  # (O,) row of the view
+    uv_px: F64  # (O, 2) in the undistorted image, pixel centres at whole numbers
+
+
+class UndistortedViews:
+    """The frames of missions that have an image, as perspective cameras."""
+
+    def __init__(
+        self,
+        vi_map: VIMap,
+        map_folder: Path,
+        missions: I64 | None,
+        options: UndistortionOptions,
+        *,
+        every_nth: int = 1,
+    ) -> None:
+        """Choose the frames with images at every n-th vertex of each mission.
+
+        Raises:
+            UserError: There is none.
+            MapError: A camera is not in sensors.yaml.
+        """
+        self.vi_map = vi_map
+        self._images = FrameImages(vi_map, map_folder)
+        self._resources = FrameResources(vi_map, map_folder)
+        self.frames = _frames_with_images(vi_map, missions, every_nth)
+        if not len(self.frames):
+            raise UserError("the chosen missions have no images: import_images attaches some")
+        self.cameras: list[Camera] = []
+        rows: dict[str, int] = {}
+        of_frame = []
+        for frame in self.frames.tolist():
+            camera = self._resources.camera(frame)
+            if camera.id not in rows:
+                rows[camera.id] = len(self.cameras)
+                self.cameras.append(camera)
+            of_frame.append(rows[camera.id])
+        self.camera_of_view = np.array(of_frame, dtype=np.int64)
+        made = [perspective(camera, options) for camera in self.cameras]
+        self.pinholes: list[Pinhole] = [pinhole for pinhole, _ in made]
+        self._maps = [image_map for _, image_map in made]
+        self.T_C_G = se3.inverse(np.stack([self._resources.T_G_C(f) for f in self.frames.tolist()]))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def image(self, view: int) -> Any:
+        """Return the undistorted image (H, W) or (H, W, 3) BGR of a view, 8 bits.
+
+        Raises:
+            MapError: The file is missing, no image, or of another size than the camera's images.
+        """
+        frame, camera = int(self.frames[view]), int(self.camera_of_view[view])
+        image: Any = self._images.image(frame)
+        name = f"the image of frame {to_hex(self.vi_map.frames.id[frame])}"
+        check_size(name, image, self.cameras[camera])
+        if image.dtype == np.uint16:
+            image = (image >> 8).astype(np.uint8)
+        return self._maps[camera].image(image)
+
+    def tracks(self, *, only_good: bool = True, progress: Progress = SILENT) -> PointTracks:
+        """Return the landmarks that the views observe, at least two each, and their observations.
+
+        Observations outside an undistorted image are left out. The quality of landmarks is evaluated where
+        it is unknown.
+        """
+        vi_map = evaluate_unknown_quality(self.vi_map, progress)[0] if only_good else self.vi_map
+        view_of_frame = np.full(len(vi_map.frames), -1, dtype=np.int64)
+        view_of_frame[self.frames] = np.arange(len(self.frames))
+        view = view_of_frame[vi_map.keypoint_frame]
+        landmark = vi_map.keypoints.landmark.astype(np.int64)
+        chosen = (view >= 0) & (landmark >= 0)
+        if only_good:
+            is_good = vi_map.landmarks.quality == LandmarkQuality.GOOD
+            chosen[chosen] &= is_good[landmark[chosen]]
+        rows = np.flatnonzero(chosen)
+        uv, inside = self._undistorted(view[rows], vi_map.keypoints.uv_px[rows])
+        rows, uv = rows[inside], uv[inside]
+        count = np.bincount(landmark[rows], minlength=len(vi_map.landmarks))
+        often = count[landmark[rows]] >= 2
+        rows, uv = rows[often], uv[often]
+        kept, number = np.unique(landmark[rows], return_inverse=True)
+        return PointTracks(vi_map.p_G[kept], number.reshape(-1), view[rows], uv)
+
+    def _undistorted(self, view: I64, uv_px: F64) -> tuple[F64, Any]:
+        """Return keypoints (N, 2) in the undistorted images, and which are inside."""
+        result = np.zeros((len(view), 2))
+        inside = np.zeros(len(view), dtype=np.bool_)
+        camera_of_row = self.camera_of_view[view]
+        for number, camera in enumerate(self.cameras):
+            rows = np.flatnonzero(camera_of_row == number)
+            rays, valid = back_project(camera, uv_px[rows])
+            pinhole = self.pinholes[number]
+            u, v, in_front = pinhole.pixels(rays)
+            result[rows] = np.stack([u, v], axis=1)
+            inside[rows] = valid & in_front & (u >= 0) & (v >= 0)
+            inside[rows] &= (u <= pinhole.width_px - 1) & (v <= pinhole.height_px - 1)
+        return result, inside
+
+
+def perspective(camera: Camera, options: UndistortionOptions) -> tuple[Pinhole, ImageMap]:
+    """Return a perspective camera on the axis of a camera, and where its pixels lie in the recorded image.
+
+    Between alpha = 0 (no pixel without image) and 1 (all of the image) the borders move linearly.
+    """
+    inner = inscribed([(camera, np.eye(3))], camera.width_px, camera.height_px)
+    outer, _ = undistorted(camera)
+    low, high = (
+        (1.0 - options.alpha) * a + options.alpha * b
+        for a, b in zip(_borders(inner), _borders(outer), strict=True)
+    )
+    scale = options.scale
+    longest = scale * inner.focal_px * float(np.max(high - low)) + 1.0
+    if options.max_size_px and longest > options.max_size_px:
+        scale *= (options.max_size_px - 1.0) / (longest - 1.0)
+    focal = scale * inner.focal_px
+    width, height = (np.floor(focal * (high - low) + 1e-6) + 1.0).astype(int).tolist()
+    centre = -focal * low
+    pinhole = Pinhole(focal, (float(centre[0]), float(centre[1])), width, height)
+    return pinhole, map_to_camera(pinhole, camera, np.eye(3))
+
+
+def _borders(pinhole: Pinhole) -> tuple[F64, F64]:
+    """Return the points on the plane z = 1 of the first and of the last pixel."""
+    centre = np.array(pinhole.centre_px)
+    size = np.array([pinhole.width_px - 1.0, pinhole.height_px - 1.0])
+    return -centre / pinhole.focal_px, (size - centre) / pinhole.focal_px
+
+
+def _frames_with_images(vi_map: VIMap, missions: I64 | None, every_nth: int) -> I64:
+    """Return the frames (rows) with an image, by mission, time and camera."""
+    table = vi_map.resources
+    owned = resources_of(vi_map, IMAGES, missions) & (table.owner_kind == ResourceOwner.FRAME)
+    frames = np.unique(table.owner[owned]).astype(np.int64)
+    frames = frames[vi_map.frames.is_valid[frames]]
+    vertex = vi_map.frames.vertex[frames].astype(np.int64)
+    place = vertex - vi_map.vertex_start[:-1][vi_map.vertices.mission[vertex]]
+    chosen = place % every_nth == 0
+    order = np.lexsort((vi_map.frames.camera_index[frames[chosen]], vertex[chosen]))
+    return np.asarray(frames[chosen][order])

@@ -1,0 +1,202 @@
+"""A grid of truncated signed distances in blocks of 8 x 8 x 8 voxels, near surfaces only."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.algorithms.dense.fusion.block_kernels import (
+    BLOCK_SIDE,
+    FULL,
+    NEIGHBOURS,
+    allocate_blocks,
+    fill_table,
+    find_neighbours,
+)
+from maplab_py.algorithms.dense.fusion.integration_kernels import integrate_depth
+from maplab_py.algorithms.dense.fusion.surface_kernels import join_vertices, place_vertices
+from maplab_py.algorithms.dense.pinhole import Pinhole
+from maplab_py.array_types import F32, F64, I32
+from maplab_py.errors import MapError
+from maplab_py.memory import require_memory
+
+_FIRST_CAPACITY = 1024
+_TABLE_ROWS_PER_BLOCK = 4
+_BYTES_PER_BLOCK = 8 * BLOCK_SIDE**3 + 12 + 16 * _TABLE_ROWS_PER_BLOCK
+_STEPS_PER_BLOCK = 4
+"""Blocks are allocated at pixels that are a quarter of a block apart at the largest depth ..."""
+_MAX_PIXEL_STEP = 8
+"""... but no further than this."""
+_LIMIT = 1 << 20
+"""Coordinates of blocks are smaller."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GridSettings:
+    """What the numbers of a grid depend on."""
+
+    voxel_size_m: float
+    truncation_m: float
+    min_depth_m: float
+    max_depth_m: float
+    depth_power: int  # the weight of a measurement falls with this power of its depth
+    max_weight: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles; corners run anticlockwise as seen from the free side."""
+
+    p: F64  # (N, 3) [m]
+    faces: I32  # (F, 3)
+
+
+class TsdfGrid:
+    """Mean signed distances to the nearest surface, along the axes of the cameras that saw it.
+
+    Distances are in units of the truncation distance and positive in free space. If all depth maps are
+    allocated before the first is integrated, every block has all of them, the order does not matter, and
+    each can be removed again.
+    """
+
+    def __init__(self, settings: GridSettings) -> None:
+        """Start without blocks."""
+        self.settings = settings
+        self.count = 0
+        self._coordinates: I32 = np.zeros((0, 3), dtype=np.int32)
+        shape = (0, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+        self._distance: F32 = np.zeros(shape, dtype=np.float32)
+        self._weight: F32 = np.zeros(shape, dtype=np.float32)
+        self._table = np.zeros((0, 2), dtype=np.int64)
+
+    @classmethod
+    def of(cls, settings: GridSettings, coordinates: I32, distance: F32, weight: F32) -> TsdfGrid:
+        """Make a grid of blocks (B, 3) with distances and weights (B, 8, 8, 8)."""
+        grid = cls(settings)
+        grid._reserve(len(coordinates))
+        grid.count = len(coordinates)
+        grid._coordinates[: grid.count] = coordinates
+        grid._distance[: grid.count] = distance
+        grid._weight[: grid.count] = weight
+        fill_table(grid.coordinates, grid._table)
+        return grid
+
+    @property
+    def coordinates(self) -> I32:
+        """Blocks (B, 3), in units of the block's side."""
+        return self._coordinates[: self.count]
+
+    @property
+    def distance(self) -> F32:
+        """Distances (B, 8, 8, 8)."""
+        return self._distance[: self.count]
+
+    @property
+    def weight(self) -> F32:
+        """Weights (B, 8, 8, 8), in measurements at a depth of 2 m; 0 = not observed."""
+        return self._weight[: self.count]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the grid [bytes]."""
+        arrays = (self._coordinates, self._distance, self._weight, self._table)
+        return sum(array.nbytes for array in arrays)
+
+    def allocate(self, depth: F32, pinhole: Pinhole, T_G_C: F64) -> None:
+        """Make the blocks near the surface in a depth map (H, W) [m] of a camera at a pose (4, 4).
+
+        Raises:
+            NotEnoughMemory: The grid would exceed the allowed memory.
+            MapError: A surface is too far from the origin for the voxel size.
+        """
+        s = self.settings
+        block_m = BLOCK_SIDE * s.voxel_size_m
+        if np.abs(T_G_C[:3, 3]).max() + 2.0 * s.max_depth_m > block_m * _LIMIT:
+            raise MapError(
+                f"a camera is {np.abs(T_G_C[:3, 3]).max():.0f} m from the origin: the grid reaches "
+                f"{block_m * _LIMIT:.0f} m; use larger voxels (--dense_tsdf_voxel_size_m)"
+            )
+        camera = np.array([pinhole.focal_px, *pinhole.centre_px])
+        step = int(pinhole.focal_px * block_m / (_STEPS_PER_BLOCK * s.max_depth_m))
+        step = min(max(step, 1), _MAX_PIXEL_STEP)
+        settings = np.array([block_m, s.truncation_m, s.min_depth_m, s.max_depth_m, step])
+        while True:
+            arguments = depth, camera, T_G_C, settings, self._table, self._coordinates
+            count = allocate_blocks(*arguments, self.count) if len(self._table) else FULL
+            if count != FULL:
+                break
+            self._reserve(max(2 * len(self._coordinates), _FIRST_CAPACITY))
+        self.count = count
+
+    def integrate(self, depth: F32, pinhole: Pinhole, T_G_C: F64, *, first_block: int = 0) -> None:
+        """Add a depth map to all blocks, or to those from a row on."""
+        self._integrate(depth, pinhole, T_G_C, 1.0, first_block)
+
+    def remove(self, depth: F32, pinhole: Pinhole, T_G_C: F64) -> None:
+        """Take out a depth map that was integrated with the same arguments."""
+        self._integrate(depth, pinhole, T_G_C, -1.0, 0)
+
+    def mesh(self, min_weight: float) -> Mesh:
+        """Return the surface between voxels of at least this weight."""
+        around = np.empty((self.count, NEIGHBOURS), dtype=np.int32)
+        find_neighbours(self.coordinates, self._table, around)
+        cells = np.empty((self.count, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE), dtype=np.int32)
+        settings = np.array([self.settings.voxel_size_m, max(min_weight, 1e-12)])
+        arguments = self.coordinates, around, self.distance, self.weight, settings, cells
+        points = np.empty((place_vertices(*arguments, np.empty((0, 3))), 3))
+        quads = np.empty((0, 4), dtype=np.int32)
+        if len(points):
+            place_vertices(*arguments, points)
+            number = join_vertices(around, self.distance, cells, quads)
+            quads = np.empty((number, 4), dtype=np.int32)
+        if len(quads):
+            join_vertices(around, self.distance, cells, quads)
+        return _triangulated(points, quads)
+
+    def sorted(self) -> TsdfGrid:
+        """Return the grid with observed blocks only, in the order of their coordinates."""
+        observed = np.flatnonzero((self.weight > 0.0).any(axis=(1, 2, 3)))
+        order = observed[np.lexsort(self.coordinates[observed].T[::-1])]
+        return TsdfGrid.of(
+            self.settings, self.coordinates[order], self.distance[order], self.weight[order]
+        )
+
+    def _integrate(
+        self, depth: F32, pinhole: Pinhole, T_G_C: F64, sign: float, first_block: int
+    ) -> None:
+        s = self.settings
+        size = pinhole.width_px, pinhole.height_px
+        image = np.array(
+            [pinhole.focal_px, *pinhole.centre_px, *size, s.min_depth_m, s.max_depth_m]
+        )
+        settings = np.array(
+            [s.voxel_size_m, s.truncation_m, float(s.depth_power), s.max_weight, sign]
+        )
+        T_C_G = np.linalg.inv(T_G_C)
+        blocks = (array[first_block:] for array in (self.coordinates, self.distance, self.weight))
+        integrate_depth(depth, image, T_C_G, settings, *blocks)
+
+    def _reserve(self, capacity: int) -> None:
+        """Make room for so many blocks."""
+        require_memory(capacity * _BYTES_PER_BLOCK, "the grid of distances")
+        for name in ("_coordinates", "_distance", "_weight"):
+            former = getattr(self, name)
+            array = np.zeros((capacity, *former.shape[1:]), dtype=former.dtype)
+            array[: self.count] = former[: self.count]
+            setattr(self, name, array)
+        rows = 1 << int(np.ceil(np.log2(max(_TABLE_ROWS_PER_BLOCK * capacity, 2))))
+        self._table = np.full((rows, 2), -1, dtype=np.int64)
+        fill_table(self.coordinates, self._table)
+
+
+def _triangulated(p: F64, quads: I32) -> Mesh:
+    """Split quadrilaterals along the shorter diagonal; leave out vertices without a face."""
+    diagonals = [np.linalg.norm(p[quads[:, k]] - p[quads[:, k + 2]], axis=1) for k in (0, 1)]
+    turned = diagonals[1] < diagonals[0]
+    corners = np.where(turned[:, None], np.roll(quads, -1, axis=1), quads)
+    faces = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    used = np.zeros(len(p), dtype=np.bool_)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - 1
+    return Mesh(p[used], number[faces].astype(np.int32))

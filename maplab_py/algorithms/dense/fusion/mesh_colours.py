@@ -1,0 +1,95 @@
+"""Colours of a mesh's vertices, from the images in which they are not hidden."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.algorithms.dense.resources import DEPTH_MAPS, FrameImages, FrameResources
+from maplab_py.array_types import F32, F64, I64, U8
+from maplab_py.errors import UserError
+from maplab_py.geometry import se3
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors.projection import is_inside_image, project
+from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap.resource_queries import resources_of
+
+_VISIBLE_M, _VISIBLE_PART = 0.05, 0.03
+"""A point is seen if its depth differs from the depth map's by no more than this, or this part of it."""
+_UNSEEN = 128
+_CHUNK = 500_000
+"""Vertices that are projected at a time."""
+
+
+def vertex_colours(
+    vi_map: VIMap,
+    map_folder: Path,
+    p_G: F64,
+    missions: I64 | None = None,
+    *,
+    progress: Progress = SILENT,
+) -> U8:
+    """Return the colours (N, 3) red, green, blue of points (N, 3) on surfaces.
+
+    The mean over all frames with an image and a depth map in which the point is not hidden, weighted by
+    1 / depth^2. Points that no image shows are grey.
+
+    Args:
+        vi_map: Map.
+        map_folder: Its folder.
+        p_G: Points in the global frame.
+        missions: Rows of missions; None = all.
+        progress: Is told about every image.
+
+    Raises:
+        UserError: No frame has both an image and a depth map.
+        MapError: A file is missing or damaged.
+    """
+    images, resources = FrameImages(vi_map, map_folder), FrameResources(vi_map, map_folder)
+    table = vi_map.resources
+    chosen = resources_of(vi_map, DEPTH_MAPS, missions)
+    chosen &= table.owner_kind == ResourceOwner.FRAME
+    rows = [row for row in np.flatnonzero(chosen).tolist() if int(table.owner[row]) in images]
+    if not rows:
+        raise UserError(
+            "no frame has an image and a depth map, which colours of a mesh come from: import_images"
+        )
+    total, weight = np.zeros((len(p_G), 3)), np.zeros(len(p_G))
+    for done, row in enumerate(rows):
+        progress.step(done, len(rows), "colours of the mesh")
+        frame = int(table.owner[row])
+        image = _as_rgb(np.asarray(images.image(frame)))
+        depth = resources.depth(row)
+        T_C_G = se3.inverse(resources.T_G_C(frame))
+        for first in range(0, len(p_G), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            p_C = se3.transform(T_C_G, p_G[part])
+            seen, pixel = _seen(resources, frame, p_C, depth)
+            w = 1.0 / p_C[seen, 2] ** 2
+            total[part][seen] += w[:, None] * image[pixel[:, 1], pixel[:, 0]]
+            weight[part][seen] += w
+    mean = total / np.maximum(weight, 1e-12)[:, None]
+    return np.where(weight[:, None] > 0.0, np.round(mean), _UNSEEN).astype(np.uint8)
+
+
+def _seen(resources: FrameResources, frame: int, p_C: F64, depth: F32) -> tuple[I64, I64]:
+    """Return which points (N, 3) the depth map does not hide, and their pixels."""
+    camera = resources.camera(frame)
+    uv, visible = project(camera, p_C)
+    rows = np.flatnonzero(visible & (p_C[:, 2] > 0.0))
+    pixel = np.round(uv[rows]).astype(np.int64)
+    inside = is_inside_image(camera, pixel)
+    rows, pixel = rows[inside], pixel[inside]
+    z, measured = p_C[rows, 2], depth[pixel[:, 1], pixel[:, 0]]
+    near = np.abs(z - measured) <= np.maximum(_VISIBLE_M, _VISIBLE_PART * z)
+    near &= measured > 0.0
+    return rows[near], pixel[near]
+
+
+def _as_rgb(image: U8) -> F64:
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if image.ndim == 2:
+        image = np.repeat(image[:, :, None], 3, axis=2)
+    return np.asarray(image[:, :, ::-1], dtype=np.float64)

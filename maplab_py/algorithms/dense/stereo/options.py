@@ -1,0 +1,149 @@
+"""Options of stereo reconstruction; names and defaults are those of maplab where it has them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.options import option
+
+_SGBM_MODES = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class SgbmOptions:
+    """Semi-global block matching: Hirschmueller, PAMI 2008; OpenCV's StereoSGBM."""
+
+    flag_prefix: ClassVar[str] = "dense_stereo_sgbm_"
+
+    mode: int = option(0, help="0 = SGBM, 1 = HH, 2 = SGBM_3WAY, 3 = HH4")
+    min_disparity: int = option(0, help="Smallest disparity", unit="px")
+    num_disparities: int = option(128, help="Number of disparities, a multiple of 16", unit="px")
+    sad_window_size: int = option(3, help="Side of the blocks that are compared, odd", unit="px")
+    p1: int = option(72, help="Penalty for a disparity that changes by one pixel")
+    p2: int = option(288, help="Penalty for a disparity that changes by more")
+    disp12_max_diff: int = option(1, help="Tolerance of the left-right check", unit="px")
+    pre_filter_cap: int = option(31, help="Bound of the gradients that are compared")
+    uniqueness_ratio: int = option(10, help="Margin to the second best disparity, in percent")
+    speckle_window_size: int = option(500, help="Smaller regions are removed; in pixels of area")
+    speckle_range: int = option(3, help="Difference of disparities inside a region", unit="px")
+
+
+@dataclasses.dataclass(frozen=True)
+class BmOptions:
+    """Block matching: Konolige, ISRR 1997; OpenCV's StereoBM."""
+
+    flag_prefix: ClassVar[str] = "dense_stereo_bm_"
+
+    min_disparity: int = option(0, help="Smallest disparity", unit="px")
+    num_disparities: int = option(128, help="Number of disparities, a multiple of 16", unit="px")
+    sad_window_size: int = option(9, help="Side of the blocks that are compared, odd", unit="px")
+    disp12_max_diff: int = option(1, help="Tolerance of the left-right check", unit="px")
+    pre_filter_cap: int = option(31, help="Bound of the filtered values")
+    pre_filter_size: int = option(9, help="Side of the filter's window, odd", unit="px")
+    prefilter_type: str = option(
+        "xsobel", help="Filter of the images", choices=("xsobel", "normalized_response")
+    )
+    texture_threshold: int = option(10, help="Blocks with less texture have no disparity")
+    uniqueness_ratio: int = option(15, help="Margin to the second best disparity, in percent")
+    speckle_window_size: int = option(500, help="Smaller regions are removed; in pixels of area")
+    speckle_range: int = option(3, help="Difference of disparities inside a region", unit="px")
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoOptions:
+    """Choice of stereo pairs, preparation of images, and checks."""
+
+    flag_prefix: ClassVar[str] = "dense_stereo_"
+
+    use_sgbm: bool = option(True, help="Semi-global block matching; else plain block matching")
+    downscaling_factor: float = option(
+        1.0, help="Images are matched at this fraction of their size"
+    )
+    adapt_params_to_image_size: bool = option(
+        True, help="Take an eighth of the image's width as the number of disparities"
+    )
+    min_baseline: float = option(
+        0.02, help="Pairs of cameras nearer to each other are left out", unit="m"
+    )
+    max_angle_between_opt_axes: float = option(
+        0.785, help="Pairs whose optical axes differ by more are left out", unit="rad"
+    )
+    depth_check: bool = option(
+        True, help="Remove what the right image does not confirm", flag="dense_depth_check"
+    )
+    median_window: int = option(
+        5, help="Side of the median filter of disparities, 0 (none), 3 or 5", unit="px"
+    )
+    bilateral_window: int = option(
+        15,
+        help="Side of the bilateral filter of disparities, which keeps edges; 0 = none",
+        unit="px",
+    )
+    edge_margin: int = option(
+        3,
+        help="Pixels so near to a step of the depth are removed: they belong to either side",
+        unit="px",
+    )
+    multi_view: bool = option(True, help="Remove what neighbouring vertices do not confirm")
+    multi_view_min_agreeing: int = option(2, help="Neighbouring vertices that must confirm a pixel")
+    multi_view_max_difference: float = option(
+        1.0, help="Difference of disparities that counts as confirmation", unit="px"
+    )
+    multi_view_interval_s: float = option(
+        0.2,
+        help="Time between the neighbours that are asked, three before and three after",
+        unit="s",
+    )
+
+    debug_reconstruction_start_fraction_of_trajectory: float = option(
+        0.0, help="Part of each mission's vertices before the first that is used"
+    )
+    debug_reconstruction_end_fraction_of_trajectory: float = option(
+        1.0, help="Part of each mission's vertices up to the last that is used"
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        start = self.debug_reconstruction_start_fraction_of_trajectory
+        if not 0.0 <= start < self.debug_reconstruction_end_fraction_of_trajectory <= 1.0:
+            raise ValueError(
+                "0 <= dense_stereo_debug_reconstruction_start_fraction_of_trajectory < end <= 1 must hold"
+            )
+        if not 0.0 < self.downscaling_factor <= 1.0:
+            raise ValueError("dense_stereo_downscaling_factor must be in (0, 1]")
+        if self.median_window not in (0, 3, 5) or self.edge_margin < 0:
+            raise ValueError(
+                "dense_stereo_median_window must be 0, 3 or 5, edge_margin 0 or greater"
+            )
+        if not 0 <= self.bilateral_window <= 31:
+            raise ValueError("dense_stereo_bilateral_window must be 0 to 31")
+        if self.min_baseline <= 0.0:
+            raise ValueError("dense_stereo_min_baseline must be positive")
+        if self.multi_view_min_agreeing < 1:
+            raise ValueError("dense_stereo_multi_view_min_agreeing must be 1 or greater")
+        if self.multi_view_interval_s < 0.0 or self.multi_view_max_difference <= 0.0:
+            raise ValueError(
+                "dense_stereo_multi_view_interval_s must be 0 or greater, max_difference positive"
+            )
+
+
+def check_matcher(options: SgbmOptions | BmOptions) -> None:
+    """Check the ranges that OpenCV would refuse with its own message.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+    name = options.flag_prefix
+    if options.num_disparities < 16 or options.num_disparities % 16:
+        raise ValueError(f"--{name}num_disparities must be a positive multiple of 16")
+    smallest = 1 if isinstance(options, SgbmOptions) else 5
+    if options.sad_window_size < smallest or options.sad_window_size % 2 == 0:
+        raise ValueError(f"--{name}sad_window_size must be odd and at least {smallest}")
+    if isinstance(options, SgbmOptions):
+        if not 0 <= options.mode < _SGBM_MODES or not 0 < options.p1 < options.p2:
+            raise ValueError(f"--{name}mode must be 0 to 3, and 0 < --{name}p1 < --{name}p2")
+    elif options.pre_filter_size % 2 == 0 or not 5 <= options.pre_filter_size <= 255:
+        raise ValueError(f"--{name}pre_filter_size must be odd, 5 to 255")
+    elif not 1 <= options.pre_filter_cap <= 63:
+        raise ValueError(f"--{name}pre_filter_cap must be 1 to 63")

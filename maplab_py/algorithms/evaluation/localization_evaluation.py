@@ -1,0 +1,105 @@
+"""Poses in a map against ground truth, without aligning them: they claim to be in the map's frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.algorithms.evaluation.reports import LocalizationErrors
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import EstimationError
+from maplab_py.geometry import se3
+from maplab_py.geometry.alignment import umeyama
+from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.text_table import read_text_table
+from maplab_py.interop.trajectories import Trajectory, read_trajectory
+from maplab_py.vimap import VIMap
+
+_MAX_GAP_NS = 500_000_000
+_MIN_PAIRS = 3
+_FLAG_COLUMN = "is_localized"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LocalizedTrajectory:
+    """Frames of a file, those included that were not localised."""
+
+    name: str
+    times_ns: I64  # (N,)
+    T_G_I: F64  # (N, 7)
+    is_localized: np.ndarray  # (N,)
+
+
+def read_localized(path: Path) -> LocalizedTrajectory:
+    """Read the file of `rovioli --export_localized_poses_to_csv`, or any trajectory in G.
+
+    Raises:
+        MapError: The file cannot be read or is not a trajectory.
+    """
+    trajectory = read_trajectory(path)
+    is_localized = np.ones(len(trajectory), dtype=np.bool_)
+    table = read_text_table(path)
+    if _FLAG_COLUMN in table.header:
+        is_localized = table.values[:, table.header.index(_FLAG_COLUMN) - 1] > 0.0
+    return LocalizedTrajectory(str(path), trajectory.times_ns, trajectory.T_R_B, is_localized)
+
+
+def alignment_of_map(vi_map: VIMap, truth: Trajectory) -> F64:
+    """Return T_R_G (7,) that puts the vertices of a map where the ground truth has them.
+
+    Raises:
+        EstimationError: Fewer than three vertices lie in the span of the truth.
+    """
+    poses, inside = interpolate_poses(
+        truth.times_ns, truth.T_R_B, vi_map.vertices.timestamp_ns, max_gap_ns=_MAX_GAP_NS
+    )
+    if np.count_nonzero(inside) < _MIN_PAIRS:
+        raise EstimationError(
+            f"{truth.source}: fewer than {_MIN_PAIRS} vertices of the map lie in its time span: give "
+            "the ground truth of the recordings that the map was made of"
+        )
+    T_R_G, _ = umeyama(poses[inside, 4:], vi_map.T_G_I[inside, 4:])
+    return T_R_G
+
+
+def localization_errors(
+    localized: LocalizedTrajectory, truth: Trajectory, T_R_G: F64
+) -> LocalizationErrors:
+    """Compare the frames of a file with ground truth in a frame R.
+
+    Args:
+        localized: Poses in G.
+        truth: Ground truth in R.
+        T_R_G: Pose (7,) of the map in R.
+
+    Raises:
+        EstimationError: No frame lies in the span of the truth.
+    """
+    poses, known = interpolate_poses(
+        truth.times_ns, truth.T_R_B, localized.times_ns, max_gap_ns=_MAX_GAP_NS
+    )
+    if not known.any():
+        raise EstimationError(f"{localized.name}: no frame lies in the time span of {truth.source}")
+    used = known & localized.is_localized
+    frames, share = int(known.sum()), float(used.sum() / known.sum())
+    if not used.any():
+        return LocalizationErrors(localized.name, frames, 0.0, *([None] * 8))
+    delta = se3.local(poses[used], se3.compose(T_R_G, localized.T_G_I[used]))
+    error = np.linalg.norm(delta[:, :3], axis=1)
+    step = np.linalg.norm(np.diff(delta[:, :3], axis=0), axis=1)
+    first_s = float(localized.times_ns[used][0] - localized.times_ns[0]) * 1e-9
+    return LocalizationErrors(
+        file=localized.name,
+        frames=frames,
+        localized_share=share,
+        first_localized_s=first_s,
+        median_m=float(np.median(error)),
+        std_m=float(np.std(error)),
+        rmse_m=float(np.sqrt(np.mean(error**2))),
+        largest_m=float(error.max()),
+        median_deg=float(np.degrees(np.median(np.linalg.norm(delta[:, 3:], axis=1)))),
+        largest_step_m=float(step.max()) if len(step) else None,
+        median_step_m=float(np.median(step)) if len(step) else None,
+    )

@@ -1,0 +1,181 @@
+"""Report of trajectory evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from maplab_py.report import Report
+
+_LARGEST_RATIO = 10.0
+"""Larger changes are shown without percents."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorStatistics:
+    """Statistics of an error, in the error's unit."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionEvaluation:
+    """Errors of a single mission that is aligned separately."""
+
+    mission_id: str
+    matched: int
+    ape_rmse_m: float | None  # None: too few vertices, or all on a line
+
+
+@dataclasses.dataclass(frozen=True)
+class BaselineErrors:
+    """RMSE of another state of the map against the same ground truth with the same options."""
+
+    name: str
+    ape_m: float
+    ape_deg: float
+    ape_sim3_m: float | None
+    rpe_m: float | None
+    rpe_deg: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorLine:
+    """One kind of error as it is shown."""
+
+    error: str
+    rmse: float = dataclasses.field(metadata={"title": "RMSE"})
+    median: float
+    max: float
+    change: str = ""  # of the RMSE since the baseline
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionLine:
+    """The error of one mission that is aligned separately, as it is shown."""
+
+    mission: str
+    vertices: int
+    rmse: float | None = dataclasses.field(
+        metadata={"title": "APE RMSE, aligned alone", "unit": "m"}
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorTable:
+    """What is shown of an evaluation."""
+
+    errors: tuple[ErrorLine, ...] = dataclasses.field(metadata={"title": ""})
+    missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
+    summary: str = dataclasses.field(metadata={"is_prose": True})
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryEvaluationReport(Report):
+    """Errors of the vertices against ground truth."""
+
+    ground_truth: str
+    alignment: str
+    vertices: int
+    matched: int
+    without_ground_truth: int  # outside its span, or in one of its gaps
+    ape_m: ErrorStatistics
+    ape_deg: ErrorStatistics
+    ape_sim3_m: ErrorStatistics | None  # None: the scale cannot be determined
+    scale: float | None  # ground truth / map
+    body_rotation_deg: float  # constant rotation between ground truth's body frame and the IMU
+    rpe_m: ErrorStatistics | None  # None: no segment of the wanted length
+    rpe_deg: ErrorStatistics | None
+    rpe_pieces: str  # description of the segments
+    missions: tuple[MissionEvaluation, ...]
+    baseline: BaselineErrors | None = None
+
+    def as_baseline(self, name: str) -> BaselineErrors:
+        """Return the errors that a later evaluation is compared with."""
+        return BaselineErrors(
+            name,
+            self.ape_m.rmse,
+            self.ape_deg.rmse,
+            None if self.ape_sim3_m is None else self.ape_sim3_m.rmse,
+            None if self.rpe_m is None else self.rpe_m.rmse,
+            None if self.rpe_deg is None else self.rpe_deg.rmse,
+        )
+
+    def display(self) -> ErrorTable:
+        """Return one table of the errors and a sentence on how they were computed."""
+        kinds = ("ape_m", "ape_deg", "ape_sim3_m", "rpe_m", "rpe_deg")
+        names = ("APE [m]", "APE [deg]", "APE, Sim(3) [m]", "RPE [m]", "RPE [deg]")
+        lines = []
+        for kind, name in zip(kinds, names, strict=True):
+            statistics: ErrorStatistics | None = getattr(self, kind)
+            if statistics is not None:
+                before = None if self.baseline is None else getattr(self.baseline, kind)
+                change = _change(statistics.rmse, before)
+                lines.append(
+                    ErrorLine(name, statistics.rmse, statistics.median, statistics.max, change)
+                )
+        missions = tuple(MissionLine(m.mission_id, m.matched, m.ape_rmse_m) for m in self.missions)
+        return ErrorTable(
+            tuple(lines), missions if len(missions) > 1 else (), " ".join(self._sentences())
+        )
+
+    def _sentences(self) -> list[str]:
+        outside = self.without_ground_truth
+        left_out = f" ({outside} of the map have none)" if outside else ""
+        scale = "" if self.scale is None else f", scale {self.scale:.5f}"
+        sentences = [
+            f"{self.matched} vertices with ground truth{left_out}, "
+            f"alignment {self.alignment}{scale}, RPE over {self.rpe_pieces}, "
+            f"body frames {self.body_rotation_deg:.2f} deg apart."
+        ]
+        if self.baseline is not None:
+            sentences.append(f"Change of the RMSE since {self.baseline.name}.")
+        return sentences
+
+
+def _change(rmse: float, before: float | None) -> str:
+    """Return the difference of an error in its unit and in percent."""
+    if before is None:
+        return ""
+    difference = rmse - before
+    is_comparable = before > 0.0 and abs(difference) < _LARGEST_RATIO * before
+    share = f" ({100.0 * difference / before:+.1f} %)" if is_comparable else ""
+    return f"{difference:+.4g}{share}" if difference else "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalizationErrors:
+    """Errors of one file."""
+
+    file: str
+    frames: int  # with ground truth
+    localized_share: float  # of them
+    first_localized_s: float | None  # after the first frame; None = never
+    median_m: float | None  # None: never localised
+    std_m: float | None
+    rmse_m: float | None
+    largest_m: float | None
+    median_deg: float | None
+    largest_step_m: float | None  # by which the error changes between two outputs
+    median_step_m: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalizationEvaluationReport(Report):
+    """Errors of poses in a map."""
+
+    ground_truth: str
+    map_alignment: str
+    files: tuple[LocalizationErrors, ...]
+
+    @property
+    def failure(self) -> str:
+        """Say that nothing was localised."""
+        if any(errors.localized_share > 0.0 for errors in self.files):
+            return ""
+        return "no frame with ground truth was localised"

@@ -1,0 +1,1 @@
+"""Measurements of other programs and receivers: trajectories and satellite positions."""

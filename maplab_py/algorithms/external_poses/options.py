@@ -1,0 +1,139 @@
+"""Flags of import_trajectory and import_gps."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from maplab_py.array_types import I64
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryOptions:
+    """What a trajectory becomes, and how far it is trusted."""
+
+    kind: str = option(
+        "absolute",
+        help="Absolute pose measurements or odometry edges of a mission of the map, or a mission of its own",
+        choices=("absolute", "odometry", "mission"),
+        flag="as",
+    )
+    position_sigma_m: float = option(
+        0.05,
+        help="Standard deviation per axis of absolute positions; of odometry: after one second, growing "
+        "with the root of time",
+        unit="m",
+    )
+    orientation_sigma_deg: float = option(
+        1.0, help="Standard deviation per axis of orientations, likewise", unit="deg"
+    )
+    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    max_gap_s: float = option(
+        0.5, help="Poses of the file are not interpolated over longer gaps", unit="s"
+    )
+    sensor_id: str = option(
+        "", help="Sensor or camera of the map whose poses the file has; empty = the IMU"
+    )
+    times_file: Path | None = option(
+        None, help="Time stamps of a KITTI trajectory, one per line [s] (times.txt)"
+    )
+    align: bool = option(
+        True,
+        help="Move the base frame of the mission by yaw and position so that it fits the absolute poses",
+    )
+    replace: bool = option(
+        False, help="Replace the measurements of the same kind that the mission has"
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A deviation or gap is not positive, or the offset is not finite.
+        """
+        for name in ("position_sigma_m", "orientation_sigma_deg", "max_gap_s"):
+            if not 0.0 < getattr(self, name) < 1e9:
+                raise FlagError(f"--{name}={getattr(self, name):g}: must be positive")
+        if not abs(self.time_offset_s) < 1e9:
+            raise FlagError(f"--time_offset_s={self.time_offset_s:g}: wants seconds below 1e9")
+
+
+@dataclasses.dataclass(frozen=True)
+class GpsOptions:
+    """How positions of a satellite receiver are used."""
+
+    flag_prefix: ClassVar[str] = "gps_"
+
+    sigma_m: float = option(1.0, help="Standard deviation of east and of north", unit="m")
+    sigma_vertical_m: float = option(
+        0.0, help="Standard deviation of the altitude; 0 = twice that of east", unit="m"
+    )
+    lever_arm_m: str = option("0,0,0", help="Position x,y,z of the antenna on the IMU", unit="m")
+    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    max_gap_s: float = option(
+        2.0, help="Fixes between vertices that are further apart are left out", unit="s"
+    )
+    origin: str = option(
+        "",
+        help="Origin of east, north and up: latitude,longitude [deg],ellipsoidal altitude [m]; empty = that "
+        "of the map, or else the median of the fixes",
+    )
+    date: str = option(
+        "", help="Day of the first fix as YYYY-MM-DD, for NMEA files without RMC sentences"
+    )
+    align: bool = option(
+        True,
+        help="Move the base frame of the mission by yaw and position so that it fits the fixes",
+    )
+    replace: bool = option(False, help="Replace the absolute poses that the mission has")
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A deviation or gap is not positive, or a list of numbers is none.
+        """
+        for name in ("sigma_m", "max_gap_s"):
+            if not 0.0 < getattr(self, name) < 1e9:
+                raise FlagError(f"--gps_{name}={getattr(self, name):g}: must be positive")
+        if not 0.0 <= self.sigma_vertical_m < 1e9:
+            raise FlagError(f"--gps_sigma_vertical_m={self.sigma_vertical_m:g}: must be 0 or more")
+        if not abs(self.time_offset_s) < 1e10:
+            raise FlagError(f"--gps_time_offset_s={self.time_offset_s:g}: wants seconds below 1e10")
+        _ = self.lever_arm, self.given_origin
+
+    @property
+    def lever_arm(self) -> tuple[float, float, float]:
+        """Position of the antenna on the IMU [m]."""
+        return _three("gps_lever_arm_m", self.lever_arm_m)
+
+    @property
+    def given_origin(self) -> tuple[float, float, float] | None:
+        """Latitude, longitude and altitude of the origin, None when it is not given."""
+        if not self.origin.strip():
+            return None
+        lat, lon, alt = _three("gps_origin", self.origin)
+        if abs(lat) > 90.0 or abs(lon) > 180.0:
+            raise FlagError(f"--gps_origin={self.origin}: wants latitude and longitude in degrees")
+        return lat, lon, alt
+
+    def shifted(self, times_ns: I64) -> I64:
+        """Return stamps (N,) on the clock of the map."""
+        return times_ns + round(self.time_offset_s * 1e9)
+
+
+def _three(flag: str, text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        x = y = z = float("nan")
+    if not np.all(np.isfinite([x, y, z])):
+        raise FlagError(
+            f"--{flag}={text}: wants three numbers separated by commas, as in 0.1,0,-0.05"
+        )
+    return x, y, z

@@ -1,0 +1,272 @@
+"""Trajectories of other programs as absolute poses, odometry edges, or missions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.algorithms.external_poses.alignment import (
+    Movement,
+    check_vertical,
+    robust_yaw_position,
+    with_aligned_base_frame,
+)
+from maplab_py.algorithms.external_poses.options import TrajectoryOptions
+from maplab_py.algorithms.external_poses.sensors import (
+    content_words,
+    mounting,
+    with_sensor,
+    without_sensors,
+)
+from maplab_py.array_types import F64, I64, U64, Mask
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import se3
+from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
+from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap.tables import (
+    AbsolutePoses,
+    Backbone,
+    BaseFrames,
+    Missions,
+    TransformationEdges,
+    Vertices,
+)
+
+_ALONG = "odometry of a trajectory"
+
+
+def shifted(trajectory: Trajectory, time_offset_s: float) -> Trajectory:
+    """Return a trajectory with another clock.
+
+    Raises:
+        MapError: Two poses have the same time.
+    """
+    same = np.flatnonzero(np.diff(trajectory.times_ns) == 0)
+    if len(same):
+        raise MapError(
+            f"{trajectory.source}: two poses have the time stamp {trajectory.times_ns[same[0]]} ns: "
+            "leave one of them"
+        )
+    return dataclasses.replace(
+        trajectory, times_ns=trajectory.times_ns + round(time_offset_s * 1e9)
+    )
+
+
+def as_absolute_poses(
+    vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
+) -> tuple[VIMap, int, Movement]:
+    """Attach poses T_G_S to the vertices of a mission (row) that are nearest to them.
+
+    A pose is interpolated to the time of its vertex.
+
+    Returns:
+        The map, the number of vertices of the mission without a pose, and the movement of the mission.
+
+    Raises:
+        UserError: Nothing of the trajectory is at the time of the mission, or the mission has absolute
+            poses and `options.replace` is not set.
+        EstimationError: The vertical of the trajectory is not that of the mission.
+    """
+    vi_map = without_absolute_poses(vi_map, mission, trajectory.source, replace=options.replace)
+    rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
+    stamps = vi_map.vertices.timestamp_ns[rows]
+    T_G_S, covered = _at(trajectory, stamps, options)
+    chosen = np.zeros(len(rows), dtype=np.bool_)
+    chosen[nearest(stamps, trajectory.times_ns)] = True
+    chosen &= covered
+    if not chosen.any():
+        raise _no_overlap(trajectory, stamps)
+    rows, T_G_S = rows[chosen], T_G_S[chosen]
+    T_I_S = mounting(vi_map, mission, options.sensor_id)
+    words = content_words(vi_map, mission, "absolute", trajectory.times_ns, trajectory.T_R_B)
+    keys = {"topic": "", "description": "trajectory of another program"}
+    vi_map = with_sensor(vi_map, mission, MissionSensor.ABSOLUTE_6DOF, words, T_I_S, keys)
+    T_M_S = se3.compose(vi_map.vertices.T_M_I[rows], T_I_S)
+    check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
+    movement = Movement(0.0, 0.0)
+    if options.align and len(rows) > 1:
+        T_G_M = robust_yaw_position(T_G_S[:, 4:], T_M_S[:, 4:])
+        vi_map, movement = with_aligned_base_frame(vi_map, mission, T_G_M)
+    sigma = _sigma(options)
+    added = AbsolutePoses.filled(
+        len(rows),
+        vertex=rows,
+        timestamp_ns=vi_map.vertices.timestamp_ns[rows],
+        sensor_id=np.tile(words, (len(rows), 1)),
+        T_G_S=T_G_S,
+        covariance=np.tile(np.diag(sigma**2), (len(rows), 1, 1)),
+    )
+    table = AbsolutePoses.concatenate([vi_map.absolute_poses, added])
+    return vi_map.replace(absolute_poses=table), int(np.count_nonzero(~chosen)), movement
+
+
+def as_odometry(
+    vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
+) -> tuple[VIMap, int]:
+    """Join neighbouring vertices of a mission (row) by the motion of a trajectory.
+
+    Returns:
+        The map, and the number of pairs of neighbours that the trajectory does not cover.
+
+    Raises:
+        UserError: Nothing of the trajectory is at the time of the mission, or the mission has odometry
+            edges and `options.replace` is not set.
+    """
+    vi_map = _without_odometry(vi_map, mission, trajectory.source, replace=options.replace)
+    rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
+    stamps = vi_map.vertices.timestamp_ns[rows]
+    T_R_S, covered = _at(trajectory, stamps, options)
+    first = np.flatnonzero(covered[:-1] & covered[1:])
+    if not len(first):
+        raise _no_overlap(trajectory, stamps)
+    words = content_words(vi_map, mission, "odometry", trajectory.times_ns, trajectory.T_R_B)
+    T_I_S = mounting(vi_map, mission, options.sensor_id)
+    keys = {"topic": "", "description": "trajectory of another program"}
+    vi_map = with_sensor(vi_map, mission, MissionSensor.ODOMETRY_6DOF, words, T_I_S, keys)
+    edges = _edges(rows[first], stamps, first, T_R_S, words, options)
+    table = TransformationEdges.concatenate([vi_map.transformation_edges, edges])
+    return vi_map.replace(transformation_edges=table), len(rows) - 1 - len(first)
+
+
+def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
+    """Return a map of one mission: a vertex per pose, joined by odometry edges.
+
+    The frame of the trajectory becomes the mission's; velocities are those of the file, or of the motion.
+
+    Raises:
+        UserError: There are fewer than two poses.
+    """
+    count = len(trajectory)
+    if count < 2:
+        raise UserError(f"{trajectory.source}: a mission needs two poses, and there is {count}")
+    times = trajectory.times_ns
+    words = content_words(_NO_MISSION, 0, _ALONG, times, trajectory.T_R_B)
+    rng = np.random.default_rng(words)
+    missions = Missions.filled(
+        1, id=random_ids(1, rng), baseframe=[0], root_vertex=[0], backbone=[Backbone.ODOMETRY]
+    )
+    zeros = np.zeros((count, 3))
+    biases = (trajectory.gyro_bias, trajectory.accel_bias)
+    gyro_bias, accel_bias = (zeros if bias is None else bias for bias in biases)
+    p, seconds = trajectory.T_R_B[:, 4:], (times - times[0]) * 1e-9
+    v_M = np.gradient(p, seconds, axis=0) if trajectory.v_R is None else trajectory.v_R
+    vi_map = VIMap(
+        missions=missions,
+        baseframes=BaseFrames.filled(1, id=random_ids(1, rng)),
+        vertices=Vertices.filled(
+            count,
+            id=random_ids(count, rng),
+            mission=np.zeros(count, dtype=np.int32),
+            T_M_I=trajectory.T_R_B,
+            v_M=v_M,
+            gyro_bias=gyro_bias,
+            accel_bias=accel_bias,
+            timestamp_ns=times,
+        ),
+    )
+    keys = {"topic": "", "description": "trajectory of another program"}
+    vi_map = with_sensor(vi_map, 0, MissionSensor.ODOMETRY_6DOF, words, se3.identity(), keys)
+    first = np.arange(count - 1)
+    edges = _edges(first, times, first, trajectory.T_R_B, words, options)
+    return vi_map.replace(transformation_edges=edges)
+
+
+def nearest(stamps: I64, times: I64) -> I64:
+    """Return the index (N,) of the stamp (V,) that is nearest to each time (N,)."""
+    after = np.clip(np.searchsorted(stamps, times), 1, max(len(stamps) - 1, 1))
+    is_before = times - stamps[after - 1] <= stamps[np.minimum(after, len(stamps) - 1)] - times
+    return np.asarray(np.where(is_before, after - 1, np.minimum(after, len(stamps) - 1)))
+
+
+_NO_MISSION = VIMap(missions=Missions.filled(1))
+
+
+def _at(trajectory: Trajectory, stamps: I64, options: TrajectoryOptions) -> tuple[F64, Mask]:
+    gap_ns = round(options.max_gap_s * 1e9)
+    return interpolate_poses(trajectory.times_ns, trajectory.T_R_B, stamps, max_gap_ns=gap_ns)
+
+
+def _edges(
+    from_vertex: I64,
+    stamps: I64,
+    first: I64,
+    T_R_S: F64,
+    words: U64,
+    options: TrajectoryOptions,
+) -> TransformationEdges:
+    """Return edges from poses `first` to the next; variances grow with time."""
+    count, rng = len(first), np.random.default_rng(words)
+    seconds = (stamps[first + 1] - stamps[first]) * 1e-9
+    return TransformationEdges.filled(
+        count,
+        id=random_ids(count, rng),
+        kind=np.full(count, int(TransformationKind.ODOMETRY)),
+        from_vertex=from_vertex,
+        to_vertex=from_vertex + 1,
+        T_A_B=se3.relative(T_R_S[first], T_R_S[first + 1]),
+        covariance=seconds[:, None, None] * np.diag(_sigma(options) ** 2),
+        sensor_id=np.tile(words, (count, 1)),
+    )
+
+
+def _sigma(options: TrajectoryOptions) -> F64:
+    return np.repeat([options.position_sigma_m, np.deg2rad(options.orientation_sigma_deg)], 3)
+
+
+def without_absolute_poses(
+    vi_map: VIMap, mission: int, source: str, *, replace: bool, flag: str = "replace"
+) -> VIMap:
+    """Remove the absolute poses of a mission (row) and the sensors that nothing else needs.
+
+    Raises:
+        UserError: There are some, and `replace` is not set.
+    """
+    table = vi_map.absolute_poses
+    of_mission = vi_map.vertices.mission[table.vertex] == mission
+    if of_mission.any() and not replace:
+        raise UserError(
+            f"{source}: the mission has {np.count_nonzero(of_mission)} absolute poses already: give --{flag} "
+            "to remove them first"
+        )
+    kept = vi_map.replace(absolute_poses=table.take(~of_mission))
+    return _without_unused(
+        kept, mission, table.sensor_id[of_mission], kept.absolute_poses.sensor_id
+    )
+
+
+def _without_odometry(vi_map: VIMap, mission: int, source: str, *, replace: bool) -> VIMap:
+    table = vi_map.transformation_edges
+    of_mission = (vi_map.vertices.mission[table.from_vertex] == mission) & (
+        table.kind == TransformationKind.ODOMETRY
+    )
+    if of_mission.any() and not replace:
+        raise UserError(
+            f"{source}: the mission has {np.count_nonzero(of_mission)} odometry edges already: give "
+            "--replace to remove them first"
+        )
+    kept = vi_map.replace(transformation_edges=table.take(~of_mission))
+    measured = kept.transformation_edges.sensor_id
+    return _without_unused(kept, mission, table.sensor_id[of_mission], measured)
+
+
+def _without_unused(vi_map: VIMap, mission: int, removed: U64, measured: U64) -> VIMap:
+    """Remove those of some sensors (N, 2) without measurements that no other mission has."""
+    others = np.delete(vi_map.missions.sensor_id, mission, axis=0).reshape(-1, 2)
+    used = set(map(tuple, np.concatenate([measured, others]).tolist()))
+    words = [row for row in np.unique(removed, axis=0).tolist() if any(row)]
+    unused = [row for row in words if tuple(row) not in used]
+    return without_sensors(vi_map, np.array(unused, dtype=np.uint64).reshape(-1, 2))
+
+
+def _no_overlap(trajectory: Trajectory, stamps: I64) -> UserError:
+    spans = [
+        f"{times[0] * 1e-9:.3f} to {times[-1] * 1e-9:.3f} s" if len(times) else "nothing"
+        for times in (trajectory.times_ns, stamps)
+    ]
+    return UserError(
+        f"{trajectory.source}: has poses from {spans[0]}, the mission vertices from {spans[1]}: give "
+        "--time_offset_s, or a larger --max_gap_s"
+    )

@@ -1,0 +1,239 @@
+"""Matches guided by verified closures: landmarks of a place near keypoints of its query.
+
+A search for the nearest descriptors of the whole map misses landmarks whose place in the list is taken
+by others. A closure predicts where the landmarks of its place are in the images of its query; there a
+similar descriptor suffices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.landmarks.covariance import landmark_covariance
+from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
+from maplab_py.algorithms.loop_closure.closure_table import Closures
+from maplab_py.algorithms.loop_closure.features import findable_landmarks, points_in_mission
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.geometry import se3, so3
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vision.descriptors import hamming, pack_words
+from maplab_py.vision.rays_and_points import Rays, points_near_rays
+
+_RADIUS_PX = 12.0
+_MAX_SIGMAS, _BIT_FACTOR = 2.0, 0.75
+"""Limits of matches. Wider ones merge more, but on recorded maps also different points (decision 52)."""
+_MIN_SHARED_LANDMARKS = 5
+"""Vertices that share as many landmarks with the place's vertex belong to the place."""
+_CLOSURES_AT_ONCE = 256
+_DESCRIPTORS = 16
+"""Observations of a landmark whose descriptors are compared."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LandmarkMatches:
+    """Keypoints of queries matched with landmarks (N,)."""
+
+    closure: I64  # row of `Closures`
+    keypoint: I64
+    landmark: I64
+    bits: NDArray[np.int32]  # different bits
+
+    def take(self, rows: I64 | Mask) -> LandmarkMatches:
+        """Return the matches of a mask or rows."""
+        columns = (getattr(self, field.name)[rows] for field in dataclasses.fields(self))
+        return LandmarkMatches(*columns)
+
+
+def guided_matches(
+    vi_map: VIMap, closures: Closures, usable: Mask, options: LoopClosureOptions
+) -> LandmarkMatches:
+    """Match keypoints that observe a landmark with another landmark near by.
+
+    Of each query vertex the usable closure with most inliers counts. A match lies within two deviations
+    of keypoint, landmark and pose, its descriptors differ in at most three quarters of
+    `max_bit_fraction`, and no other keypoint of the image or landmark is more similar.
+
+    Args:
+        vi_map: The map, whose landmarks have a quality.
+        closures: Closures; their landmark rows are not used.
+        usable: Closures (N,) that may be used.
+        options: Tolerances.
+    """
+    rows = np.flatnonzero(usable)
+    rows = rows[np.lexsort((rows, -closures.inlier_count[rows], closures.query_vertex[rows]))]
+    _, first = np.unique(closures.query_vertex[rows], return_index=True)
+    rows = rows[first]
+    search = _Search(vi_map, closures, options)
+    parts = [
+        search.matches(rows[begin : begin + _CLOSURES_AT_ONCE])
+        for begin in range(0, len(rows), _CLOSURES_AT_ONCE)
+    ]
+    empty = np.zeros(0, dtype=np.int64)
+    parts.append(LandmarkMatches(empty, empty, empty, empty.astype(np.int32)))
+    fields = [field.name for field in dataclasses.fields(LandmarkMatches)]
+    return LandmarkMatches(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
+
+
+class _Search:
+    """Data of the map that the searches of all closures use."""
+
+    def __init__(self, vi_map: VIMap, closures: Closures, options: LoopClosureOptions) -> None:
+        self._map, self._closures, self._options = vi_map, closures, options
+        # the tolerance of an inlier is two deviations of a keypoint
+        self._sigma_px = 0.5 * options.ransac_pixel_sigma
+        self._sees = _observations(vi_map)  # (V, L)
+        vertices, landmarks = self._sees.shape
+        rows = np.repeat(np.arange(vertices), np.diff(self._sees.indptr))
+        self._entries = np.append(rows * landmarks + self._sees.indices, -1)
+        self._findable = findable_landmarks(vi_map)
+        findable = np.flatnonzero(self._findable)
+        self._covariance_G = np.zeros((len(vi_map.landmarks), 3, 3))
+        self._covariance_G[findable] = landmark_covariance(vi_map, findable, self._sigma_px)
+        sizes = vi_map.binary_descriptor_size
+        self._bytes = int(sizes.max(initial=0))
+        self._described = (sizes == self._bytes) & (self._bytes > 0)
+        self._words = pack_words(
+            np.ascontiguousarray(vi_map.keypoints.descriptor[:, : self._bytes])
+        )
+
+    def matches(self, rows: I64) -> LandmarkMatches:
+        """Return the matches of some closures (rows)."""
+        vi_map, c = self._map, self._closures
+        problem, landmark = self._landmarks_of_places(rows)
+        mission = vi_map.vertices.mission[c.place_vertex[rows]].astype(np.int64)
+        p_M = points_in_mission(vi_map, landmark, mission[problem])
+        p_I = se3.transform(se3.inverse(c.T_M_I[rows])[problem], p_M)
+        keypoint, of_keypoint = self._keypoints(c.query_vertex[rows])
+        origin_I, ray_I, rad_per_px, seen = keypoint_rays(vi_map, keypoint)
+        keypoint, of_keypoint = keypoint[seen], of_keypoint[seen]
+        origin_I, ray_I, rad_per_px = origin_I[seen], ray_I[seen], rad_per_px[seen]
+        rays = Rays(_starts(of_keypoint, len(rows)), origin_I, ray_I, _RADIUS_PX * rad_per_px)
+        ray, near = points_near_rays(rays, _starts(problem, len(rows)), p_I)
+        offset = p_I[near] - origin_I[ray]
+        depth_m = np.linalg.norm(offset, axis=1)
+        sigma_m = self._sigma_px * rad_per_px[ray] * depth_m
+        covariance = self._covariance_I(rows, of_keypoint[ray], landmark[near], p_I[near])
+        inside = _squared_sigmas(offset, ray_I[ray], covariance, sigma_m)
+        inside_rows = np.flatnonzero(inside <= _MAX_SIGMAS**2)
+        ray, near = ray[inside_rows], near[inside_rows]
+        return self._most_similar(
+            LandmarkMatches(
+                rows[of_keypoint[ray]], keypoint[ray], landmark[near], np.zeros(len(ray), np.int32)
+            )
+        )
+
+    def _landmarks_of_places(self, rows: I64) -> tuple[I64, I64]:
+        """Return landmarks of the places of closures that their queries do not observe.
+
+        Returns:
+            Index into `rows` and landmark (N,), sorted by the first.
+        """
+        c, sees = self._closures, self._sees
+        shared = sees[c.place_vertex[rows]] @ sees.T
+        near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int32) @ sees
+        problem, landmark = near.tocsr().tocoo().coords
+        problem, landmark = problem.astype(np.int64), landmark.astype(np.int64)
+        new = self._findable[landmark] & ~self._is_observed(c.query_vertex[rows][problem], landmark)
+        problem, landmark = problem[new], landmark[new]
+        order = np.lexsort((landmark, problem))
+        return problem[order], landmark[order]
+
+    def _is_observed(self, vertex: I64, landmark: I64) -> Mask:
+        """Return whether vertices (N,) observe landmarks (N,)."""
+        wanted = vertex * self._sees.shape[1] + landmark
+        place = np.searchsorted(self._entries[:-1], wanted)
+        return np.asarray(self._entries[place] == wanted)
+
+    def _keypoints(self, vertices: I64) -> tuple[I64, I64]:
+        """Return the keypoints (N,) of vertices that observe a landmark, and the vertices' index."""
+        vi_map = self._map
+        start = vi_map.keypoint_start[vi_map.frame_start]  # (V + 1,) keypoints of each vertex
+        keypoint = ragged_rows(start, vertices)
+        owner = np.repeat(np.arange(len(vertices)), np.diff(start)[vertices])
+        kept = (vi_map.keypoints.landmark[keypoint] >= 0) & self._described[keypoint]
+        return keypoint[kept], owner[kept]
+
+    def _covariance_I(self, rows: I64, problem: I64, landmark: I64, p_I: F64) -> F64:
+        """Return the covariances (N, 3, 3) of landmarks in the body frames of closures' queries."""
+        c = self._closures
+        covariance_G = self._covariance_G[landmark]
+        mission = self._map.vertices.mission[c.place_vertex[rows]]
+        R_I_M = so3.to_matrix(se3.inverse(c.T_M_I[rows])[:, :4])
+        R_I_G = (R_I_M @ so3.to_matrix(se3.inverse(self._map.T_G_M)[mission, :4]))[problem]
+        J = np.concatenate([-R_I_M[problem], so3.skew(p_I)], axis=2)  # p_I by [position, angle]
+        pose = c.covariance[rows][problem]
+        return np.asarray(
+            R_I_G @ covariance_G @ R_I_G.transpose(0, 2, 1) + J @ pose @ J.transpose(0, 2, 1)
+        )
+
+    def _most_similar(self, near: LandmarkMatches) -> LandmarkMatches:
+        """Return the matches that are the most similar ones of their keypoint and of their landmark."""
+        vi_map = self._map
+        count = np.diff(vi_map.observation_start)[near.landmark]
+        compared = np.minimum(count, _DESCRIPTORS)
+        owner = np.repeat(np.arange(len(compared)), compared)
+        number = np.arange(len(owner)) - np.repeat(np.cumsum(compared) - compared, compared)
+        step = number * count[owner] // np.maximum(compared[owner], 1)
+        other = vi_map.observations[vi_map.observation_start[near.landmark[owner]] + step]
+        bits = hamming(self._words, near.keypoint[owner], self._words, other)
+        bits[~self._described[other]] = 8 * self._bytes
+        fewest = np.full(len(near.keypoint), 8 * self._bytes, dtype=np.int32)
+        np.minimum.at(fewest, owner, bits)
+        near = dataclasses.replace(near, bits=fewest)
+        limit = _BIT_FACTOR * self._options.max_bit_fraction * 8 * self._bytes
+        near = near.take(fewest <= limit)
+        near = near.take(_first(near.bits, near.closure, near.keypoint))
+        frame = vi_map.keypoint_frame[near.keypoint].astype(np.int64)
+        return near.take(
+            _first(near.bits, near.closure, near.landmark * len(vi_map.frames) + frame)
+        )
+
+
+def _first(bits: NDArray[np.int32], closure: I64, key: I64) -> I64:
+    """Return the row of the fewest bits of every closure and key, in order."""
+    order = np.lexsort((np.arange(len(bits)), bits, key, closure))
+    begins = np.ones(len(order), dtype=np.bool_)
+    begins[1:] = (np.diff(closure[order]) != 0) | (np.diff(key[order]) != 0)
+    return np.sort(order[begins])
+
+
+def _starts(group: I64, groups: int) -> I64:
+    return starts_of_counts(np.bincount(group, minlength=groups))
+
+
+def _squared_sigmas(offset: F64, ray: F64, covariance: F64, sigma_m: F64) -> F64:
+    """Return squared Mahalanobis distances (N,) of points from rays, two degrees of freedom.
+
+    Args:
+        offset: From the camera to the point (N, 3).
+        ray: Unit rays (N, 3).
+        covariance: Of the points (N, 3, 3).
+        sigma_m: Standard deviation (N,) of the ray at the point.
+    """
+    helper = np.eye(3)[np.argmin(np.abs(ray), axis=1)]
+    u = np.cross(ray, helper)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    across = np.stack([u, np.cross(ray, u)], axis=1)  # (N, 2, 3)
+    error = np.einsum("nij,nj->ni", across, offset)
+    S = across @ covariance @ across.transpose(0, 2, 1)
+    S += np.square(sigma_m)[:, None, None] * np.eye(2)
+    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(S, error[:, :, None])[:, :, 0]))
+
+
+def _observations(vi_map: VIMap) -> Any:
+    """Return the matrix (V, L) of ones where a vertex observes a landmark."""
+    from scipy.sparse import csr_array
+
+    rows = vi_map.observations
+    pair = vi_map.keypoint_vertex[rows], vi_map.keypoints.landmark[rows]
+    shape = (len(vi_map.vertices), len(vi_map.landmarks))
+    sees = csr_array((np.ones(len(rows), dtype=np.int32), pair), shape=shape)
+    sees.sum_duplicates()
+    sees.data[:] = 1
+    return sees

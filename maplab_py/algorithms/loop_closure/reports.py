@@ -1,0 +1,178 @@
+"""Verdicts on loop closures, and the reports of the commands that find, list and remove them."""
+
+from __future__ import annotations
+
+import dataclasses
+from enum import Enum
+
+from maplab_py.report import Report
+
+
+class Verdict(Enum):
+    """Outcome of a candidate."""
+
+    ACCEPTED = "accepted"
+    FEW_INLIERS = "too few inliers"
+    LOW_RATIO = "too low a part of inliers"
+    TILTED = "gravity deviates"
+    IMPLAUSIBLE = "corrects more than the mission can have drifted"
+    AMBIGUOUS = "looks the same as another place"
+    NO_SUPPORT = "no closures nearby agree"
+    CONTRADICTED = "closures nearby disagree"
+    REMOVED = "removed by hand"
+    UNCERTAIN = "too uncertain rotation"
+    SMALL_OVERLAP = "clouds overlap too little"
+    BAD_FIT = "clouds do not fit"
+    DEGENERATE = "clouds do not fix the position"
+
+
+OF_CLOUDS = (Verdict.SMALL_OVERLAP, Verdict.BAD_FIT, Verdict.DEGENERATE)
+"""Verdicts of gates that only closures between clouds have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopClosureReport(Report):
+    """Counts of a search and the use of its result."""
+
+    query_vertices: int = 0
+    database_landmarks: int = 0
+    descriptor_matches: int = 0
+    candidates: int = 0  # pairs of a query vertex and a place that were verified
+    accepted: int = 0
+    accepted_vertices: int = 0
+    refused: dict[str, int] = dataclasses.field(default_factory=dict)  # by reason
+    missions_joined: tuple[str, ...] = ()  # "short id - short id: closures"
+    largest_correction_m: float = 0.0
+    median_correction_m: float = 0.0
+    edges_added: int = 0
+    landmarks_merged: int = 0
+    observations_moved: int = 0
+    merges_refused: dict[str, int] = dataclasses.field(default_factory=dict)  # by reason
+    notes: tuple[str, ...] = ()
+    reason: str = ""  # why there is no result, empty when there is one
+
+    @property
+    def failure(self) -> str:
+        """Return why the search has no result."""
+        return self.reason
+
+    @property
+    def advice(self) -> str:
+        """Tell how to get more closures, or what to do with those that were accepted."""
+        drifted = self.refused.get(Verdict.IMPLAUSIBLE.value, 0)
+        if self.candidates and drifted > self.accepted:
+            return f"{drifted} closures correct more than the drift allows: relax first"
+        if self.candidates and not self.accepted:
+            return "no closure was accepted: lc_report --which=refused --sort_by=near_miss, why"
+        if self.landmarks_merged:
+            return "landmarks were merged: optvi adjusts the map to them"
+        return ""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosureLine:
+    """A closure: the query vertex A was localised in the place around vertex B."""
+
+    id: str
+    query: str  # mission
+    query_s: float  # time since the mission's first vertex
+    place: str
+    place_s: float
+    matches: int
+    inliers: int
+    ratio: float
+    correction_m: float  # change of the query's position at detection time
+    correction_deg: float
+    gap_m: float  # distance of the map's current relative pose from the closure
+    gap_deg: float
+    tilt_deg: float
+    support: int  # number of nearby query vertices with consistent closures
+    merged: int  # pairs of landmarks whose merge it supports
+    verdict: str  # accepted, or the reason for the refusal
+    use: str  # merge, edge, relax, anchor; empty if unused
+    weight: float  # weight after relaxation, 1 = full
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosureReport(Report):
+    """The recorded closures of a map."""
+
+    recorded: int
+    accepted: int
+    refused: dict[str, int]
+    largest_gap_m: float  # of accepted ones
+    shown: int
+    file: str
+    closures: tuple[ClosureLine, ...]
+    notes: tuple[str, ...] = ()
+
+    def display(self) -> ClosureTable:
+        """Return the closures with what was decided on them in the first columns."""
+        reasons = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
+        summary = (
+            f"{self.recorded} recorded, {self.accepted} accepted, largest gap "
+            f"{self.largest_gap_m:.3f} m; refused: {reasons or 'none'}; {self.shown} shown"
+            + (f"; written to {self.file}" if self.file else "")
+        )
+        names = [field.name for field in dataclasses.fields(ShownClosure)]
+        lines = tuple(
+            ShownClosure(**{name: getattr(line, name) for name in names}) for line in self.closures
+        )
+        return ClosureTable(lines, summary, self.notes)
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownClosure:
+    """A closure as it is shown."""
+
+    id: str
+    query: str
+    query_s: float
+    place: str
+    place_s: float
+    inliers: int
+    verdict: str
+    weight: float
+    gap_m: float
+    correction_m: float
+    matches: int
+    support: int
+    ratio: float
+    tilt_deg: float
+    gap_deg: float
+    correction_deg: float
+    merged: int
+    use: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosureTable:
+    """What is shown of the recorded closures."""
+
+    closures: tuple[ShownClosure, ...] = dataclasses.field(metadata={"title": ""})
+    summary: str = dataclasses.field(metadata={"is_prose": True})
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosureRemovalReport(Report):
+    """Entities removed and restored with closures."""
+
+    closures: tuple[str, ...]  # prefixes of their ids
+    edges_removed: int
+    landmarks_restored: int
+    observations_moved: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingReport(Report):
+    """Training data of a projection and its separation of landmarks."""
+
+    descriptors: int
+    tracks: int
+    descriptor_size: int  # bytes
+    dimensions: int
+    same_distance: float  # median distance of two descriptors of one landmark
+    other_distance: float  # of two landmarks
+    file: str = ""

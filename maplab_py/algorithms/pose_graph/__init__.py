@@ -1,1 +1,0 @@
-"""Manipulation of pose graphs: uncertainties of edges, disturbed vertices, missions laid apart."""

@@ -1,0 +1,1 @@
+"""Manipulation of pose graphs: edge uncertainties, disturbed vertices, layout of missions."""

@@ -1,0 +1,192 @@
+"""Pose graphs of other programs: optimise them as they are, or turn them into maps and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.relaxation.map_edges import (
+    has_odometry_backbone,
+    loop_edges,
+    trajectory_edges,
+)
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.robust import optimize_robustly
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.errors import MapError
+from maplab_py.estimation.kernels.connected_parts import connected_parts
+from maplab_py.estimation.symbolic.sources import PoseError
+from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
+from maplab_py.geometry import so3
+from maplab_py.interop.g2o import PoseGraph
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import (
+    Backbone,
+    BaseFrames,
+    LoopClosureEdges,
+    Missions,
+    TransformationEdges,
+    Vertices,
+    VIMap,
+)
+from maplab_py.vimap.ids import random_ids
+
+_ROBOT_SHIFT = 56
+"""Ids above 2^56 are a robot's letter and a number (GTSAM's symbols)."""
+_STEP_NS = 1_000_000_000
+
+
+def is_odometry(graph: PoseGraph) -> Mask:
+    """Tell which edges (E,) join a pose with the next one of the same robot; first of each pair."""
+    a, b = graph.id[graph.first], graph.id[graph.second]
+    chain = (b - a == 1) & (a >> _ROBOT_SHIFT == b >> _ROBOT_SHIFT)
+    _, earliest = np.unique(np.where(chain, graph.first, -1), return_index=True)
+    is_first = np.zeros(len(a), dtype=np.bool_)
+    is_first[earliest] = True
+    return np.asarray(chain & is_first)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OptimizedGraph:
+    """Poses of a graph, and what became of its edges."""
+
+    T_G_V: F64  # (V, 7)
+    weight: F64  # (E,) 1 = trusted, 0 = switched off
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
+def optimize_graph(
+    graph: PoseGraph, options: RelaxationOptions, *, progress: Progress = SILENT
+) -> OptimizedGraph:
+    """Optimise a pose graph with its own objective, sum |Log(T_measured^-1 T_A_B)|^2.
+
+    Fixed poses stay, or the first one of each connected part where none is fixed. With robustness
+    all edges but odometry may be switched off.
+
+    Raises:
+        EstimationError: The poses are not determined, or not finite.
+    """
+    edges = _edges(graph)
+    is_plain = options.robustness == "none"
+    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else is_odometry(graph)
+    if np.all(chain):
+        options = dataclasses.replace(options, robustness="none")
+    is_free = np.ones(len(graph.id), dtype=np.bool_)
+    is_free[_anchors(graph)] = False
+    trajectory, loops = edges.take(np.flatnonzero(chain)), edges.take(np.flatnonzero(~chain))
+    solution = optimize_robustly(
+        graph.T_G_V, is_free, trajectory, loops, TiltPriors.none(), options, progress
+    )
+    weight = np.ones(len(edges))
+    weight[~chain] = solution.weight
+    return OptimizedGraph(
+        solution.T_G_I, weight, solution.cost_before, solution.cost_after, solution.iterations
+    )
+
+
+def _edges(graph: PoseGraph) -> RelativePoses:
+    try:
+        W = np.swapaxes(np.linalg.cholesky(graph.information), 1, 2)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(graph.information)[:, 0]
+        row = int(np.argmin(smallest))
+        names = f"{graph.id[graph.first[row]]} - {graph.id[graph.second[row]]}"
+        raise MapError(f"the information of edge {names} is not positive definite") from None
+    return RelativePoses(graph.first, graph.second, graph.T_A_B, W, PoseError.LOGARITHM)
+
+
+def _anchors(graph: PoseGraph) -> I64:
+    """Return the poses that stay."""
+    part = connected_parts(len(graph.id), graph.first, graph.second)
+    return np.union1d(graph.fixed, part[~np.isin(part, part[graph.fixed])])
+
+
+def map_of_graph(graph: PoseGraph) -> VIMap:
+    """Return a map: odometry along each robot, every other edge a loop closure.
+
+    A robot's poses are one mission as far as odometry joins them.
+    Vertices lie one second apart, as the format has no times.
+    """
+    content = hashlib.blake2b(graph.T_G_V.tobytes() + graph.T_A_B.tobytes(), digest_size=16)
+    rng = np.random.default_rng(int.from_bytes(content.digest(), "little"))
+    chain, vertices = is_odometry(graph), len(graph.id)
+    follows = np.zeros(vertices, dtype=np.bool_)
+    follows[graph.second[chain]] = True
+    first = np.flatnonzero(~follows)
+    mission, count = np.cumsum(~follows) - 1, len(first)
+    covariance = _split_covariance(np.linalg.inv(graph.information), graph.T_A_B)
+    odometry, loops = np.flatnonzero(chain), np.flatnonzero(~chain)
+    return VIMap(
+        missions=Missions.filled(
+            count,
+            id=random_ids(count, rng),
+            baseframe=np.arange(count),
+            root_vertex=first,
+            backbone=np.full(count, Backbone.ODOMETRY),
+        ),
+        baseframes=BaseFrames.filled(
+            count, id=random_ids(count, rng), is_known=np.ones(count, dtype=np.bool_)
+        ),
+        vertices=Vertices.filled(
+            vertices,
+            id=random_ids(vertices, rng),
+            mission=mission,
+            T_M_I=graph.T_G_V,
+            timestamp_ns=np.arange(vertices) * _STEP_NS,
+        ),
+        transformation_edges=TransformationEdges.filled(
+            len(odometry),
+            id=random_ids(len(odometry), rng),
+            from_vertex=graph.first[odometry],
+            to_vertex=graph.second[odometry],
+            T_A_B=graph.T_A_B[odometry],
+            covariance=covariance[odometry],
+        ),
+        loop_closure_edges=LoopClosureEdges.filled(
+            len(loops),
+            id=random_ids(len(loops), rng),
+            from_vertex=graph.first[loops],
+            to_vertex=graph.second[loops],
+            T_A_B=graph.T_A_B[loops],
+            covariance=covariance[loops],
+        ),
+    )
+
+
+def _split_covariance(covariance: NDArray[Any], T_A_B: F64, *, back: bool = False) -> F64:
+    """Turn the position part of covariances (N, 6, 6) from B to A (or back), to first order."""
+    R = so3.to_matrix(T_A_B[:, :4])
+    turn = np.tile(np.eye(6), (len(R), 1, 1))
+    turn[:, :3, :3] = np.swapaxes(R, 1, 2) if back else R
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+
+
+def graph_of_map(vi_map: VIMap, options: RelaxationOptions) -> PoseGraph:
+    """Return the pose graph that `relax` works on: trajectories with their drift, loop closures."""
+    closures = vi_map.loop_closure_edges
+    as_given = has_odometry_backbone(vi_map)[closures.from_vertex]
+    loops = loop_edges(closures, options, as_given=as_given)
+    parts = trajectory_edges(vi_map, options).followed_by(loops)
+    W = parts.sqrt_information
+    covariance = np.linalg.inv(np.swapaxes(W, 1, 2) @ W)
+    back = _split_covariance(covariance, parts.T_A_B, back=True)
+    information = np.asarray(np.linalg.inv(back), dtype=np.float64)
+    robot = vi_map.vertices.mission.astype(np.int64)
+    number = np.arange(len(robot)) - vi_map.vertex_start[robot]
+    single_mission = len(vi_map.missions) == 1
+    ids = number if single_mission else ((robot + ord("a")) << _ROBOT_SHIFT) + number
+    return PoseGraph(
+        id=ids,
+        T_G_V=vi_map.T_G_I,
+        first=parts.from_vertex,
+        second=parts.to_vertex,
+        T_A_B=parts.T_A_B,
+        information=0.5 * (information + np.swapaxes(information, 1, 2)),
+        fixed=np.zeros(0, dtype=np.int64),
+    )

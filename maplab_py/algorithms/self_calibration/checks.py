@@ -1,0 +1,159 @@
+"""Calibration with checks that formal deviations cannot replace.
+
+Formal deviations follow from the noise of the measurements. On recorded maps they are several times
+too small for the camera's position, because they do not contain errors of the models (decisions 97
+and 99). Hence the camera's position is limited, and results on parts of the data are compared.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
+from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
+from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
+from maplab_py.algorithms.self_calibration.segments.selection import collect
+from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
+from maplab_py.algorithms.self_calibration.uncertainty.model import Verdict
+from maplab_py.array_types import I64
+from maplab_py.errors import UserError
+from maplab_py.estimation.terms.cameras import EXTRINSICS
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors import SensorSet
+from maplab_py.sensors.calibration_transfer import with_calibration_of, with_sensors_of
+from maplab_py.vimap import VIMap
+
+_POSITION = "extrinsics_translation"
+
+Selector = Callable[
+    [VIMap, SelfCalibrationOptions, NDArray[np.integer] | None, Progress], Sequence[I64]
+]
+"""Select segments (vertex rows) of some missions (rows, None = all) of a map."""
+
+
+def camera_shift_m(result: Calibration) -> float:
+    """Return the largest distance [m] by which a camera moved on the IMU."""
+    shift_m: dict[int, list[float]] = {}
+    for parameter, change in zip(result.parameters.each, result.change.tolist(), strict=True):
+        if parameter.block == EXTRINSICS and parameter.column < 3:
+            shift_m.setdefault(parameter.row, []).append(change)
+    return max((float(np.linalg.norm(shift)) for shift in shift_m.values()), default=0.0)
+
+
+def calibrate_with_checks(
+    vi_map: VIMap,
+    options: SelfCalibrationOptions,
+    *,
+    max_camera_shift_m: float = 0.0,
+    parts: int = 0,
+    database: SegmentDatabase | None = None,
+    missions: NDArray[np.integer] | None = None,
+    batch: bool = False,
+    selector: Selector | None = None,
+    progress: Progress = SILENT,
+) -> tuple[SensorSet, SegmentDatabase | None, SelfCalibrationReport]:
+    """Calibrate; where a camera moves too far, keep its position and calibrate the rest again.
+
+    Args:
+        vi_map: The map.
+        options: What to estimate.
+        max_camera_shift_m: How far a camera may move from where it was; 0 = no limit.
+        parts: Also calibrate on so many parts of the data, and report deviations that are at least
+            the standard error of their mean; 0 = none.
+        database: Segments of earlier sessions.
+        missions: Missions (rows, None = all).
+        batch: Use all data instead of segments.
+        selector: Another way to select segments; then there is no database.
+        progress: Shown one line an iteration.
+
+    Raises:
+        EstimationError: The data do not determine the calibration.
+        UserError: The missions were recorded with different devices.
+    """
+    if parts == 1 or parts < 0:
+        raise UserError("a spread needs two parts of the data at least")
+    device, collected = device_of(vi_map, missions), None
+    if not batch and selector is None:
+        if options.selection == "information_gain":
+            raise UserError("selection by information gain needs its selector (maplab_py.research)")
+        collected, _ = collect(vi_map, options, database, missions=missions, progress=progress)
+
+    def estimate(
+        options: SelfCalibrationOptions,
+    ) -> tuple[SensorSet, Calibration, SelfCalibrationReport]:
+        if batch:
+            result, report = calibrate(vi_map, options, missions=missions, progress=progress)
+            return result.sensors, result, report
+        if collected is not None:
+            segments, count = collected.vi_map, len(collected)
+        else:
+            assert selector is not None
+            rows = selector(vi_map, options, missions, progress)
+            segments, count = extract_submap(vi_map, np.unique(np.concatenate(rows))), len(rows)
+        result, report = calibrate(segments, options, segments=count, progress=progress)
+        source = device_of(segments)
+        if device == source:
+            return with_sensors_of(vi_map.sensors, result.sensors), result, report
+        sensors = with_calibration_of(vi_map.sensors, device, result.sensors, source)
+        return sensors, result, report
+
+    sensors, result, report = estimate(options)
+    shift_m = camera_shift_m(result)
+    rest = sorted(options.estimated() - {_POSITION})
+    if not 0.0 < max_camera_shift_m < shift_m or not rest:
+        return sensors, collected, _with_spread(report, result, options, parts, progress)
+    fewer = dataclasses.replace(options, states=",".join(rest))
+    sensors, result, again = estimate(fewer)
+    again = _with_spread(again, result, fewer, parts, progress)
+    return sensors, collected, _with_kept_positions(again, report, shift_m)
+
+
+def _with_spread(
+    report: SelfCalibrationReport,
+    result: Calibration,
+    options: SelfCalibrationOptions,
+    parts: int,
+    progress: Progress,
+) -> SelfCalibrationReport:
+    """Return the report with deviations that are at least the spread of results on parts.
+
+    The vertices are split into runs of equal length. Each is calibrated alone, from the result. The
+    mean of n results has the standard deviation of their spread over sqrt(n).
+    """
+    if not parts:
+        return report
+    problem = result.solution.problem
+    vi_map = problem.vi_map.replace(sensors=result.sensors)
+    lenient = dataclasses.replace(options, keep_unobservable_at_prior=True)
+    changes = []
+    for number, rows in enumerate(np.array_split(np.sort(problem.selection.vertices), parts)):
+        progress.step(number, parts, "calibrate on parts")
+        part, _ = calibrate(extract_submap(vi_map, rows), lenient)
+        if part.parameters.names == result.parameters.names:
+            changes.append(part.change)
+    if len(changes) < 2:
+        raise UserError(f"there are too few data to cut them into {parts} parts")
+    spread = np.std(changes, axis=0, ddof=1) / np.sqrt(len(changes))
+    uncertainty = dataclasses.replace(result.uncertainty, spread=spread)
+    estimates = dataclasses.replace(result, uncertainty=uncertainty).estimates()
+    return dataclasses.replace(report, parameters=estimates)
+
+
+def _with_kept_positions(
+    report: SelfCalibrationReport, rejected: SelfCalibrationReport, shift_m: float
+) -> SelfCalibrationReport:
+    """Return a report with the camera positions of the rejected calibration, as they were before."""
+    verdict = Verdict.KEPT.text(1e3 * shift_m)
+    estimated = {estimate.parameter for estimate in report.parameters}
+    kept = (
+        dataclasses.replace(estimate, after=estimate.before, change_in_sigmas=0.0, verdict=verdict)
+        for estimate in rejected.parameters
+        if estimate.parameter not in estimated
+    )
+    return dataclasses.replace(report, parameters=(*report.parameters, *kept))

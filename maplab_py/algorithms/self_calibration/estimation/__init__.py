@@ -1,0 +1,1 @@
+"""The least-squares problem of motion segments and its solution."""

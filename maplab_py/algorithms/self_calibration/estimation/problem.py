@@ -1,0 +1,196 @@
+"""The least-squares problem of segments, or of whole missions (Schneider 2019, section 5.4)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters, parameters_of
+from maplab_py.algorithms.self_calibration.estimation.partitions import (
+    BiasGaps,
+    bias_gaps,
+    parallax_rad,
+    partitions,
+    runs_of,
+    split_landmarks,
+)
+from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.vi_optimization.fixed_states import hold_unconstrained
+from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, MapTerms, collect_terms
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.blocks import ParameterBlocks
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.problem.gauge import first_of_each, fix_position_and_heading
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
+from maplab_py.estimation.terms.cameras import EXTRINSICS
+from maplab_py.estimation.terms.inertial import BiasWalkTerm
+from maplab_py.estimation.terms.prior import VertexVectorPrior
+from maplab_py.estimation.terms.protocol import FactorTerm, FixedMeasurements
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.selection import keep_rows
+
+
+class CalibrationPrior(FixedMeasurements):
+    """A weak prior on the calibration: one factor over all its parameters."""
+
+    name = "calibration prior"
+    loss = (Loss.NONE, 1.0)
+
+    def __init__(self, parameters: Parameters, states: States, mean: ParameterBlocks) -> None:
+        """Tie the parameters of states of this layout to the values of some blocks."""
+        self._parameters, self._mean = parameters, mean
+        node, direction = parameters.nodes(states)
+        unique, where = np.unique(node, return_inverse=True)
+        self.nodes = unique[None, :]
+        self._weight = 1.0 / parameters.prior_sigma
+        self._jacobian = np.zeros((1, len(parameters), 3 * len(unique)))
+        column = 3 * np.asarray(where).reshape(-1) + direction
+        self._jacobian[0, np.arange(len(parameters)), column] = self._weight
+
+    def evaluate(self, states: States) -> tuple[F64, F64]:
+        """Return whitened residuals (1, k) and Jacobians (1, k, 3 n); rotations to first order."""
+        change = self._parameters.difference(states.blocks, self._mean)
+        return (change * self._weight)[None, :], self._jacobian
+
+
+class GapWalkTerm(BiasWalkTerm):
+    """Random walk of the biases across the gaps between the segments of a mission."""
+
+    name = "bias walk across gaps"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SegmentProblem(MapProblem):
+    """The problem of a map with its calibration parameters and partitions."""
+
+    parameters: Parameters
+    partition: I64  # (V,) label of every vertex of the map
+    gaps: int  # bridged by the random walk of the biases
+
+    @property
+    def num_partitions(self) -> int:
+        """Number of partitions."""
+        return int(self.partition.max(initial=-1)) + 1
+
+
+def build_segment_problem(
+    vi_map: VIMap,
+    options: SelfCalibrationOptions,
+    *,
+    missions: NDArray[np.integer] | None = None,
+    robust: bool = True,
+    prior_mean: ParameterBlocks | None = None,
+    progress: Progress = SILENT,
+) -> SegmentProblem:
+    """Build the problem of all segments of a map, or of whole missions (rows, None = all).
+
+    Args:
+        vi_map: Segments, or a whole map.
+        options: What to estimate.
+        missions: Which missions to use.
+        robust: Use the loss of the options and reject outliers. Otherwise every measurement has its
+            full weight, for information instead of estimates.
+        prior_mean: Mean of the calibration prior; None = the map's calibration.
+        progress: Shown while kernels are compiled.
+
+    Raises:
+        EstimationError: There is nothing to estimate.
+        MapError: Calibrations are missing.
+    """
+    partition = partitions(vi_map, options.min_shared_landmarks)
+    vi_map = split_landmarks(vi_map, partition)
+    has_parallax = parallax_rad(vi_map) >= np.deg2rad(options.min_parallax_deg)
+    vi_map = keep_rows(vi_map, landmarks=np.flatnonzero(has_parallax))
+    parts = collect_terms(vi_map, vi_options(options, robust), missions=missions, progress=progress)
+    states = parts.states
+    parameters = parameters_of(parts.rig, len(parts.factors.imus), states, options)
+    if not len(parameters):
+        raise EstimationError("nothing to calibrate: neither tracks nor inertial edges")
+    gaps = bias_gaps(vi_map)
+    terms = [
+        *parts.terms,
+        CalibrationPrior(parameters, states, prior_mean or states.blocks),
+        *_motion_priors(parts, options),
+        *_gap_walks(parts, gaps),
+    ]
+    problem = Problem(states, parts.visual, terms)
+    held = _fix_gauge(problem, parts, parameters, partition)
+    map_problem = parts.map_problem(problem, held, "one keyframe a partition")
+    return SegmentProblem(
+        **vars(map_problem), parameters=parameters, partition=partition, gaps=len(gaps.before)
+    )
+
+
+def vi_options(options: SelfCalibrationOptions, robust: bool = True) -> VIOptimizationOptions:
+    """Return the options with which the terms of the problem are built."""
+    names = options.estimated()
+    return VIOptimizationOptions(
+        fix_ncamera_intrinsics=False,
+        fix_ncamera_extrinsics_rotation=False,
+        fix_ncamera_extrinsics_translation=False,
+        fix_ncamera_time_offset="time_offset" not in names,
+        fix_imu_intrinsics="imu" not in names,
+        loss=options.loss if robust else "none",
+        retriangulate_doubtful=robust,
+        gate_reprojection_error_px=options.gate_reprojection_error_px,
+    )
+
+
+def _motion_priors(parts: MapTerms, options: SelfCalibrationOptions) -> list[FactorTerm]:
+    """Return weak priors on biases and velocity of the first vertex of every run.
+
+    They keep these determined where nothing moves.
+    """
+    states = parts.states
+    first = parts.selection.rows(first_of_each(runs_of(parts.vi_map)))
+    first = first[first >= 0]
+    return [
+        VertexVectorPrior(kind, first, values[first], sigma)
+        for kind, values, sigma in (
+            (GYRO_BIAS, states.gyro_bias, options.prior_gyro_bias_radps),
+            (ACCEL_BIAS, states.accel_bias, options.prior_accel_bias_mps2),
+            (VELOCITY, states.v_G, options.prior_velocity_mps),
+        )
+    ]
+
+
+def _gap_walks(parts: MapTerms, gaps: BiasGaps) -> list[FactorTerm]:
+    """Return the random walk of the biases across gaps, if there are any."""
+    before, after = parts.selection.rows(gaps.before), parts.selection.rows(gaps.after)
+    inside = (before >= 0) & (after >= 0)
+    if not inside.any():
+        return []
+    density = _walk_density(parts.vi_map, gaps.before[inside])
+    variance = density * gaps.duration_s[inside, None]
+    return [GapWalkTerm(before[inside], after[inside], variance[:, 0], variance[:, 1])]
+
+
+def _walk_density(vi_map: VIMap, vertices: I64) -> F64:
+    """Return the variance densities (G, 2) of the bias walks of the vertices' missions."""
+    data = InertialData.of_map(vi_map)
+    of_mission = np.zeros((len(vi_map.missions), 2))
+    edge_mission = vi_map.vertices.mission[vi_map.imu_edges.from_vertex]
+    of_mission[edge_mission] = data.walk_variance_density[data.imu_of_edge]
+    return np.asarray(of_mission[vi_map.vertices.mission[vertices]])
+
+
+def _fix_gauge(problem: Problem, parts: MapTerms, parameters: Parameters, partition: I64) -> I64:
+    """Fix what is not estimated, and position and heading of one keyframe of every partition."""
+    states = parts.states
+    held = hold_unconstrained(problem, states)
+    is_free = np.zeros((problem.num_nodes, 3), dtype=np.bool_)
+    is_free[parameters.nodes(states)] = True
+    nodes = np.arange(states.num_vertex_nodes, problem.num_nodes)
+    problem.restrict(nodes, is_free[nodes][:, :, None] * np.eye(3))
+    first = first_of_each(partition[parts.selection.vertices])
+    fix_position_and_heading(problem, states, first)
+    if EXTRINSICS not in states.blocks and not problem.factors:
+        raise EstimationError("nothing to calibrate: no camera has usable tracks")
+    return held

@@ -1,0 +1,167 @@
+"""Solution of the problem of segments: robust iterations, outlier rejection, least squares."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
+from maplab_py.algorithms.self_calibration.estimation.outliers import TrackTest, reject_tracks_chi2
+from maplab_py.algorithms.self_calibration.estimation.partitions import parallax_rad
+from maplab_py.algorithms.self_calibration.estimation.problem import (
+    SegmentProblem,
+    build_segment_problem,
+    vi_options,
+)
+from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.vi_optimization.solution import apply_states
+from maplab_py.array_types import Mask
+from maplab_py.estimation.problem.solver import (
+    AfterStep,
+    SolverOptions,
+    SolverSummary,
+    optimize_states,
+)
+from maplab_py.estimation.problem.trust_region import Schedule
+from maplab_py.estimation.states import States
+from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import with_p_G
+
+_INITIAL_ITERATIONS = 8
+"""Iterations before all landmarks are triangulated and outliers judged a second time."""
+_INITIAL_TOLERANCE = 1e-3
+_ROBUST_TOLERANCE = 1e-4
+"""Tracks are tested when an iteration lowers the robust cost by less than this part of it."""
+_MEASUREMENTS = (InertialTerm.name, BiasWalkTerm.name)
+"""Terms, beside the visual ones, that are measurements and no priors."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solution:
+    """The optimum of a problem and how it was reached."""
+
+    problem: SegmentProblem
+    states: States
+    track_test: TrackTest
+    iterations: int
+    first_cost: float
+    summary: SolverSummary  # of the last iterations
+
+
+def solve_twice(
+    initial: SegmentProblem,
+    options: SelfCalibrationOptions,
+    missions: NDArray[np.integer] | None,
+    progress: Progress,
+) -> Solution:
+    """Iterate a few times, triangulate all landmarks again, and solve.
+
+    Observations that were outliers under the first calibration may fit the better one, and landmarks
+    that diverged while the poses were wrong return.
+    """
+    few = dataclasses.replace(
+        options, num_iterations=_INITIAL_ITERATIONS, function_tolerance=_INITIAL_TOLERANCE
+    )
+    states, first = solve(initial, few, progress)
+    problem = build_segment_problem(
+        _retriangulated(initial, states, options),
+        options,
+        missions=missions,
+        prior_mean=initial.states.blocks,
+        progress=progress,
+    )
+    solution = solve_rejecting_outliers(problem, options, progress)
+    return dataclasses.replace(
+        solution,
+        iterations=first.iterations + solution.iterations,
+        first_cost=sum(first.initial_costs.values()),
+    )
+
+
+def solve_rejecting_outliers(
+    problem: SegmentProblem, options: SelfCalibrationOptions, progress: Progress = SILENT
+) -> Solution:
+    """Minimise the robust cost, reject inconsistent tracks, and minimise the sum of squares."""
+    if options.loss == "none" or options.inconsistent_probability <= 0.0:
+        states, summary = solve(problem, options, progress)
+        first_cost = sum(summary.initial_costs.values())
+        return Solution(problem, states, TrackTest(), summary.iterations, first_cost, summary)
+    tolerance = max(options.function_tolerance, _ROBUST_TOLERANCE)
+    loose = dataclasses.replace(options, function_tolerance=tolerance)
+    states, robust = solve(problem, loose, progress)
+    track_test = reject_tracks_chi2(
+        problem,
+        states,
+        options.inconsistent_probability,
+        _has_parallax(problem, states, options),
+    )
+
+    def refresh(_: int, now: States) -> bool:
+        return problem.problem.visual is not None and problem.problem.visual.refresh(now)
+
+    states, summary = _minimise(problem, states, options, progress, refresh)
+    iterations = robust.iterations + summary.iterations
+    first_cost = sum(robust.initial_costs.values())
+    return Solution(problem, states, track_test, iterations, first_cost, summary)
+
+
+def solve(
+    problem: SegmentProblem, options: SelfCalibrationOptions, progress: Progress = SILENT
+) -> tuple[States, SolverSummary]:
+    """Minimise the cost from the problem's states, with rejection of outliers between steps."""
+    after_step = problem.rejection.after_step if problem.rejection is not None else None
+    return _minimise(problem, problem.states, options, progress, after_step)
+
+
+def _minimise(
+    problem: SegmentProblem,
+    states: States,
+    options: SelfCalibrationOptions,
+    progress: Progress,
+    after_step: AfterStep | None,
+) -> tuple[States, SolverSummary]:
+    solver = SolverOptions(
+        num_iterations=options.num_iterations,
+        function_tolerance=options.function_tolerance,
+        schedule=Schedule.CERES,
+    )
+    return optimize_states(problem.problem, states, solver, progress, after_step)
+
+
+def _has_parallax(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> Mask:
+    """Return which landmarks (L,) of the problem have parallax at the states."""
+    angle_rad = parallax_rad(apply_states(problem, states, vi_options(options)))
+    limit_rad = np.deg2rad(options.min_parallax_deg)
+    return np.asarray(angle_rad[problem.selection.landmarks] >= limit_rad)
+
+
+def _retriangulated(
+    problem: SegmentProblem, states: States, options: SelfCalibrationOptions
+) -> VIMap:
+    """Return the map at the states with every landmark triangulated from all its observations."""
+    vi_map = apply_states(problem, states, vi_options(options))
+    rows = np.arange(len(vi_map.landmarks))
+    p_G, _, good = triangulate_keypoints(vi_map, vi_map.observations, vi_map.observation_start)
+    return with_p_G(vi_map, rows[good], p_G[good])
+
+
+def chi_square_per_freedom(problem: SegmentProblem, states: States) -> float:
+    """Return the squared whitened residuals of all measurements per degree of freedom."""
+    inner = problem.problem
+    total, count, free = 0.0, 0, inner.degrees_of_freedom()
+    if inner.visual is not None and problem.rejection is not None:
+        data = inner.visual.observations
+        error_px = np.nan_to_num(inner.visual.errors(states)[0])
+        total += float(np.sum(np.square(error_px * data.inverse_sigma)))
+        count += 2 * int(np.count_nonzero(data.inverse_sigma))
+        free += 3 * int(np.count_nonzero(problem.rejection.used_landmarks()))
+    for term in inner.factors:
+        if term.name in _MEASUREMENTS:
+            residual = term.evaluate(states)[0]
+            total += float(np.sum(residual**2))
+            count += residual.size
+    return total / (count - free) if count > free else float("nan")

@@ -1,0 +1,1 @@
+"""Motion segments: splitting, selection, the database and its file."""

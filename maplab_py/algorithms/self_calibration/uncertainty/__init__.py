@@ -1,0 +1,1 @@
+"""How certain a calibration is, and how much a segment contributes to it."""

@@ -1,0 +1,342 @@
+"""Factor terms of a map: inertial, odometry, loop closures, absolute poses."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.vi_optimization.absolute_outliers import absolute_outliers
+from maplab_py.algorithms.vi_optimization.calibration_states import MountedSensors
+from maplab_py.algorithms.vi_optimization.data_selection import Selection
+from maplab_py.algorithms.vi_optimization.options import (
+    DataOptions,
+    PriorOptions,
+    VIOptimizationOptions,
+)
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import MapError
+from maplab_py.estimation.codegen.kernels import residual_kernel
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, States
+from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
+from maplab_py.estimation.terms.inertial_calibration import CalibratingInertialTerm, imu_blocks
+from maplab_py.estimation.terms.pose import (
+    SWITCH,
+    AbsolutePoseTerm,
+    Mounting,
+    RelativePoseTerm,
+    SwitchedRelativePoseTerm,
+    mounting_block,
+    switch_block,
+    whitening,
+)
+from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
+from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.geometry import se3, so3
+from maplab_py.progress import Progress
+from maplab_py.sensors import Imu
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.queries import mission_sensor_id
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapFactors:
+    """Factor terms of a map, the states with their parameter blocks, and the sensors of the blocks."""
+
+    terms: list[FactorTerm]
+    states: States
+    imus: tuple[Imu, ...] = ()  # rows of the IMU blocks
+    mounted: MountedSensors = dataclasses.field(default_factory=MountedSensors)
+    switched_edges: I64 = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    absolute_poses_rejected: int = 0  # outliers that are left out
+
+
+def factor_terms(
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    states: States,
+    progress: Progress,
+) -> MapFactors:
+    """Return the terms that the options enable and the map has measurements for."""
+    result = MapFactors([], states)
+    if options.include_inertial:
+        result = _with_inertial(result, vi_map, selection, options, progress)
+    result = _with_mountings(result, vi_map, selection, options)
+    for wanted, kind, name, is_fixed in (
+        (
+            options.include_6dof_odometry,
+            TransformationKind.ODOMETRY,
+            "odometry",
+            options.fix_6dof_odometry_extrinsics,
+        ),
+        (
+            options.include_wheel_odometry,
+            TransformationKind.WHEEL_ODOMETRY,
+            "wheel odometry",
+            options.fix_wheel_odometry_extrinsics,
+        ),
+    ):
+        if wanted:
+            result.terms.extend(
+                _odometry(result, vi_map, selection, kind, name, is_fixed, progress)
+            )
+    if options.include_absolute_pose_constraints:
+        result = _with_absolute_poses(result, vi_map, selection, options, progress)
+    if options.include_loop_closure_edges:
+        result = _with_loop_closures(result, vi_map, selection, options, progress)
+    return result
+
+
+def prior_terms(states: States, options: PriorOptions) -> list[FactorTerm]:
+    """Return the enabled priors of poses and biases at the given states."""
+    vertices, terms = np.arange(len(states.T_G_I)), list[FactorTerm]()
+    sigmas = [options.position_prior_sigma_m] * 3 + [options.orientation_prior_sigma_rad] * 3
+    if any(sigmas):
+        root = np.diag([1.0 / sigma if sigma > 0.0 else 0.0 for sigma in sigmas])
+        terms.append(PosePrior(vertices, states.T_G_I, root))
+    for kind, values, sigma in (
+        (GYRO_BIAS, states.gyro_bias, options.gyro_bias_prior_sigma_radps),
+        (ACCEL_BIAS, states.accel_bias, options.accel_bias_prior_sigma_mps2),
+    ):
+        if sigma > 0.0:
+            terms.append(VertexVectorPrior(kind, vertices, values, sigma))
+    return terms
+
+
+def landmark_prior(states: States, options: PriorOptions) -> F64 | None:
+    """Return the prior (L, 4) of the landmarks at the given states, if it is enabled."""
+    sigma_m = options.landmark_prior_sigma_m
+    if not sigma_m > 0.0:
+        return None
+    return np.column_stack([states.p_G, np.full(len(states.p_G), 1.0 / sigma_m)])
+
+
+def _with_inertial(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    progress: Progress,
+) -> MapFactors:
+    from maplab_py.estimation.symbolic.sources import inertial, inertial_with_intrinsics
+
+    table = vi_map.imu_edges
+    ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+    edges = np.flatnonzero((ends >= 0).all(axis=0) & (table.sample_count > 1))
+    data = InertialData.of_map(vi_map, edges)
+    lasting = data.duration_s > 0.0
+    if not lasting.all():
+        edges = edges[lasting]
+        data = InertialData.of_map(vi_map, edges)
+    if not len(edges):
+        return so_far
+    first, second = selection.rows(table.from_vertex[edges]), selection.rows(table.to_vertex[edges])
+    mission = vi_map.vertices.mission[table.from_vertex[edges]]
+    g_G = so3.rotate(vi_map.T_G_M[mission, :4], _gravity_M(data, options))
+    walk = data.walk_variance_density[data.imu_of_edge] * data.duration_s[:, None]
+    bias_walk = BiasWalkTerm(first, second, walk[:, 0], walk[:, 1])
+    if options.fix_imu_intrinsics:
+        kernel = residual_kernel("inertial", inertial, progress)
+        plain = InertialTerm(kernel, data, first, second, g_G)
+        return dataclasses.replace(so_far, terms=[*so_far.terms, plain, bias_walk])
+    kernel = residual_kernel("inertial_with_intrinsics", inertial_with_intrinsics, progress)
+    states = so_far.states.with_blocks(*imu_blocks(data.imus))
+    term = CalibratingInertialTerm(kernel, data, first, second, g_G, states)
+    return dataclasses.replace(
+        so_far, terms=[*so_far.terms, term, bias_walk], states=states, imus=data.imus
+    )
+
+
+def _gravity_M(data: InertialData, options: DataOptions) -> F64:
+    """Return gravity (E, 3) in the mission frames, from the map or from the flags."""
+    magnitudes = np.array([imu.gravity_magnitude_mps2 for imu in data.imus])[data.imu_of_edge]
+    if not np.isnan(options.latitude):
+        magnitudes = np.full(len(data), gravity_mps2(options.latitude, options.altitude_meters))
+    if options.gravity_magnitude_mps2 > 0.0:
+        magnitudes = np.full(len(data), options.gravity_magnitude_mps2)
+    return np.stack([np.zeros(len(data)), np.zeros(len(data)), -magnitudes], axis=1)
+
+
+def gravity_mps2(latitude_deg: float, altitude_m: float) -> float:
+    """Return gravity on the WGS 84 ellipsoid (Somigliana) with the free-air gradient [m/s^2]."""
+    sine2 = np.sin(np.radians(latitude_deg)) ** 2
+    at_sea = 9.7803253359 * (1 + 0.00193185265241 * sine2) / np.sqrt(1 - 0.00669437999013 * sine2)
+    return float(at_sea - 3.086e-6 * altitude_m)
+
+
+def _with_mountings(
+    so_far: MapFactors, vi_map: VIMap, selection: Selection, options: VIOptimizationOptions
+) -> MapFactors:
+    """Add an extrinsics block for every sensor whose extrinsics are estimated."""
+    keys = [np.zeros((0, 3), dtype=np.uint64)]
+    table, absolute = vi_map.transformation_edges, vi_map.absolute_poses
+    for kind, is_free in (
+        (
+            TransformationKind.ODOMETRY,
+            options.include_6dof_odometry and not options.fix_6dof_odometry_extrinsics,
+        ),
+        (
+            TransformationKind.WHEEL_ODOMETRY,
+            options.include_wheel_odometry and not options.fix_wheel_odometry_extrinsics,
+        ),
+    ):
+        ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+        rows = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind) & is_free)
+        keys.append(_sensor_keys(vi_map, table.from_vertex[rows], table.sensor_id[rows]))
+    if options.include_absolute_pose_constraints and not (
+        options.fix_absolute_pose_sensor_extrinsics
+    ):
+        rows = np.flatnonzero(selection.row_of_vertex[absolute.vertex] >= 0)
+        keys.append(_sensor_keys(vi_map, absolute.vertex[rows], absolute.sensor_id[rows]))
+    owners = sorted({_owner(vi_map, key) for key in np.unique(np.concatenate(keys), axis=0)})
+    if not owners:
+        return so_far
+    T_I_S = np.stack([vi_map.sensors.T_I_S(*owner) for owner in owners])
+    states = so_far.states.with_blocks(mounting_block(T_I_S))
+    return dataclasses.replace(so_far, states=states, mounted=MountedSensors(tuple(owners)))
+
+
+def _odometry(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    kind: TransformationKind,
+    name: str,
+    is_fixed: bool,
+    progress: Progress,
+) -> list[FactorTerm]:
+    from maplab_py.estimation.symbolic.sources import relative_pose, relative_pose_with_mounting
+
+    table = vi_map.transformation_edges
+    ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+    edges = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind))
+    if not len(edges):
+        return []
+    T_I_S, rows = _mounting(
+        vi_map, so_far.mounted, table.from_vertex[edges], table.sensor_id[edges]
+    )
+    W = whitening(table.covariance[edges])
+    measured = table.T_A_B[edges]
+    first, second = ends[:, edges]
+    if is_fixed:
+        kernel = residual_kernel("relative_pose", relative_pose, progress)
+        return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W)]
+    kernel = residual_kernel("relative_pose_with_mounting", relative_pose_with_mounting, progress)
+    mounting = Mounting.of(so_far.states, rows)
+    return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)]
+
+
+def _with_loop_closures(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    progress: Progress,
+) -> MapFactors:
+    from maplab_py.estimation.symbolic.sources import relative_pose, switched_relative_pose
+
+    table = vi_map.loop_closure_edges
+    is_switched = options.loop_closure_robustness == "switchable"
+    ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+    edges = np.flatnonzero((ends >= 0).all(axis=0) & ((table.switch_variable > 0.0) | is_switched))
+    if not len(edges):
+        return so_far
+    measured, (first, second) = table.T_A_B[edges], ends[:, edges]
+    W = whitening(table.covariance[edges])
+    if is_switched:
+        kernel = residual_kernel("switched_relative_pose", switched_relative_pose, progress)
+        states = so_far.states.with_blocks(switch_block(np.ones(len(edges))))
+        rows, nodes = np.arange(len(edges)), states.nodes(SWITCH)
+        term = SwitchedRelativePoseTerm(
+            kernel, "loop closure", first, second, measured, W, rows, nodes
+        )
+        sigma = np.sqrt(np.maximum(table.switch_variable_variance[edges], 1e-16))
+        prior = BlockPrior(states, SWITCH, np.ones((len(edges), 1)), 1.0 / sigma[:, None, None])
+        terms = [*so_far.terms, term, prior]
+        return dataclasses.replace(so_far, terms=terms, states=states, switched_edges=edges)
+    kernel = residual_kernel("relative_pose", relative_pose, progress)
+    W = W * table.switch_variable[edges, None, None]
+    T_I_S = np.broadcast_to(se3.identity(), (len(edges), 7))
+    loss = (Loss.DCS, 3.0) if options.loop_closure_robustness == "dcs" else (Loss.NONE, 1.0)
+    plain = RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)
+    return dataclasses.replace(so_far, terms=[*so_far.terms, plain])
+
+
+def _with_absolute_poses(
+    so_far: MapFactors,
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    progress: Progress,
+) -> MapFactors:
+    """Add the absolute poses except outliers."""
+    from maplab_py.estimation.symbolic.sources import absolute_pose, absolute_pose_with_mounting
+
+    table = vi_map.absolute_poses
+    rows = np.flatnonzero(selection.row_of_vertex[table.vertex] >= 0)
+    if not len(rows):
+        return so_far
+    T_I_S, mounted = _mounting(vi_map, so_far.mounted, table.vertex[rows], table.sensor_id[rows])
+    outlying = absolute_outliers(vi_map, rows, T_I_S, options.absolute_pose_gate_sigma)
+    T_I_S, mounted, used = T_I_S[~outlying], mounted[~outlying], rows[~outlying]
+    vertex = selection.rows(table.vertex[used])
+    W = whitening(table.covariance[used])
+    scale = options.absolute_pose_loss_scale
+    loss = (Loss.HUBER, scale) if scale > 0.0 else (Loss.NONE, 1.0)
+    mounting = None
+    if options.fix_absolute_pose_sensor_extrinsics:
+        kernel = residual_kernel("absolute_pose", absolute_pose, progress)
+    else:
+        name = "absolute_pose_with_mounting"
+        kernel = residual_kernel(name, absolute_pose_with_mounting, progress)
+        mounting = Mounting.of(so_far.states, mounted)
+    term = AbsolutePoseTerm(
+        kernel, vertex, T_I_S, table.T_G_S[used], W, loss=loss, mounting=mounting
+    )
+    return dataclasses.replace(
+        so_far,
+        terms=[*so_far.terms, term],
+        absolute_poses_rejected=int(np.count_nonzero(outlying)),
+    )
+
+
+def _sensor_keys(
+    vi_map: VIMap, vertices: NDArray[np.integer], sensor_ids: NDArray[np.uint64]
+) -> NDArray[np.uint64]:
+    mission = vi_map.vertices.mission[vertices].astype(np.uint64)
+    return np.column_stack([mission, sensor_ids])
+
+
+def _owner(vi_map: VIMap, key: NDArray[np.uint64]) -> tuple[str, str]:
+    """Return the ids of the mission's IMU and of the sensor of a key [mission, id words]."""
+    imu_id = mission_sensor_id(vi_map, int(key[0]), MissionSensor.IMU)
+    sensor_id = to_hex(key[1:])
+    if sensor_id not in vi_map.sensors.sensors:
+        raise MapError(f"sensors.yaml has no sensor {sensor_id}, but measurements name it")
+    return imu_id, sensor_id
+
+
+def _mounting(
+    vi_map: VIMap,
+    mounted: MountedSensors,
+    vertices: NDArray[np.integer],
+    sensor_ids: NDArray[np.uint64],
+) -> tuple[F64, I64]:
+    """Return T_I_S (N, 7) of sensors and their rows (N,) of the mounting block (-1 = none)."""
+    result, row = np.empty((len(vertices), 7)), np.full(len(vertices), -1, dtype=np.int64)
+    keys = _sensor_keys(vi_map, vertices, sensor_ids)
+    unique, inverse = np.unique(keys, axis=0, return_inverse=True)
+    for number, key in enumerate(unique):
+        owner = _owner(vi_map, key)
+        of_owner = inverse.reshape(-1) == number
+        # a mission without IMU has the last base of its sensors as body
+        imu_id, sensor_id = owner
+        sensors = vi_map.sensors
+        result[of_owner] = sensors.T_I_S(*owner) if imu_id else sensors.T_R_S(sensor_id)
+        row[of_owner] = mounted.owner.index(owner) if owner in mounted.owner else -1
+    return result, row

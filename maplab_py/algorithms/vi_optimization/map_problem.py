@@ -1,0 +1,264 @@
+"""Build the least-squares problem of a map.
+
+The problem uses every observation of every landmark except gross outliers: observations behind the
+camera, with a reprojection error above a gate, or of landmarks with fewer than two inliers. Landmarks
+of bad quality are used too: on recorded maps most of them merely have few observers and improve the
+estimate once gross outliers are rejected.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.algorithms.vi_optimization.calibration_states import (
+    RigCameras,
+    parameter_count,
+    rig_cameras,
+)
+from maplab_py.algorithms.vi_optimization.data_selection import (
+    Selection,
+    check_finite,
+    check_metric,
+    initial_states,
+    observations,
+    retriangulated,
+    select,
+)
+from maplab_py.algorithms.vi_optimization.extensions import extension_terms
+from maplab_py.algorithms.vi_optimization.factor_terms import (
+    MapFactors,
+    factor_terms,
+    landmark_prior,
+    prior_terms,
+)
+from maplab_py.algorithms.vi_optimization.fixed_states import fix_gauge, hold_unconstrained
+from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
+from maplab_py.algorithms.vi_optimization.options import FixedStates, VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
+from maplab_py.array_types import I64
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.estimation.codegen.kernels import visual_kernels
+from maplab_py.estimation.imu.angular_velocity import angular_velocity_at_vertices
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.states import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    NODES_PER_VERTEX,
+    ORIENTATION,
+    POSITION,
+    VELOCITY,
+    States,
+)
+from maplab_py.estimation.terms.cameras import (
+    EXTRINSICS,
+    INTRINSICS,
+    TIME_OFFSET,
+    camera_blocks,
+)
+from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.visual import VisualTerms
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapTerms:
+    """States and terms of a map, from which a problem is built."""
+
+    vi_map: VIMap
+    selection: Selection
+    states: States
+    visual: VisualTerms | None
+    rejection: OutlierRejection | None
+    rig: RigCameras | None
+    factors: MapFactors
+    terms: tuple[FactorTerm, ...]  # terms of `factors`, priors and plugins
+
+    def map_problem(self, problem: Problem, held: I64, gauge: str) -> MapProblem:
+        """Return the problem of these terms with the data needed to apply its solution to the map."""
+        return MapProblem(
+            self.vi_map,
+            self.selection,
+            problem,
+            self.states,
+            self.rejection,
+            self.rig,
+            self.factors,
+            held,
+            gauge,
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapProblem:
+    """Optimisation problem of a map with the data needed to apply its solution to the map."""
+
+    vi_map: VIMap
+    selection: Selection
+    problem: Problem
+    states: States
+    rejection: OutlierRejection | None
+    rig: RigCameras | None
+    factors: MapFactors
+    held: I64  # vertices that nothing constrains
+    gauge: str
+
+
+def build(
+    vi_map: VIMap,
+    options: VIOptimizationOptions,
+    *,
+    missions: NDArray[np.integer] | None = None,
+    progress: Progress = SILENT,
+) -> MapProblem:
+    """Build the problem of some missions (rows, None = all).
+
+    Raises:
+        UserError: Flags contradict each other.
+        EstimationError: Nothing can be optimised.
+        MapError: Calibrations that the terms need are missing.
+    """
+    parts = collect_terms(vi_map, options, missions=missions, progress=progress)
+    states = parts.states
+    problem = make_problem(states, parts.visual, parts.terms, options, progress)
+    held = hold_unconstrained(problem, states)
+    _fix_by_options(problem, options, states, parts.rig)
+    gauge = fix_gauge(
+        problem,
+        states,
+        held,
+        has_inertial=options.include_inertial,
+        has_fixed_landmarks=options.fix_landmark_positions,
+    )
+    return parts.map_problem(problem, held, gauge)
+
+
+def collect_terms(
+    vi_map: VIMap,
+    options: VIOptimizationOptions,
+    *,
+    missions: NDArray[np.integer] | None = None,
+    progress: Progress = SILENT,
+) -> MapTerms:
+    """Return the states and terms of some missions (rows, None = all).
+
+    A caller with more terms or another gauge builds `Problem(parts.states, parts.visual,
+    [*parts.terms, *more])`, fixes states, and calls `parts.map_problem`.
+
+    Raises:
+        UserError: Flags contradict each other.
+        EstimationError: Nothing can be optimised.
+        MapError: Calibrations that the terms need are missing.
+    """
+    if options.fix_vertices and not options.absolute_pose_sensor_fix_mission_baseframes:
+        raise UserError(
+            "--ba_fix_vertices keeps the base frames as well: drop it, or leave "
+            "--ba_absolute_pose_sensor_fix_mission_baseframes on"
+        )
+    selection = select(vi_map, options, missions)
+    if not len(selection.vertices):
+        raise EstimationError("nothing to optimise: the map has no vertices")
+    check_finite(vi_map, selection, options)
+    check_metric(vi_map, selection, options)
+    states = initial_states(vi_map, selection)
+    visual, rejection, rig, states = _visual(vi_map, selection, options, states, progress)
+    factors = factor_terms(vi_map, selection, options, states, progress)
+    states = factors.states
+    terms: list[FactorTerm] = [
+        *factors.terms,
+        *prior_terms(states, options),
+        *extension_terms(vi_map, selection, options, progress),
+    ]
+    if visual is None and not terms:
+        raise EstimationError("nothing to optimise: no landmark observed twice and no usable edge")
+    return MapTerms(vi_map, selection, states, visual, rejection, rig, factors, tuple(terms))
+
+
+def _visual(
+    vi_map: VIMap,
+    selection: Selection,
+    options: VIOptimizationOptions,
+    states: States,
+    progress: Progress,
+) -> tuple[VisualTerms | None, OutlierRejection | None, RigCameras | None, States]:
+    """Set up the reprojection errors and reject initial gross outliers.
+
+    Landmarks with outliers are triangulated again before the final test.
+    """
+    if not len(selection.keypoints):
+        return None, None, None, states
+    used_missions = np.unique(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
+    rig = rig_cameras(vi_map, used_missions)
+    data, sigma_px = observations(vi_map, selection, options, rig.first_of_mission)
+    calibrating = is_calibrating(options, rig)
+    visual = VisualTerms(
+        visual_kernels(rig.models, progress, calibrating=calibrating),
+        data,
+        rig.cameras,
+        len(selection.vertices),
+        loss=Loss[options.loss.upper()],
+        move_points=not options.fix_landmark_positions,
+        landmark_prior=landmark_prior(states, options),
+    )
+    if calibrating:
+        states = states.with_blocks(*camera_blocks(rig.cameras, rig.delay_s))
+        if rig.delay_s.any() or not options.fix_ncamera_time_offset:
+            visual.follow_motion(angular_velocity_at_vertices(vi_map)[selection.vertices])
+    rejection = OutlierRejection(visual, sigma_px, options)
+    rejection.gate(states)
+    if options.retriangulate_doubtful and not options.fix_landmark_positions:
+        doubtful = rejection.doubtful_landmarks()
+        rejection.restart()
+        fresh = retriangulated(vi_map, selection, states, data.start, doubtful)
+        states = rejection.better_placed(states, fresh)
+        rejection.gate(states)
+    visual.refresh(states)
+    if not rejection.is_used.any():
+        return None, None, None, initial_states(vi_map, selection)
+    return visual, rejection, rig, states
+
+
+def is_calibrating(options: FixedStates, rig: RigCameras) -> bool:
+    """Return whether the cameras need the kernels with calibration or time-offset states."""
+    return bool(rig.delay_s.any()) or not (
+        options.fix_ncamera_intrinsics
+        and options.fix_ncamera_extrinsics_rotation
+        and options.fix_ncamera_extrinsics_translation
+        and options.fix_ncamera_time_offset
+    )
+
+
+def _fix_by_options(
+    problem: Problem, options: FixedStates, states: States, rig: RigCameras | None
+) -> None:
+    first = NODES_PER_VERTEX * np.arange(len(states.T_G_I), dtype=np.int64)
+    for kind, is_fixed in (
+        (POSITION, options.fix_vertices),
+        (ORIENTATION, options.fix_vertices),
+        (VELOCITY, options.fix_velocity),
+        (GYRO_BIAS, options.fix_gyro_bias),
+        (ACCEL_BIAS, options.fix_accel_bias),
+    ):
+        if is_fixed:
+            problem.fix(first + kind)
+    if rig is not None and EXTRINSICS in states.blocks:
+        _fix_cameras(problem, options, states, rig)
+
+
+def _fix_cameras(problem: Problem, options: FixedStates, states: States, rig: RigCameras) -> None:
+    extrinsics, intrinsics = states.nodes(EXTRINSICS), states.nodes(INTRINSICS)
+    for nodes, is_fixed in (
+        (extrinsics[:, 0], options.fix_ncamera_extrinsics_translation),
+        (extrinsics[:, 1], options.fix_ncamera_extrinsics_rotation),
+        (intrinsics.reshape(-1), options.fix_ncamera_intrinsics),
+        (states.nodes(TIME_OFFSET).reshape(-1), options.fix_ncamera_time_offset),
+    ):
+        if is_fixed:
+            problem.fix(nodes)
+    is_used = np.arange(3 * intrinsics.shape[1]) < parameter_count(rig)[:, None]
+    kept = is_used.reshape(-1, 3)[:, :, None] * np.eye(3)
+    problem.restrict(intrinsics.reshape(-1), kept)

@@ -1,0 +1,262 @@
+"""Commands: plain functions whose keyword parameters are the flags."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
+
+from maplab_py.console.commands.docstrings import parse_docstring
+from maplab_py.console.commands.flag_types import flag_type
+from maplab_py.console.commands.flags import COMMON_FLAGS, REQUIRED, Flag, normalise
+from maplab_py.errors import FlagError
+
+COMMAND_ATTRIBUTE = "maplab_command"
+
+ValueSource = str | Callable[[Any], list[tuple[str, str]]]
+"""Kind of a flag's values, or a function that returns values and notes for a session."""
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Command:
+    """A registered command: the function and what its signature and docstring say."""
+
+    name: str
+    aliases: tuple[str, ...]
+    function: Callable[..., Any]
+    summary: str
+    description: str
+    flags: Mapping[str, Flag]
+    positional: tuple[str, ...]  # flags that may also be given by position
+    variadic: bool  # takes any number of further words
+    defaults: Mapping[str, Any]  # default option groups by parameter
+    example: str = ""
+    see_also: tuple[str, ...] = ()
+    needs_map: bool = True
+    raw_arguments: bool = False
+    acts_outside: bool = False  # does something that dropping the draft of the maps does not undo
+    writes_files: bool = False  # all that it does outside the maps is to write output files
+    guards_effects: bool = False  # acts outside only inside `lasting_effect()`
+    obeys_dry_run: bool = False  # acts outside, but not where `context.is_trial` is set
+    completes: Mapping[str, ValueSource] = dataclasses.field(default_factory=dict)  # by flag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name and all aliases."""
+        return (self.name, *self.aliases)
+
+    def bind(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Convert typed flag values into the function's keyword arguments.
+
+        Raises:
+            FlagError: A required flag is missing, or an option group refuses its values.
+        """
+        arguments: dict[str, Any] = {}
+        changes: dict[str, dict[tuple[str, ...], Any]] = {}
+        for flag in self.flags.values():
+            parameter = flag.path[0]
+            value = values.get(flag.name, REQUIRED)
+            if len(flag.path) == 1:
+                arguments[parameter] = flag.default if value is REQUIRED else value
+                if arguments[parameter] is REQUIRED:
+                    raise FlagError(f"{self.name} needs --{flag.name}=... ({flag.help})")
+            elif value is not REQUIRED:
+                changes.setdefault(parameter, {})[flag.path[1:]] = value
+        for parameter, default in self.defaults.items():
+            try:
+                arguments[parameter] = _changed(default, changes.get(parameter, {}))
+            except ValueError as error:
+                raise FlagError(f"{self.name}: {error}") from None
+        return arguments
+
+
+def command(
+    name: str,
+    *aliases: str,
+    example: str = "",
+    see_also: tuple[str, ...] = (),
+    needs_map: bool = True,
+    raw_arguments: bool = False,
+    acts_outside: bool = False,
+    writes_files: bool = False,
+    guards_effects: bool = False,
+    obeys_dry_run: bool = False,
+    completes: Mapping[str, ValueSource] | None = None,
+) -> Callable[[FunctionT], FunctionT]:
+    """Register a function as a command of the console; the function is unchanged.
+
+    The first parameter receives the `CommandContext`. Keyword-only parameters are flags; others
+    are flags that may also be given by position, as may the only required flag; `*words: str` takes
+    all further words. A parameter whose type is an options dataclass becomes one flag per field, named
+    `flag_prefix` + field, or as the field's `flag` says. Flag help comes from `Args:`.
+
+    Args:
+        name: maplab's name of the command.
+        aliases: Short names.
+        example: One line that can be typed as it is.
+        see_also: Related commands for the help page.
+        needs_map: The command needs a selected map.
+        raw_arguments: The words behind the command go to `*words` unread, flags included.
+        acts_outside: The command changes the session, or files in a way of its own. Then Ctrl-C
+            waits for it, and --dry_run is refused unless the command obeys it.
+        writes_files: All that the command does outside the maps is to write files through
+            `maplab_py.output_files`. They appear together when it ends well, none when it fails or
+            is cancelled; --dry_run tells which files it would write.
+        guards_effects: The command acts outside, but only inside `lasting_effect()`. Ctrl-C then
+            waits only while it is in such a block.
+        obeys_dry_run: The command acts outside, but where `context.is_trial` is set it only checks
+            and returns a report of what it would do.
+        completes: Values that the prompt proposes, by flag: "snapshot", "job", "alias", "map",
+            "mission", "command", or a function of the session that returns pairs of a value and a
+            note on it.
+
+    Raises:
+        TypeError: The signature cannot be a command: a type that no flag can have, or the same
+            flag twice.
+    """
+
+    def decorate(function: FunctionT) -> FunctionT:
+        described = describe(
+            function,
+            name,
+            aliases,
+            example=example,
+            see_also=see_also,
+            needs_map=needs_map,
+            raw_arguments=raw_arguments,
+            acts_outside=acts_outside,
+            writes_files=writes_files,
+            guards_effects=guards_effects,
+            obeys_dry_run=obeys_dry_run,
+            completes=dict(completes or {}),
+        )
+        setattr(function, COMMAND_ATTRIBUTE, described)
+        return function
+
+    return decorate
+
+
+def describe(
+    function: Callable[..., Any], name: str, aliases: tuple[str, ...], **settings: Any
+) -> Command:
+    """Read a function's signature and docstring into a `Command`."""
+    documentation = parse_docstring(function)
+    if not documentation.summary:
+        raise TypeError(f"command {name}: the function has no docstring to serve as help")
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    hints = _parameter_hints(function, [parameter.name for parameter in parameters])
+    flags: dict[str, Flag] = {}
+    positional: list[str] = []
+    defaults: dict[str, Any] = {}
+    variadic = False
+    for parameter in parameters:
+        if parameter.kind is parameter.VAR_POSITIONAL:
+            variadic = True
+            continue
+        if parameter.kind is parameter.VAR_KEYWORD or parameter.name not in hints:
+            raise TypeError(f"command {name}: parameter {parameter.name} needs a type")
+        for flag in _flags_of(parameter, hints[parameter.name], documentation.arguments):
+            if flag.name in flags or flag.name in COMMON_FLAGS:
+                raise TypeError(f"command {name}: flag --{flag.name} is defined twice")
+            flags[flag.name] = flag
+        if _is_options(hints[parameter.name]):
+            defaults[parameter.name] = _default_group(parameter, hints[parameter.name])
+        elif parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
+            positional.append(normalise(parameter.name).rstrip("_"))
+    required = [flag.name for flag in flags.values() if flag.is_required]
+    if not positional and not variadic and len(required) == 1:
+        positional = required
+    described = Command(
+        name,
+        aliases,
+        function,
+        documentation.summary,
+        documentation.description,
+        types.MappingProxyType(flags),
+        tuple(positional),
+        variadic,
+        defaults,
+        **settings,
+    )
+    if described.example or any(flag.is_required for flag in flags.values()):
+        return described
+    return dataclasses.replace(described, example=name)
+
+
+def _parameter_hints(function: Callable[..., Any], names: list[str]) -> dict[str, Any]:
+    """Evaluate the annotations of flags; other types may be known to type checkers alone."""
+    annotations = function.__annotations__
+    wanted = {name: annotations[name] for name in names if name in annotations}
+    holder = types.SimpleNamespace(__annotations__=wanted)
+    namespace = getattr(function, "__globals__", {})
+    return typing.get_type_hints(holder, globalns=namespace, localns=namespace)
+
+
+def _flags_of(
+    parameter: inspect.Parameter, hint: Any, documentation: Mapping[str, str]
+) -> Iterator[Flag]:
+    if _is_options(hint):
+        yield from _group_flags(_default_group(parameter, hint), (parameter.name,))
+        return
+    yield Flag(
+        normalise(parameter.name).rstrip("_"),
+        flag_type(hint),
+        REQUIRED if parameter.default is parameter.empty else parameter.default,
+        _flag_help(documentation.get(parameter.name, "")),
+        path=(parameter.name,),
+    )
+
+
+def _group_flags(group: Any, path: tuple[str, ...]) -> Iterator[Flag]:
+    """Yield one flag per field of an options dataclass, those of nested groups included."""
+    prefix = getattr(group, "flag_prefix", "")
+    hints = _field_types(group.__class__)
+    for field in dataclasses.fields(group):
+        value = getattr(group, field.name)
+        if _is_options(hints[field.name]):
+            yield from _group_flags(value, (*path, field.name))
+            continue
+        yield Flag(
+            field.metadata.get("flag") or prefix + field.name,
+            flag_type(hints[field.name], field.metadata.get("choices", ())),
+            value,
+            _flag_help(field.metadata.get("help", "")),
+            field.metadata.get("unit", ""),
+            (*path, field.name),
+        )
+
+
+@functools.cache
+def _field_types(group: type) -> dict[str, Any]:
+    return typing.get_type_hints(group)
+
+
+def _flag_help(text: str) -> str:
+    """Return the help of a flag; like an entry of a table it ends without a full stop."""
+    return text.strip().removesuffix(".")
+
+
+def _is_options(hint: Any) -> bool:
+    return isinstance(hint, type) and dataclasses.is_dataclass(hint)
+
+
+def _default_group(parameter: inspect.Parameter, hint: Any) -> Any:
+    return hint() if parameter.default is parameter.empty else parameter.default
+
+
+def _changed(group: Any, changes: Mapping[tuple[str, ...], Any]) -> Any:
+    """Return an options dataclass with some (nested) fields exchanged."""
+    fields = {path[0]: value for path, value in changes.items() if len(path) == 1}
+    nested: dict[str, dict[tuple[str, ...], Any]] = {}
+    for path, value in changes.items():
+        if len(path) > 1:
+            nested.setdefault(path[0], {})[path[1:]] = value
+    for name, inner in nested.items():
+        fields[name] = _changed(getattr(group, name), inner)
+    return dataclasses.replace(group, **fields) if fields else group

@@ -1,0 +1,181 @@
+"""The registry of commands: plugins from entry points, and the owners of names."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import os
+from collections.abc import Callable, Iterable
+from importlib.metadata import Distribution, EntryPoint, entry_points
+from types import ModuleType
+from typing import Any
+
+from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
+from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
+from maplab_py.console.commands.suggest import unknown
+from maplab_py.errors import UserError
+
+ENTRY_POINT_GROUP = "maplab_py.plugins"
+PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
+ALWAYS_LOADED = "console"
+BUILT_IN = "maplab_plugins."
+PROMPT_WATCHER_ATTRIBUTE = "__maplab_prompt_watcher__"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass
+class Plugin:
+    """An installed plugin."""
+
+    name: str
+    module: str = ""
+    version: str = ""
+    commands: list[Command] = dataclasses.field(default_factory=list)
+    error: str = ""  # why it could not be loaded
+    clashes: list[str] = dataclasses.field(default_factory=list)  # names that others had first
+
+
+class Registry:
+    """Commands by name and alias, with the plugins that own them."""
+
+    def __init__(self) -> None:
+        """Start without any command."""
+        self.plugins: list[Plugin] = []
+        self.prompt_watchers: dict[str, Callable[[Any], Any]] = {}  # see session.watchers
+        self._commands: dict[str, Command] = {}
+        self._owners: dict[str, Plugin] = {}
+
+    @property
+    def commands(self) -> list[Command]:
+        """All commands, by name, each once."""
+        unique = {command.name: command for command in self._commands.values()}
+        return [unique[name] for name in sorted(unique)]
+
+    @property
+    def names(self) -> list[str]:
+        """All names and aliases."""
+        return sorted(self._commands)
+
+    @property
+    def problems(self) -> list[str]:
+        """One line for every broken plugin and every name that two plugins claim."""
+        lines = [f"plugin {p.name} is not available: {p.error}" for p in self.plugins if p.error]
+        return lines + [clash for plugin in self.plugins for clash in plugin.clashes]
+
+    def find(self, name: str) -> Command:
+        """Return the command with this name or alias.
+
+        Raises:
+            UserError: There is none; the message suggests similar names.
+        """
+        command = self._commands.get(name) or self._commands.get(name.replace("-", "_"))
+        if command is not None:
+            return command
+        broken = [plugin.name for plugin in self.plugins if plugin.error]
+        hint = f"plugins not available: {', '.join(broken)} (see: plugins)" if broken else ""
+        raise unknown("command", name, self._commands, hint or "see: help")
+
+    def owner(self, command: Command) -> str:
+        """Return the name of the plugin that brought a command."""
+        return self._owners[command.name].name
+
+    def is_built_in(self, command: Command) -> bool:
+        """Tell whether a command belongs to this distribution."""
+        return self._owners[command.name].module.startswith(BUILT_IN)
+
+    def flags_named(self, name: str) -> list[tuple[Command, Flag]]:
+        """Return every command that has a flag of this name, with the flag."""
+        return [(c, c.flags[name]) for c in self.commands if name in c.flags]
+
+    def all_flags(self) -> dict[str, Flag]:
+        """Return one flag for every flag name of any command, and the console's own flags."""
+        flags = {name: flag for command in self.commands for name, flag in command.flags.items()}
+        return CONSOLE_FLAGS | flags
+
+    def add(self, command: Command, plugin: Plugin) -> None:
+        """Register a command; a name that is in use stays with its first owner."""
+        if command.name in self._commands:
+            plugin.clashes.append(self._clash(command.name, plugin))
+            return
+        plugin.commands.append(command)
+        self._owners[command.name] = plugin
+        for name in command.names:
+            if name in self._commands:
+                plugin.clashes.append(self._clash(name, plugin))
+            else:
+                self._commands[name] = command
+
+    def add_module(self, module: ModuleType, plugin: Plugin) -> None:
+        """Register the commands that a module or package defines (not those it only imports)."""
+        for value in list(vars(module).values()):
+            watcher = getattr(value, PROMPT_WATCHER_ATTRIBUTE, None)
+            if isinstance(watcher, str):
+                self.prompt_watchers.setdefault(watcher, value)
+            command = getattr(value, COMMAND_ATTRIBUTE, None)
+            if not isinstance(command, Command) or isinstance(value, type):
+                continue
+            home = command.function.__module__
+            if home == module.__name__ or home.startswith(module.__name__ + "."):
+                self.add(command, plugin)
+
+    def load(self, entry: EntryPoint) -> None:
+        """Load one plugin; if it fails it is listed with the reason, the traceback in the log."""
+        version = _version(entry.dist) if entry.dist is not None else ""
+        plugin = Plugin(entry.name, entry.value, version)
+        self.plugins.append(plugin)
+        try:
+            loaded = entry.load()
+        except (Exception, SystemExit) as error:
+            plugin.error = f"{type(error).__name__}: {error}".splitlines()[0]
+            logger.exception("plugin %s (%s) cannot be loaded", entry.name, entry.value)
+            return
+        if not isinstance(loaded, ModuleType):
+            plugin.error = f"entry point '{entry.value}' is not a module"
+            return
+        self.add_module(loaded, plugin)
+        for clash in plugin.clashes:
+            logger.warning("%s", clash)
+
+    def _clash(self, name: str, plugin: Plugin) -> str:
+        first = self.owner(self._commands[name])
+        return (
+            f"command '{name}' of plugin {plugin.name} is taken by plugin {first}, which keeps it"
+        )
+
+
+def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
+    """Load the installed plugins.
+
+    The environment variable MAPLAB_PLUGINS (names separated by commas) restricts which; the
+    console's own commands are always there.
+
+    Raises:
+        UserError: The variable names a plugin that is not installed.
+    """
+    installed = sorted(entries or entry_points(group=ENTRY_POINT_GROUP), key=_loading_order)
+    wanted = os.environ.get(PLUGINS_VARIABLE, "").replace(";", ",").split(",")
+    names = {name.strip() for name in wanted if name.strip()}
+    missing = names - {entry.name for entry in installed}
+    if missing:
+        raise UserError(
+            f"{PLUGINS_VARIABLE} names plugins that are not installed: {', '.join(sorted(missing))}"
+        )
+    registry = Registry()
+    for entry in installed:
+        if not names or entry.name in names or entry.name == ALWAYS_LOADED:
+            registry.load(entry)
+    return registry
+
+
+@functools.cache
+def _version(distribution: Distribution) -> str:
+    """Return the version of a distribution; its metadata are parsed for each request."""
+    return distribution.version
+
+
+def _loading_order(entry: EntryPoint) -> tuple[bool, bool, str]:
+    """Built-in plugins come first, so that a third-party plugin cannot take over a command."""
+    is_built_in = entry.value.startswith(BUILT_IN)
+    return entry.name != ALWAYS_LOADED, not is_built_in, entry.name

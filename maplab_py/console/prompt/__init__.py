@@ -1,0 +1,1 @@
+"""The interactive prompt: completion, colouring, history."""

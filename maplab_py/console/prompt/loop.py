@@ -1,0 +1,277 @@
+"""The interactive prompt: history, completion, colours, Ctrl-C and Ctrl-D."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+from prompt_toolkit import PromptSession
+from prompt_toolkit.auto_suggest import AutoSuggestFromHistory
+from prompt_toolkit.buffer import Buffer
+from prompt_toolkit.completion import CompleteEvent, Completer, Completion
+from prompt_toolkit.document import Document
+from prompt_toolkit.filters import Condition
+from prompt_toolkit.formatted_text import StyleAndTextTuples
+from prompt_toolkit.history import History
+from prompt_toolkit.input import Input
+from prompt_toolkit.input.typeahead import get_typeahead, store_typeahead
+from prompt_toolkit.key_binding import KeyPress
+from prompt_toolkit.keys import Keys
+from prompt_toolkit.lexers import Lexer
+from prompt_toolkit.output import ColorDepth
+from prompt_toolkit.patch_stdout import patch_stdout
+from prompt_toolkit.styles import Style
+
+from maplab_py.console.prompt.colouring import coloured_parts
+from maplab_py.console.prompt.completion import complete
+from maplab_py.console.prompt.history import open_history, recent_commands
+from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.session.maps import MapEntry
+from maplab_py.console.session.paths import state_folder
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status
+from maplab_py.console.terminal.foreground import NotedInterrupts, interrupts_noted
+from maplab_py.console.terminal.render import wants_colour
+from maplab_py.errors import Cancelled
+from maplab_py.report import counted
+
+SHEEP = "sheep"
+_logger = logging.getLogger(__name__)
+_MAX_NAMES_IN_TOOLBAR = 4
+_CTRL_C = (Keys.ControlC, Keys.SIGINT)
+
+_STYLE = Style.from_dict(
+    {
+        "key": "ansiyellow",
+        "unsaved": "ansired bold",
+        "sign": "ansigreen",
+        "command": "ansicyan bold",
+        "unknown": "ansired",
+        "flag": "ansiblue",
+        "value": "ansigreen",
+        "comment": "ansibrightblack",
+        "bottom-toolbar": "noreverse ansibrightblack",
+        "bottom-toolbar.text": "noreverse ansibrightblack",
+    }
+)
+
+
+class CommandCompleter(Completer):
+    """Offers the session's candidates to prompt_toolkit."""
+
+    def __init__(self, session: Session) -> None:
+        """Complete for one session."""
+        self._session = session
+
+    def get_completions(
+        self,
+        document: Document,
+        complete_event: CompleteEvent,  # noqa: ARG002
+    ) -> Iterable[Completion]:
+        """Yield the candidates for the text before the cursor."""
+        text = document.text_before_cursor
+        width = max(20, shutil.get_terminal_size().columns - 40)
+        for candidate in complete(text, self._session):
+            note = candidate.help
+            yield Completion(
+                candidate.text,
+                start_position=candidate.start - len(text),
+                display=candidate.shown,
+                display_meta=note if len(note) <= width else note[: width - 1] + "…",
+            )
+
+
+class CommandLexer(Lexer):
+    """Colours commands, flags and values; an unknown command is red."""
+
+    def __init__(self, session: Session) -> None:
+        """Colour for one session."""
+        self._session = session
+
+    def lex_document(self, document: Document) -> Callable[[int], StyleAndTextTuples]:
+        """Return the coloured parts of each line."""
+        lines = document.lines
+
+        def line_parts(number: int) -> StyleAndTextTuples:
+            parts = coloured_parts(lines[number], self._session.registry)
+            return [(f"class:{style}" if style else "", text) for style, text in parts]
+
+        return line_parts
+
+
+def prompt_parts(session: Session) -> StyleAndTextTuples:
+    """Return the prompt: `maplab <key>:/$ `, with `*` when the map has unsaved changes."""
+    key = session.maps.selected_key
+    parts: StyleAndTextTuples = []
+    if session.marks.get(SHEEP):
+        parts.append(("class:sign", session.marks[SHEEP] + " "))
+    parts += [("", "maplab "), ("class:key", f"<{key}>")]
+    if key and not session.maps.selected.is_saved:
+        parts.append(("class:unsaved", "*"))
+    return [*parts, ("", ":/$ ")]
+
+
+def toolbar_text(session: Session) -> str:
+    """Return the line below the prompt: what is selected, unsaved, running and announced."""
+    facts = []
+    if session.maps.selected_key:
+        entry = session.maps.selected
+        facts += [
+            f"map {entry.key}",
+            _missions(entry),
+            counted(len(entry.vi_map.vertices), "vertex", "vertices"),
+            counted(len(entry.vi_map.landmarks), "landmark"),
+            "saved" if entry.is_saved else "unsaved",
+        ]
+        others = len(session.maps) - 1
+        facts += [f"{others} other map{'' if others == 1 else 's'}"] if others else []
+    running = ", ".join(f"[{job.number}] {job.call.command.name}" for job in session.jobs.running)
+    facts += [f"running {running}"] if running else []
+    facts += [f"{topic} {text}" for topic, text in session.marks.items() if text and topic != SHEEP]
+    return " · ".join(facts)
+
+
+def _missions(entry: MapEntry) -> str:
+    """Return the number of missions, with their names if they are few and not the map's."""
+    names = [str(name) for name in entry.vi_map.missions.name if name]
+    is_short = 0 < len(names) <= _MAX_NAMES_IN_TOOLBAR and names != [entry.key]
+    return counted(len(entry.vi_map.missions), "mission") + (
+        f": {', '.join(names)}" if is_short else ""
+    )
+
+
+def run_prompt(runner: Runner, first_line: str = "") -> Status:
+    """Read and run lines until the user leaves (status 0) or the terminal is closed (status 1).
+
+    Args:
+        runner: Runs the lines.
+        first_line: Run before the first prompt.
+    """
+    session = runner.session
+    plain = not wants_colour(sys.stdout)
+    prompt: PromptSession[str] = PromptSession(
+        completer=CommandCompleter(session),
+        lexer=None if plain else CommandLexer(session),
+        history=_history(),
+        auto_suggest=AutoSuggestFromHistory(),
+        complete_while_typing=Condition(lambda: session.settings.is_on("complete_while_typing")),
+        style=_STYLE,
+        color_depth=ColorDepth.DEPTH_1_BIT if plain else None,
+        bottom_toolbar=None if plain else lambda: toolbar_text(session) or None,
+        refresh_interval=0 if plain else 1.0,
+    )
+    runner.terminal.is_prompt = True
+    session.uses.update(recent_commands(state_folder() / "history"))
+    session.jobs.on_finish = runner.tell_of_job
+    for problem in session.registry.problems:
+        runner.terminal.warning(problem)
+    for name, make_watcher in session.registry.prompt_watchers.items():
+        session.watchers.set(name, make_watcher(session))
+    try:
+        if first_line:
+            _run_line(runner, first_line)
+        return _read_lines(runner, prompt)
+    finally:
+        session.watchers.close()
+
+
+def _read_lines(runner: Runner, prompt: PromptSession[str]) -> Status:
+    session = runner.session
+    with interrupts_noted() as interrupts:
+        _note_interrupts_from_enter_on(prompt, interrupts)
+        while True:
+            try:
+                interrupts.is_noted = False
+                with patch_stdout(raw=True), _interrupts_as_keys(prompt, interrupts):
+                    line = prompt.prompt(lambda: prompt_parts(session))
+            except KeyboardInterrupt:
+                continue
+            except EOFError:
+                if not sys.stdin.isatty():
+                    return _without_terminal(session)
+                runner.wants_exit = True
+                line = ""
+            if _has_ctrl_c_behind_enter(prompt.input):
+                interrupts.is_noted = True
+            if line.strip():
+                _run_line(runner, line)
+            if runner.wants_exit and _may_leave(runner):
+                return Status.OK
+            runner.wants_exit = False
+
+
+@contextmanager
+def _interrupts_as_keys(prompt: PromptSession[str], interrupts: NotedInterrupts) -> Iterator[None]:
+    """Turn Ctrl-C inside into the key, so that a new prompt is drawn.
+
+    The line editor hears it by itself as soon as it runs, but not while the prompt is drawn.
+    """
+    interrupts.instead = lambda: store_typeahead(prompt.input, [KeyPress(Keys.ControlC)])
+    try:
+        yield
+    finally:
+        interrupts.instead = None
+
+
+def _note_interrupts_from_enter_on(prompt: PromptSession[str], interrupts: NotedInterrupts) -> None:
+    """Let Ctrl-C cancel the command as soon as Enter was pressed, while the line editor still ends."""
+    accept = prompt.default_buffer.accept_handler
+    assert accept is not None
+
+    def accept_line(buffer: Buffer) -> bool:
+        interrupts.instead = None
+        return accept(buffer)
+
+    prompt.default_buffer.accept_handler = accept_line
+
+
+def _has_ctrl_c_behind_enter(keyboard: Input) -> bool:
+    """Tell whether Ctrl-C was typed behind Enter, while the terminal still took it for a key.
+
+    What was typed before it is dropped, what comes behind it is kept for the next line.
+    """
+    keys = get_typeahead(keyboard)
+    with keyboard.raw_mode():
+        keys += keyboard.read_keys()
+    at = [number for number, press in enumerate(keys) if press.key in _CTRL_C]
+    store_typeahead(keyboard, keys[at[-1] + 1 :] if at else keys)
+    return bool(at)
+
+
+def _run_line(runner: Runner, line: str) -> None:
+    """Run a line; Ctrl-C while a report is printed must not end the program."""
+    try:
+        status = runner.run_text(line)
+        runner.session.watchers.after_line(line, succeeded=status is Status.OK)
+    except KeyboardInterrupt:
+        runner.terminal.error("cancelled")
+
+
+def _without_terminal(session: Session) -> Status:
+    """Tell the log what is lost, since nobody can be asked any more."""
+    unsaved = ", ".join(entry.key for entry in session.maps.unsaved)
+    _logger.warning("the terminal was closed%s", f"; unsaved changes in {unsaved}" * bool(unsaved))
+    return Status.FAILED
+
+
+def _may_leave(runner: Runner) -> bool:
+    """Ask before running jobs or unsaved changes are lost."""
+    unsaved = ", ".join(entry.key for entry in runner.session.maps.unsaved)
+    running = ", ".join(job.text for job in runner.session.jobs.running)
+    questions = [f"still running: {running}; leave and stop it?"] if running else []
+    questions += [f"unsaved changes in {unsaved}; leave without saving?"] if unsaved else []
+    try:
+        return all(runner.terminal.ask(question) for question in questions)
+    except Cancelled:
+        return False
+
+
+def _history() -> History:
+    """Return the history file in the user's state folder; only memory where none can be written."""
+    history, problem = open_history(state_folder() / "history")
+    if problem:
+        sys.stderr.write(f"warning: the history is not kept: {problem}\n")
+    return history

@@ -1,0 +1,1 @@
+"""Lines of commands and where they come from: program arguments, scripts, batch files, aliases."""

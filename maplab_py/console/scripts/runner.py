@@ -1,0 +1,291 @@
+"""Running command lines for a user: reports printed, errors as one line, an honest status."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+
+from maplab_py.atomic import write_file
+from maplab_py.cancellation import CancelToken
+from maplab_py.console.commands.flag_types import expand_path
+from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
+from maplab_py.console.scripts.aliases import expanded
+from maplab_py.console.session.call import Call
+from maplab_py.console.session.jobs import Job
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status, describe, status_of
+from maplab_py.console.terminal.foreground import interruptible, run_in_foreground, terminal_lent
+from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.errors import UserError
+from maplab_py.report import Report
+
+LEAVE = ("q", "quit", "exit")
+_MAX_ALIAS_DEPTH = 8
+_INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
+"""How a shell command ends by Ctrl-C: by the signal, or by a shell that says so."""
+
+logger = logging.getLogger(__name__)
+
+
+class Runner:
+    """Runs lines in a session and shows what came out.
+
+    Attributes:
+        wants_exit: The user has asked to leave.
+    """
+
+    def __init__(self, session: Session, terminal: ConsoleTerminal) -> None:
+        """Make a runner.
+
+        Args:
+            session: Where the commands run.
+            terminal: Where their reports go.
+        """
+        self.session = session
+        self.terminal = terminal
+        self.wants_exit = False
+        self._alias_depth = 0
+        terminal.mission_names = lambda: session.mission_names
+
+    def run_text(self, text: str, *, keep_going: bool = False) -> Status:
+        """Run the commands of a text; stop at the first that fails unless told to go on.
+
+        Returns:
+            The status of the first command that failed.
+        """
+        try:
+            commands = typed_commands(text)
+        except UserError as error:
+            return self.report_error("", error)
+        failed: list[str] = []
+        first = Status.OK
+        for command in commands:
+            status = self._run_typed(command, keep_going=keep_going)
+            first = first or status
+            failed += [command.source] if status else []
+            if self.wants_exit or status == Status.CANCELLED or (status and not keep_going):
+                break
+        if keep_going and failed:
+            lines = "".join(f"\n  {line}" for line in failed)
+            self.terminal.error(f"{len(failed)} of {len(commands)} commands failed:{lines}")
+        return first
+
+    def run_words(self, words: Sequence[str]) -> Status:
+        """Run one command and return its status."""
+        return self._run(TypedCommand(" ".join(words), list(words)))
+
+    def finish(self, *, discard: bool) -> Status:
+        """End a script: wait for its jobs, then say which maps have changes that are on no disk."""
+        status = Status.OK
+        for job in self.session.jobs.jobs:
+            if not job.was_told:
+                status = status or self.run_words(["join", str(job.number)])
+        return status or self.check_unsaved(discard=discard)
+
+    def check_unsaved(self, *, discard: bool) -> Status:
+        """Say at the end of a script which maps have changes that are on no disk."""
+        unsaved = ", ".join(entry.key for entry in self.session.maps.unsaved)
+        if not unsaved or discard:
+            return Status.OK
+        self.terminal.error(f"unsaved changes are lost: {unsaved} (save them, or give --discard)")
+        return Status.USER_ERROR
+
+    def report_error(
+        self, command: str, error: BaseException, *, has_effects: bool = False
+    ) -> Status:
+        """Print an error as one line and return its status.
+
+        Args:
+            command: Name of the command, as it was typed.
+            error: What was raised.
+            has_effects: The command had written files or changed the session before.
+        """
+        status = status_of(error)
+        known = command in self.session.registry.names
+        name = self.session.registry.find(command).name if known else command
+        if status is Status.CANCELLED:
+            remark = ", what it had done outside them remains" if has_effects else ""
+            text = f"{name}: cancelled; the maps are as before{remark}"
+        else:
+            text = describe(error)
+            text = text if not known or text.startswith(name) else f"{name}: {text}"
+        self.terminal.failed(text, name, int(status))
+        return status
+
+    def _run_typed(self, command: TypedCommand, *, keep_going: bool) -> Status:
+        """Run what was typed: an assignment, a shell command, an alias or a command."""
+        try:
+            (command,) = typed_commands(command.source, variable_lookup(self.session.variables))
+            if command.assignment is not None:
+                name, value = command.assignment
+                self.session.variables[name] = value
+                return Status.OK
+            if not command.words:
+                return self._run_shell(command.shell)
+            text = expanded(command, self.session.aliases)
+        except UserError as error:
+            return self.report_error("", error)
+        if text is None:
+            return self._run(command)
+        if self._alias_depth >= _MAX_ALIAS_DEPTH:
+            return self.report_error("", UserError(f"alias '{command.words[0]}' contains itself"))
+        self._alias_depth += 1
+        try:
+            return self.run_text(text, keep_going=keep_going)
+        finally:
+            self._alias_depth -= 1
+
+    def _run(self, command: TypedCommand) -> Status:
+        """Run one command and show its report."""
+        words = command.words
+        if words[0] in LEAVE and len(words) == 1:
+            self.wants_exit = True
+            return Status.OK
+        logger.info("command: %s", command.source)
+        self.session.uses[words[0]] += 1
+        self.terminal.echo_to_transcript("> " + command.source)
+        start = time.perf_counter()
+        token = CancelToken()
+        is_shown = True
+        try:
+            call = self.session.parse(words)
+            if call.wants_help:
+                call = self.session.parse(["help", call.command.name])
+            if command.in_background:
+                return self._start_job(call, command)
+            with self._piped(command.shell), self._written(command), self.session.lock:
+                report = run_in_foreground(
+                    call.command.name,
+                    lambda: self.session.execute(call),
+                    token=token,
+                    while_waiting=self.terminal.tick,
+                )
+                name = call.command.name
+                seconds = time.perf_counter() - start
+                is_shown = self._show(report, name, seconds, in_shell=bool(command.shell))
+        except (Exception, KeyboardInterrupt) as error:
+            logger.exception("%s", words[0])
+            return self.report_error(words[0], error, has_effects=token.has_effects)
+        trial = " (dry run: nothing has changed)" if call.is_trial else ""
+        self.terminal.note(f"{name}: {format_seconds(seconds)}{trial}")
+        if report.advice and self.terminal.is_prompt and self.session.settings.is_on("advice"):
+            self.terminal.advise(report.advice)
+        if report.failure:
+            self.terminal.error(f"{name}: {report.failure}")
+            logger.error("%s: %s", name, report.failure)
+            return Status.FAILED
+        if token.cancelled or not is_shown:
+            self.terminal.error(
+                f"{name}: finished before Ctrl-C; the following commands are not run"
+            )
+            return Status.CANCELLED
+        return Status.OK
+
+    def _show(self, report: Report, name: str, seconds: float, *, in_shell: bool) -> bool:
+        """Show a report; return whether it was shown to its end and not cut by Ctrl-C."""
+        try:
+            with nullcontext() if in_shell else interruptible():
+                self.terminal.show(report, name, seconds)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+    def _start_job(self, call: Call, command: TypedCommand) -> Status:
+        text = command.source.rstrip("& \t")
+        job = self.session.start_call(call, text)
+        self.terminal.note(f"[{job.number}] {text} (see: jobs, join, cancel)")
+        return Status.OK
+
+    def tell_of_job(self, job: Job) -> None:
+        """Report that a job has finished; called in the thread of the job."""
+        name = job.call.command.name
+        text = f"[{job.number}] {name}: {job.state} after {format_seconds(job.elapsed_s)}"
+        if job.problem:
+            text += f": {job.problem}"
+        for conflict in job.conflicts:
+            text += f"; '{conflict.key}' changed in the meantime: see map '{conflict.kept_as}'"
+        self.terminal.note(text)
+
+    def _run_shell(self, line: str) -> Status:
+        """Run a line in the shell, which also receives Ctrl-C."""
+        if not line:
+            return self.report_error("", UserError("no command after '!' (write !ls)"))
+        self.terminal.echo_to_transcript("> !" + line)
+        try:
+            with terminal_lent():
+                child = subprocess.run(line, shell=True, check=False, env=self._environment)
+        except KeyboardInterrupt:
+            return Status.CANCELLED
+        code = child.returncode
+        if code in _INTERRUPTED:
+            return Status.CANCELLED
+        if code:
+            self.terminal.error(f"!{line}: exit status {code}")
+        return Status.FAILED if code else Status.OK
+
+    @property
+    def _environment(self) -> dict[str, str]:
+        return {**os.environ, **self.session.variables}
+
+    @contextmanager
+    def _written(self, command: TypedCommand) -> Iterator[None]:
+        """Write the report of a command to the file behind `>` or `>>`, if it succeeds."""
+        if not command.output:
+            yield
+            return
+        try:
+            path = expand_path(command.output)
+        except ValueError as error:
+            raise UserError(f"> {command.output}: {error}") from None
+        assert path is not None
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            raise UserError(f"> {path}: name a file in a folder that exists")
+        before = path.read_bytes() if command.appends and path.exists() else b""
+        report = io.StringIO()
+        with self.terminal.redirected(report):
+            yield
+        write_file(path, [before + report.getvalue().encode()])
+
+    @contextmanager
+    def _piped(self, line: str) -> Iterator[None]:
+        """Send the report of a command to the standard input of a shell command."""
+        if not line:
+            yield
+            return
+        with (
+            terminal_lent(),
+            subprocess.Popen(
+                line, shell=True, stdin=subprocess.PIPE, text=True, env=self._environment
+            ) as child,
+        ):
+            assert child.stdin is not None
+            try:
+                with self.terminal.redirected(child.stdin):
+                    yield
+            except BrokenPipeError:
+                pass
+            finally:
+                _close(child)
+
+
+def _close(child: subprocess.Popen[str]) -> None:
+    """Close the pipe to a shell command; it may have stopped reading before."""
+    try:
+        if child.stdin is not None:
+            child.stdin.close()
+    except BrokenPipeError:
+        pass
+
+
+def format_seconds(seconds: float) -> str:
+    """Format a duration."""
+    if seconds < 60:
+        return f"{seconds:.2f} s" if seconds < 10 else f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s"

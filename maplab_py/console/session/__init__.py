@@ -1,0 +1,1 @@
+"""What a session holds and how a command runs in it: maps, lasting flags, transactions, jobs."""

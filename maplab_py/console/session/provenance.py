@@ -1,0 +1,106 @@
+"""Which commands led to a value of a map, so that they can be written as a script.
+
+Maps are values: undo, redo and restore return to a value whose commands are known. A command that
+makes a new value follows the commands of the maps that it read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import weakref
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from maplab_py.console.commands.flag_types import format_value
+from maplab_py.console.commands.lines import escaped
+from maplab_py.console.session.call import Call
+from maplab_py.console.session.maps import MapEntry, MapsState
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
+
+
+@dataclasses.dataclass(frozen=True)
+class ScriptLine:
+    """A command that changed maps."""
+
+    number: int  # in the order of their ends
+    text: str  # with every value that is not the default
+    selected_before: str  # key of the map that the command worked on; empty = none
+    selected_after: str
+
+
+Script = tuple[ScriptLine, ...]
+
+
+class Provenance:
+    """The commands that led to each value of the maps of a session."""
+
+    def __init__(self) -> None:
+        """Start without values."""
+        self._scripts: weakref.WeakKeyDictionary[VIMap, dict[str, Script]] = (
+            weakref.WeakKeyDictionary()
+        )
+        self._numbers = itertools.count(1)
+
+    def record(self, call: Call, base: MapsState, result: MapsState) -> None:
+        """Record a finished command that led from one state of the maps to another."""
+        new = [
+            entry
+            for key, entry in result.entries.items()
+            if base.entries.get(key) is None or base.entries[key].vi_map is not entry.vi_map
+        ]
+        unknown = [entry for entry in new if entry.key not in self._scripts.get(entry.vi_map, {})]
+        if not unknown:
+            return
+        before = base.selected if call.command.needs_map else ""
+        line = ScriptLine(next(self._numbers), _text(call), before, result.selected)
+        named = {value for value in call.values.values() if isinstance(value, str)}
+        removed = base.entries.keys() - result.entries.keys()
+        read = {before} | named | removed | {entry.key for entry in unknown}
+        lines = {
+            known
+            for key in read & base.entries.keys()
+            for known in self.script_of(base.entries[key])
+        }
+        script = (*sorted(lines, key=lambda known: known.number), line)
+        for entry in unknown:
+            self._scripts.setdefault(entry.vi_map, {})[entry.key] = script
+
+    def script_of(self, entry: MapEntry) -> Script:
+        """Return the commands that led to the value of a map; none if they are not known."""
+        scripts = self._scripts.get(entry.vi_map, {})
+        if entry.key in scripts or not scripts:
+            return scripts.get(entry.key, ())
+        key, script = next(iter(scripts.items()))  # the map was renamed since
+        line = ScriptLine(script[-1].number, f"rename_map {entry.key}", key, entry.key)
+        return (*script, line)
+
+
+def script_text(script: Script) -> list[str]:
+    """Return the lines of a script; maps are selected where the next command needs that."""
+    lines, selected = [], ""
+    for line in script:
+        if line.selected_before and line.selected_before != selected:
+            lines.append(f"select_map {line.selected_before}")
+        lines.append(line.text)
+        selected = line.selected_after
+    return lines
+
+
+def _text(call: Call) -> str:
+    """Write a call as a line, with the lasting flags that it used."""
+    flags = call.command.flags
+    given: Mapping[str, Any] = {
+        name: value for name, value in call.values.items() if value != flags[name].default
+    }
+    words: Iterable[str] = (f"--{name}={_quoted(value)}" for name, value in sorted(given.items()))
+    return " ".join([call.command.name, *words, *map(_quoted, call.words)])
+
+
+def _quoted(value: Any) -> str:
+    """Return a value as a word; paths are absolute, so that the script runs in any folder."""
+    text = format_value(value.absolute() if isinstance(value, Path) else value)
+    return escaped(text).replace("$", "\\$") if text else "''"

@@ -1,0 +1,234 @@
+"""Layout of reports: paragraphs, pairs of name and value, tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from maplab_py.console.terminal.cells import format_cell, format_column
+from maplab_py.report import Report
+
+_TRANSFORMATION = re.compile(r"(?<![A-Za-z])([TRpq](?:_[A-Z]+)+)(?![A-Za-z])")
+_UNIT_SUFFIXES = {
+    "_m": "m",
+    "_px": "px",
+    "_deg": "deg",
+    "_rad": "rad",
+    "_s": "s",
+    "_seconds": "s",
+    "_ms": "ms",
+    "_mb": "MB",
+    "_megabytes": "MB",
+    "_percent": "%",
+    "_mps": "m/s",
+    "_mps2": "m/s^2",
+    "_radps": "rad/s",
+    "_degps": "deg/s",
+    "_hz": "Hz",
+    "_ns": "ns",
+}
+_WORDS = {
+    "imu": "IMU",
+    "gyro": "gyroscope",
+    "accel": "accelerometer",
+    "rms": "RMS",
+    "rmse": "RMSE",
+    "ape": "APE",
+    "rpe": "RPE",
+    "ate": "ATE",
+    "sim3": "Sim(3)",
+    "max": "largest",
+    "min": "smallest",
+    "lidar": "LiDAR",
+    "ransac": "RANSAC",
+    "csv": "CSV",
+    "json": "JSON",
+    "url": "URL",
+    "localized": "localised",
+    "localization": "localisation",
+}
+"""Words of field names as they are shown."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Paragraph:
+    """Lines of text."""
+
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """Names with their values, one per line, under an optional title."""
+
+    rows: list[tuple[str, str]]
+    title: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows under column heads, with an optional title.
+
+    Entries are rows whose first cell is a term and whose last one explains it; a narrow terminal
+    shows the explanation under the term.
+    """
+
+    title: str
+    heads: list[str]
+    rows: list[list[str]]
+    is_number: list[bool]  # columns that are aligned to the right
+    are_entries: bool = False
+
+
+Block = Paragraph | Pairs | Table
+
+
+def blocks_of(report: Any, title: str = "") -> list[Block]:
+    """Lay out a report: its single values first, then its lists and nested reports.
+
+    The metadata of a field can hold its `title` (empty: no title) and its `unit`; `is_prose` marks
+    a text that stands without a title, `are_entries` a list that explains terms.
+    """
+    failure = report.failure if isinstance(report, Report) else ""
+    for _ in range(2):  # what a report displays can be a sentence
+        if isinstance(report, Report):
+            text = report.as_text()
+            if text is not None:
+                return [Paragraph(text)] if text else []
+            report = report.display()
+    pairs: list[tuple[str, str]] = []
+    following: list[Block] = []
+    for field in dataclasses.fields(report):
+        value = getattr(report, field.name)
+        head = heading(field)
+        value = _without_failure(value, failure)
+        if _is_absent(value):
+            continue
+        if field.metadata.get("is_prose"):
+            following.append(Paragraph(str(value)))
+        elif _is_record(value):
+            following += blocks_of(value, head)
+        elif _is_records(value) and any(_has_records(record) for record in value):
+            following += [block for record in value for block in blocks_of(record)]
+        elif _is_records(value):
+            following += _tables(head, value, are_entries=field.metadata.get("are_entries", False))
+        elif isinstance(value, Mapping) and all(map(_is_records, value.values())):
+            following += [
+                table for key, records in value.items() for table in _tables(str(key), records)
+            ]
+        elif isinstance(value, Mapping) and any(map(_is_record, value.values())):
+            following += [block for key, item in value.items() for block in blocks_of(item, key)]
+        elif isinstance(value, Mapping):
+            rows = [(str(key), format_cell(item)) for key, item in value.items()]
+            following.append(Pairs(rows, head))
+        elif _is_lines(value):
+            following.append(Paragraph("\n".join([f"{head}:", *(f"  {v}" for v in value)])))
+        else:
+            pairs.append((head, format_cell(value)))
+    if pairs:
+        return [Pairs(pairs, title), *following]
+    return _under(title, following)
+
+
+def _under(title: str, blocks: list[Block]) -> list[Block]:
+    """Give the title of a record without single values to its first block if that has none."""
+    if title and blocks and not isinstance(blocks[0], Paragraph) and not blocks[0].title:
+        return [dataclasses.replace(blocks[0], title=title), *blocks[1:]]
+    return blocks
+
+
+def heading(field: dataclasses.Field[Any]) -> str:
+    """Return a readable name of a field with its unit in brackets."""
+    if "title" in field.metadata:
+        name = str(field.metadata["title"])
+        unit = field.metadata.get("unit", "")
+    else:
+        name, unit = field.name, field.metadata.get("unit", "")
+        for suffix, meaning in _UNIT_SUFFIXES.items():
+            if name.endswith(suffix):
+                unit = unit or meaning
+                if unit == meaning:
+                    name = name.removesuffix(suffix)
+                break
+        if name.startswith("seconds_"):
+            rest, unit = name.removeprefix("seconds_"), "s"
+            name = f"time_{rest}" if rest.startswith("per_") else f"{rest}_time"
+        name = _with_spaces(name)
+    return f"{name} [{unit}]" if unit else name
+
+
+def _with_spaces(name: str) -> str:
+    """Replace underscores by spaces except in names of transformations such as T_G_M."""
+    parts = _TRANSFORMATION.split(name)
+    parts[::2] = [part.replace("_", " ") for part in parts[::2]]
+    words = "".join(parts).split()
+    if words[:1] == ["num"]:
+        words = words[1:]
+    return " ".join(_WORDS.get(word, word) for word in words)
+
+
+def _is_record(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def _is_records(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and len(value) > 0 and all(map(_is_record, value))
+
+
+def _has_records(record: Any) -> bool:
+    return any(_is_records(getattr(record, field.name)) for field in dataclasses.fields(record))
+
+
+def _is_lines(value: Any) -> bool:
+    """Tell whether a value is a list of sentences, which are printed one per line."""
+    return (
+        isinstance(value, (list, tuple))
+        and len(value) > 0
+        and all(isinstance(item, str) for item in value)
+        and sum(len(item) for item in value) > 80
+    )
+
+
+def _without_failure(value: Any, failure: str) -> Any:
+    """Return a text or a list of sentences without what the error line says anyway."""
+    if not failure:
+        return value
+    if isinstance(value, str):
+        return "" if value and value in failure else value
+    if isinstance(value, (list, tuple)) and all(isinstance(item, str) for item in value):
+        return type(value)(item for item in value if item not in failure)
+    return value
+
+
+def _is_absent(value: Any) -> bool:
+    """Tell whether a value is empty: no value, no text, no rows."""
+    return value is None or (isinstance(value, (str, list, tuple, Mapping)) and len(value) == 0)
+
+
+def _tables(title: str, records: Sequence[Any], *, are_entries: bool = False) -> list[Table]:
+    """Return a table of the fields that any record has a value for; none if there is no such field."""
+    fields = dataclasses.fields(records[0])
+    columns = [[getattr(record, field.name) for record in records] for field in fields]
+    kept = [i for i, column in enumerate(columns) if not all(map(_is_absent, column))]
+    if not kept:
+        return []
+    cells = [format_column([_flat(value) for value in columns[i]]) for i in kept]
+    rows = [list(row) for row in zip(*cells, strict=True)]
+    numeric = [all(isinstance(v, _NUMBER_TYPES) for v in columns[i]) for i in kept]
+    return [Table(title, [heading(fields[i]) for i in kept], rows, numeric, are_entries)]
+
+
+_NUMBER_TYPES = (int, float, np.integer, np.floating, type(None))
+
+
+def _flat(value: Any) -> Any:
+    """Return a value of a cell; a record in a cell becomes text."""
+    if not _is_record(value):
+        return value
+    return ", ".join(
+        f"{heading(f)} {format_cell(getattr(value, f.name))}" for f in dataclasses.fields(value)
+    )

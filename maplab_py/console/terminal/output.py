@@ -1,0 +1,194 @@
+"""The console's terminal: reports, one-line errors, questions and progress on the standard streams."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TextIO
+
+from maplab_py.console.terminal.drawing import folded, plain_text
+from maplab_py.console.terminal.foreground import in_waiting_thread, interruptible
+from maplab_py.console.terminal.layout import blocks_of
+from maplab_py.console.terminal.naming import text_with_names, with_names
+from maplab_py.console.terminal.pager import page
+from maplab_py.console.terminal.progress import TerminalProgress
+from maplab_py.console.terminal.render import (
+    render,
+    render_json,
+    render_json_error,
+    rendered,
+    wants_colour,
+)
+from maplab_py.console.terminal.streams import write_message, writing_output
+from maplab_py.errors import Cancelled, UserError
+from maplab_py.progress import Progress
+from maplab_py.report import Report
+
+
+class ConsoleTerminal:
+    """Standard input, output and error of the process.
+
+    With `as_json` standard output carries one JSON object per command and nothing else.
+    """
+
+    def __init__(self, *, as_json: bool = False) -> None:
+        """Make the terminal of this process."""
+        self.as_json = as_json
+        self.is_prompt = False  # a user reads the output directly
+        self.mission_names: Callable[[], Mapping[str, str]] = dict  # by id
+        self._transcript: TextIO | None = None
+        self._out: IO[str] | None = None  # instead of standard output
+        self._progresses: list[TerminalProgress] = []  # of the running command and inner ones
+
+    @property
+    def is_interactive(self) -> bool:
+        """Tell whether somebody is there to answer a question."""
+        return sys.stdin.isatty() and sys.stderr.isatty()
+
+    def ask(self, question: str) -> bool:
+        """Ask a yes-or-no question; anything but yes is no.
+
+        Raises:
+            Cancelled: The answer is Ctrl-C.
+        """
+        self._hide_progress()
+        return in_waiting_thread(lambda: self._ask(question))
+
+    def _ask(self, question: str) -> bool:
+        sys.stderr.write(f"{question} [y/N] ")
+        sys.stderr.flush()
+        try:
+            with interruptible():
+                answer = sys.stdin.readline().strip()
+        except KeyboardInterrupt:
+            raise Cancelled("cancelled") from None
+        self._copy(f"{question} [y/N] {answer}")
+        return answer.lower() in ("y", "yes")
+
+    def show(self, report: Report, command: str, seconds: float | None = None) -> None:
+        """Print a report to standard output."""
+        self._hide_progress()
+        with self._output() as out:
+            if self.as_json:
+                render_json(report, command, seconds, out)
+            elif blocks_of(report) and not self._page(report):
+                render(report, out, self.mission_names())
+        if self._transcript is not None:
+            blocks = with_names(blocks_of(report), self.mission_names())
+            self._copy("\n\n".join(plain_text(block) for block in blocks))
+
+    def failed(self, text: str, command: str, status: int) -> None:
+        """Report that a command failed: a line on standard error, with --json also an object."""
+        self.clear_progress()
+        if self.as_json:
+            with self._output() as out:
+                render_json_error(text, command, status, out)
+        self.error(text)
+
+    @contextmanager
+    def _output(self) -> Iterator[IO[str]]:
+        """Give the stream for reports."""
+        if self._out is not None:
+            yield self._out
+            return
+        with writing_output():
+            yield sys.stdout
+
+    def tick(self) -> None:
+        """Show that a silent command is running."""
+        for progress in self._progresses[-1:]:
+            progress.tick()
+
+    @contextmanager
+    def redirected(self, stream: IO[str]) -> Iterator[None]:
+        """Redirect reports to another stream."""
+        self._out = stream
+        try:
+            yield
+        finally:
+            self._out = None
+
+    def note(self, text: str) -> None:
+        """Print a line that is not part of a report; never into a pipe that wants reports."""
+        stream = sys.stdout if sys.stdout.isatty() and not self.as_json else sys.stderr
+        _write_line(stream, text, "\x1b[2m")
+        self._copy(text)
+
+    def advise(self, text: str) -> None:
+        """Print one line on what to do next."""
+        line = text_with_names(f"next: {text}", self.mission_names())
+        _write_line(sys.stdout, line, "\x1b[36m")
+        self._copy(line)
+
+    def error(self, text: str) -> None:
+        """Print one line on standard error."""
+        text = text if self.as_json else text_with_names(text, self.mission_names())
+        _write_line(sys.stderr, f"error: {text}", "\x1b[31m")
+        self._copy(f"error: {text}")
+
+    def warning(self, text: str) -> None:
+        """Print one line on standard error."""
+        _write_line(sys.stderr, f"warning: {text}", "\x1b[33m")
+        self._copy(f"warning: {text}")
+
+    @contextmanager
+    def progress(self, command: str, verbosity: int = 0) -> Iterator[Progress]:
+        """Show progress on standard error."""
+        self._hide_progress()
+        progress = TerminalProgress(sys.stderr, verbosity, command)
+        self._progresses.append(progress)
+        try:
+            yield progress
+        finally:
+            progress.close()
+            if progress in self._progresses:  # not so when the command was left behind
+                self._progresses.remove(progress)
+
+    def clear_progress(self) -> None:
+        """Remove all bars for good, also those of an abandoned command."""
+        for progress in self._progresses:
+            progress.close()
+        self._progresses.clear()
+
+    def transcribe(self, path: Path | None) -> None:
+        """Copy all further output to a file; None ends it.
+
+        Raises:
+            UserError: The file cannot be written.
+        """
+        if self._transcript is not None:
+            self._transcript.close()
+            self._transcript = None
+        if path is not None:
+            try:
+                self._transcript = path.open("a", encoding="utf-8")
+            except OSError as error:
+                raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def echo_to_transcript(self, text: str) -> None:
+        """Copy what the user typed into the transcript."""
+        self._copy(text)
+
+    def _page(self, report: Report) -> bool:
+        if not self.is_prompt or self._out is not None:
+            return False
+        return page(rendered(report, sys.stdout, self.mission_names()))
+
+    def _hide_progress(self) -> None:
+        for progress in self._progresses:
+            progress.hide()
+
+    def _copy(self, text: str) -> None:
+        if self._transcript is not None:
+            self._transcript.write(text + "\n")
+            self._transcript.flush()
+
+
+def _write_line(stream: TextIO, text: str, colour: str) -> None:
+    if stream.isatty():
+        text = folded(text, shutil.get_terminal_size().columns)
+    line = f"{colour}{text}\x1b[0m" if wants_colour(stream) else text
+    write_message(stream, line)

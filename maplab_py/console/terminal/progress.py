@@ -1,0 +1,131 @@
+"""Progress on a terminal: a bar with the remaining time after one second."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any, TextIO
+
+from maplab_py.cancellation import current_token
+from maplab_py.console.terminal.render import wants_colour
+from maplab_py.console.terminal.streams import write_message
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
+SECONDS_BEFORE_BAR = 1.0
+SECONDS_BETWEEN_UPDATES = 0.1
+
+
+class TerminalProgress:
+    """Progress of one command. It is quiet if the stream is no terminal.
+
+    A verbosity above zero prints the lines of intermediate results everywhere.
+    """
+
+    def __init__(self, stream: TextIO, verbosity: int = 0, what: str = "") -> None:
+        """Start the clock of one command.
+
+        Args:
+            stream: Where the bar goes.
+            verbosity: Above zero: print lines of intermediate results everywhere.
+            what: Shown until the command names its current step.
+        """
+        self._stream = stream
+        self._token = current_token()
+        self._what = what
+        self._is_live = wants_colour(stream)
+        self._prints_lines = stream.isatty() or verbosity > 0
+        self._start = time.monotonic()
+        self._updated = 0.0
+        self._lock = threading.Lock()
+        self._bar: RichProgress | None = None
+        self._task: Any = None
+        self._is_closed = False
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        """Say that `done` of `total` is finished.
+
+        Raises:
+            Cancelled: The user has asked to stop.
+        """
+        self._token.check()
+        now = time.monotonic()
+        if not self._is_live or now - self._start < SECONDS_BEFORE_BAR:
+            return
+        if now - self._updated < SECONDS_BETWEEN_UPDATES and done < total:
+            return
+        self._updated = now
+        self._update(done, total, what or self._what)
+
+    def tick(self) -> None:
+        """Show that a silent command is running; any thread may call this."""
+        is_late = time.monotonic() - self._start > SECONDS_BEFORE_BAR
+        if self._is_live and self._bar is None and is_late:
+            self._update(0, None, self._what)
+
+    def line(self, text: str) -> None:
+        """Print one line of intermediate result."""
+        if not self._prints_lines or self._token.abandoned:
+            return
+        with self._lock:
+            if self._bar is not None:
+                self._bar.console.print(text, markup=False, highlight=False)
+            else:
+                write_message(self._stream, text)
+
+    def check(self) -> None:
+        """Raise Cancelled when the user has asked to stop."""
+        self._token.check()
+
+    def hide(self) -> None:
+        """Remove the bar before other output; it may reappear later."""
+        with self._lock:
+            self._start = time.monotonic()
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
+
+    def close(self) -> None:
+        """Remove the bar for good."""
+        with self._lock:
+            self._is_closed = True
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
+
+    def _update(self, done: float, total: float | None, what: str) -> None:
+        with self._lock:
+            if self._is_closed:
+                return
+            if self._bar is None:
+                self._bar = _make_bar(self._stream)
+                self._bar.start()
+                self._task = self._bar.add_task(what, total=total)
+            self._bar.update(self._task, completed=done, total=total, description=what)
+
+
+def _make_bar(stream: TextIO) -> RichProgress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("left", style="dim"),
+        TimeRemainingColumn(),
+        TextColumn("elapsed", style="dim"),
+        TimeElapsedColumn(),
+        console=Console(file=stream),
+        transient=True,
+        redirect_stdout=False,  # the streams are swapped by the prompt too, in its own order
+        redirect_stderr=False,
+    )

@@ -1,0 +1,1 @@
+"""Hand-written compiled kernels, and the templates of generated ones."""

@@ -1,0 +1,426 @@
+"""Visual terms: landmarks are eliminated slab by slab as they are evaluated.
+
+For one landmark with observations o of poses k(o), whitened and robustly weighted Jacobians P_o
+(2 x 6, pose) and Q_o (2 x 3, landmark), and residuals r_o, the normal equations are
+
+    [ sum P'P   W' ] [ pose steps    ]     [ sum P'r ]
+    [   W       H  ] [ landmark step ] = - [ sum Q'r ],   W_o = Q_o' P_o,  H = sum Q_o' Q_o.
+
+With H = L L' (3 x 3), Y_o = L^-1 W_o and z = L^-1 sum Q'r, eliminating the landmark leaves
+-Y_b' Y_a at the pose pair (k(b), k(a)) and -Y_o' z in the gradient of k(o): the Schur complement,
+formed without storing any Jacobian (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000,
+section 6.1; Agarwal et al., Bundle Adjustment in the Large, 2010). After the poses are solved for,
+a second pass evaluates the same Jacobians again, gives the landmark steps, and in the same sweep
+the new cost and the decrease that the quadratic model promised.
+
+The elimination takes two turns per slab of landmarks (see `visual_structure`):
+
+1. by landmark: evaluate, sum P'P, P'r and H, leave Y of every observation of the slab;
+2. by pose: for every observation b from there and every a of the same landmark up to b, subtract
+   Y_b' Y_a in the pose's own row of blocks. A row is short enough to stay in the fastest cache,
+   and belongs to one thread. What a slab leaves in a row is added to the storage of the system,
+   where the factorisation wants it: the blocks are never listed.
+
+The result does not depend on how many threads there are, bit for bit: sums of the first turn are
+those of a fixed number of chunks, added in a fixed order; a row is summed in the order of its views.
+
+A landmark may have a prior, a place and the inverse of its standard deviation, which adds to H, to
+Q'r and to the cost.
+
+Where cameras are estimated, an observation touches the CAMERA_COLUMNS numbers of its camera too:
+extrinsics, time offset, intrinsics. With their Jacobian C_o (2 x CAMERA_COLUMNS), V_c = sum Q_o' C_o
+over the landmark's observations by camera c, and Z_c = L^-1 V_c, eliminating the landmark leaves
+
+    C_o' P_o - Z_c' Y_o   between camera c and pose k(o): the border,
+    C_o' C_o - Z_c' Z_d   between cameras c and d,
+    C_o' r_o - Z_c' z     in the gradient of camera c.
+
+A camera whose clock is late by t sees a landmark where its pixel was t earlier: the residual gets
+uv_motion t, where uv_motion is the pixel's velocity from the states' velocities (Qin and Shen,
+Online Temporal Calibration for Monocular Visual-Inertial Systems, IROS 2018, with the velocity
+from the states instead of from the neighbouring image). Without cameras to estimate CAMERA_COLUMNS
+is zero and the compiler leaves all this out.
+
+This file is a template: `reproject` is generated for the camera models in use, and both are
+compiled as one module (see `codegen.modules`).
+"""
+
+
+# ruff: noqa: F821
+# mypy: ignore-errors
+# --- kernels ---
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_pose(out, n, k, Y, square, grad, diag):
+    """Write W = Q'P of one observation to Y[n]; add P'P to square[k], its diagonal and P'r."""
+    for c in range(6):
+        a, b = out[POSE + 2 * c], out[POSE + 2 * c + 1]
+        for i in range(3):
+            Y[n, i, c] = a * out[LANDMARK + 2 * i] + b * out[LANDMARK + 2 * i + 1]
+        grad[k, c] += a * out[0] + b * out[1]
+        diag[k, c] += a * a + b * b
+        for e in range(6):
+            square[k, c, e] += a * out[POSE + 2 * e] + b * out[POSE + 2 * e + 1]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def step_landmark(h, f, g, d):
+    """Solve H d = -g with the factor f of the damped H; return the decrease that d promises."""
+    z0 = g[0] * f[0]
+    z1 = (g[1] - f[1] * z0) * f[2]
+    z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
+    d[2] = -z2 * f[5]
+    d[1] = (-z1 - f[4] * d[2]) * f[2]
+    d[0] = (-z0 - f[1] * d[1] - f[3] * d[2]) * f[0]
+    decrease = -2.0 * (d[0] * g[0] + d[1] * g[1] + d[2] * g[2])
+    decrease -= h[0] * d[0] * d[0] + h[2] * d[1] * d[1] + h[5] * d[2] * d[2]
+    return decrease - 2.0 * (h[1] * d[0] * d[1] + h[3] * d[0] * d[2] + h[4] * d[1] * d[2])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def subtract_product(S, k, Y, b, a):
+    """Compute S[k] -= Y[b]' Y[a].
+
+    Half the time of an elimination goes here, hence the plain form. Entries are named by all their
+    indices, since a view like Y[b] counts references, which costs as much as the arithmetic. The
+    compiler has to assume that S and Y overlap: what is read before the first number is written it
+    need not read again. And each product is subtracted on its own, which is one instruction.
+    """
+    p0, p1, p2, p3, p4, p5 = Y[a, 0, 0], Y[a, 0, 1], Y[a, 0, 2], Y[a, 0, 3], Y[a, 0, 4], Y[a, 0, 5]
+    q0, q1, q2, q3, q4, q5 = Y[a, 1, 0], Y[a, 1, 1], Y[a, 1, 2], Y[a, 1, 3], Y[a, 1, 4], Y[a, 1, 5]
+    r0, r1, r2, r3, r4, r5 = Y[a, 2, 0], Y[a, 2, 1], Y[a, 2, 2], Y[a, 2, 3], Y[a, 2, 4], Y[a, 2, 5]
+    for c in range(6):
+        p, q, r = Y[b, 0, c], Y[b, 1, c], Y[b, 2, c]
+        s0 = S[k, c, 0] - p * p0 - q * q0 - r * r0
+        s1 = S[k, c, 1] - p * p1 - q * q1 - r * r1
+        s2 = S[k, c, 2] - p * p2 - q * q2 - r * r2
+        s3 = S[k, c, 3] - p * p3 - q * q3 - r * r3
+        s4 = S[k, c, 4] - p * p4 - q * q4 - r * r4
+        s5 = S[k, c, 5] - p * p5 - q * q5 - r * r5
+        S[k, c, 0], S[k, c, 1], S[k, c, 2] = s0, s1, s2
+        S[k, c, 3], S[k, c, 4], S[k, c, 5] = s3, s4, s5
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def eliminate_landmark(first, last, base, pose_of, grad, Y, f, g):
+    """Turn W of a landmark's observations into Y = L^-1 W and subtract Y_o' z from grad."""
+    z0 = g[0] * f[0]
+    z1 = (g[1] - f[1] * z0) * f[2]
+    z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
+    for o in range(first, last):
+        n, k = o - base, pose_of[o]
+        for c in range(6):
+            y0 = Y[n, 0, c] * f[0]
+            y1 = (Y[n, 1, c] - f[1] * y0) * f[2]
+            y2 = (Y[n, 2, c] - f[3] * y0 - f[4] * y1) * f[5]
+            Y[n, 0, c], Y[n, 1, c], Y[n, 2, c] = y0, y1, y2
+            grad[k, c] -= y0 * z0 + y1 * z1 + y2 * z2
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_part(S, k, i, j, target, numbers, row, col, place):
+    """Add the part S[k, 3 i.., 3 j..] (3 x 3) at node row and column of the system."""
+    if target.position[row] >= target.position[col]:
+        at, leading = target.column_start[col] + place, target.leading[col]
+        for c in range(3):
+            for r in range(3):
+                numbers[at + c * leading + r] += S[k, 3 * i + r, 3 * j + c]
+    else:
+        at, leading = target.column_start[row] + place, target.leading[row]
+        for r in range(3):
+            for c in range(3):
+                numbers[at + r * leading + c] += S[k, 3 * i + r, 3 * j + c]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_pose_block(S, k, plan, block, row, target, numbers):
+    """Add S[k] (6 x 6), a block of the pose `row`, to the system; a diagonal block's lower triangle."""
+    col, each = plan.cols[block], target.nodes_per_vertex
+    for i in range(2):
+        for j in range(2):
+            if col < row or i >= j:
+                place = target.places[4 * block + 2 * i + j]
+                add_part(S, k, i, j, target, numbers, each * row + i, each * col + j, place)
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers):
+    """Subtract Y_b' Y_a of all pairs of a slab, block row by block row.
+
+    A row is summed up in a small matrix first, which stays in the fastest cache.
+    """
+    num_poses, num_observations = len(plan.row_start) - 1, len(pose_of)
+    for piece in prange(plan.piece_start.shape[1] - 1):
+        place_of = np.empty(num_poses, np.int64)  # by column, in the row at hand
+        S = np.empty((plan.widest_row, 6, 6))
+        for row in range(plan.piece_start[slab, piece], plan.piece_start[slab, piece + 1]):
+            low, high = plan.view_start[slab, row], plan.view_start[slab, row + 1]
+            if low == high:
+                continue
+            begin, end = plan.row_start[row], plan.row_start[row + 1]
+            for block in range(begin, end):
+                place_of[plan.cols[block]] = block - begin
+            S[: end - begin] = 0.0
+            for view in range(low, high):
+                b = plan.views[view]
+                if inverse_sigma[b] == 0.0:
+                    continue
+                first = plan.first[b]
+                for a in range(first, b + 1):
+                    subtract_product(S, place_of[pose_of[a]], Y, b - base, a - base)
+                a = b + 1  # other cameras of the rig: pairs of the pose with itself
+                while a < num_observations and plan.first[a] == first and pose_of[a] == row:
+                    subtract_product(S, place_of[row], Y, b - base, a - base)
+                    a += 1
+            for block in range(begin, end):
+                add_pose_block(S, block - begin, plan, block, row, target, numbers)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
+    """Add the sums of all chunks into chunk 0, always in the same order, and P'P to the system."""
+    chunks = square.shape[0]
+    for pose in range(square.shape[1]):
+        for chunk in range(1, chunks):
+            for c in range(6):
+                for e in range(6):
+                    square[0, pose, c, e] += square[chunk, pose, c, e]
+                gradient[0, pose, c] += gradient[chunk, pose, c]
+                diagonal[0, pose, c] += diagonal[chunk, pose, c]
+        add_pose_block(square[0], pose, plan, plan.row_start[pose + 1] - 1, pose, target, numbers)
+    for chunk in range(1, chunks):
+        cost[0] += cost[chunk]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_time_offset(out, uv_motion, time_offset, o, c):
+    """Shift the residual by the time offset and write its column."""
+    out[0] += uv_motion[o, 0] * time_offset[c, 0]
+    out[1] += uv_motion[o, 1] * time_offset[c, 0]
+    out[TIME_OFFSET] = uv_motion[o, 0]
+    out[TIME_OFFSET + 1] = uv_motion[o, 1]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_camera(out, c, k, s, V, border, square, camera_gradient, camera_diagonal):
+    """Add one observation's share to V[s] of its camera c, border, square, gradient, diagonal."""
+    for w in range(CAMERA_COLUMNS):
+        a, b = out[CAMERA + 2 * w], out[CAMERA + 2 * w + 1]
+        if a == 0.0 and b == 0.0:
+            continue
+        for i in range(3):
+            V[s, i, w] += a * out[LANDMARK + 2 * i] + b * out[LANDMARK + 2 * i + 1]
+        camera_gradient[c, w] += a * out[0] + b * out[1]
+        camera_diagonal[c, w] += a * a + b * b
+        for e in range(6):
+            border[c, k, w, e] += a * out[POSE + 2 * e] + b * out[POSE + 2 * e + 1]
+        for x in range(CAMERA_COLUMNS):
+            square[c, c, w, x] += a * out[CAMERA + 2 * x] + b * out[CAMERA + 2 * x + 1]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def eliminate_cameras(cameras, count, V, f, g, square, camera_gradient):
+    """Turn V of the landmark's cameras into Z = L^-1 V and subtract Z'Z and Z'z."""
+    z0 = g[0] * f[0]
+    z1 = (g[1] - f[1] * z0) * f[2]
+    z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
+    for s in range(count):
+        c = cameras[s]
+        for w in range(CAMERA_COLUMNS):
+            y0 = V[s, 0, w] * f[0]
+            y1 = (V[s, 1, w] - f[1] * y0) * f[2]
+            y2 = (V[s, 2, w] - f[3] * y0 - f[4] * y1) * f[5]
+            V[s, 0, w], V[s, 1, w], V[s, 2, w] = y0, y1, y2
+            camera_gradient[c, w] -= y0 * z0 + y1 * z1 + y2 * z2
+    for s in range(count):
+        for t in range(count):
+            c, d = cameras[s], cameras[t]
+            for w in range(CAMERA_COLUMNS):
+                y0, y1, y2 = V[s, 0, w], V[s, 1, w], V[s, 2, w]
+                for x in range(CAMERA_COLUMNS):
+                    square[c, d, w, x] -= y0 * V[t, 0, x] + y1 * V[t, 1, x] + y2 * V[t, 2, x]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def subtract_border(first, last, base, pose_of, cameras, count, Y, V, border):
+    """Subtract Z'Y of a landmark's observations after `eliminate_cameras` has turned V into Z."""
+    for s in range(count):
+        c = cameras[s]
+        for o in range(first, last):
+            n, k = o - base, pose_of[o]
+            for w in range(CAMERA_COLUMNS):
+                y0, y1, y2 = V[s, 0, w], V[s, 1, w], V[s, 2, w]
+                for e in range(6):
+                    border[c, k, w, e] -= y0 * Y[n, 0, e] + y1 * Y[n, 1, e] + y2 * Y[n, 2, e]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def slot_of(camera, cameras, count):
+    """Return the place of a camera among those of the landmark, or `count` for a new one."""
+    for s in range(count):
+        if cameras[s] == camera:
+            return s
+    return count
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
+    """Form the reduced normal equations of poses and, with CAMERA_COLUMNS > 0, cameras.
+
+    In: `data`, `at` and `rule` as in `kernels.visual_arguments`. Room: Y (observations of the largest
+    slab, 3, 6).
+    Out: `sums`, of which the camera's parts remain to be added over chunks; cost (chunks,), the sum
+    of rho, whose chunk 0 holds the sum over all at the end, as those of the poses do. Sums and cost are
+    zero at first. The blocks of poses are added to `numbers`, the storage of the system, where `target`
+    says. The numbers are an argument of their own: numba drops what a parallel loop writes into an
+    array unpacked from a tuple.
+    """
+    start, pose_of, camera_of, uv, inverse_sigma, scale2, uv_motion = data
+    poses, extrinsics, parameters, points, time_offset = at
+    loss_kind, damping, move_points = rule
+    square, gradient, diagonal, border, camera_square, camera_gradient, camera_diagonal = sums
+    for slab in range(len(plan.slab_start) - 1):
+        base = start[plan.slab_start[slab]]
+        for chunk in prange(len(cost)):
+            grad, diag, pose_square = gradient[chunk], diagonal[chunk], square[chunk]
+            B, C = border[chunk], camera_square[chunk]
+            cgrad, cdiag = camera_gradient[chunk], camera_diagonal[chunk]
+            V = np.empty((len(extrinsics), 3, CAMERA_COLUMNS))
+            cameras = np.empty(len(extrinsics), dtype=np.int64)
+            out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
+            total = 0.0
+            for landmark in range(plan.chunk_start[slab, chunk], plan.chunk_start[slab, chunk + 1]):
+                first, last = start[landmark], start[landmark + 1]
+                rho, count = begin_landmark(points, prior, landmark, h, g), 0
+                for o in range(first, last):
+                    n = o - base
+                    if inverse_sigma[o] == 0.0:
+                        Y[n] = 0.0
+                        continue
+                    k, c = pose_of[o], camera_of[o]
+                    reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+                    if CAMERA_COLUMNS > 0:
+                        add_time_offset(out, uv_motion, time_offset, o, c)
+                    rho += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                    add_landmark_sums(out, h, g)
+                    add_pose(out, n, k, Y, pose_square, grad, diag)
+                    if CAMERA_COLUMNS > 0:
+                        s = slot_of(c, cameras, count)
+                        if s == count:
+                            cameras[s] = c
+                            V[s] = 0.0
+                            count += 1
+                        add_camera(out, c, k, s, V, B, C, cgrad, cdiag)
+                total += rho
+                if move_points:
+                    factor_3x3(h, damping, f)
+                    eliminate_landmark(first, last, base, pose_of, grad, Y, f, g)
+                    if CAMERA_COLUMNS > 0:
+                        eliminate_cameras(cameras, count, V, f, g, C, cgrad)
+                        subtract_border(first, last, base, pose_of, cameras, count, Y, V, B)
+            cost[chunk] += total
+        if move_points:
+            subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers)
+    add_chunks(plan, square, gradient, diagonal, cost, target, numbers)
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, sums):
+    """Step the landmarks for given steps of poses (P, 6) and cameras (C, CAMERA_COLUMNS).
+
+    In: `new` is what `at` becomes with these steps. Out: new.points (L, 3); sums (chunks, 2): new
+    sum of rho, and twice the decrease of the quadratic model. Row 0 of sums holds the sum over all
+    chunks at the end.
+    """
+    start, pose_of, camera_of, uv, inverse_sigma, scale2, uv_motion = data
+    poses, extrinsics, parameters, points, time_offset = at
+    new_poses, new_extrinsics, new_parameters, new_points, new_time_offset = new
+    loss_kind, damping, move_points = rule
+    chunks = sums.shape[0]
+    for chunk in prange(chunks):
+        out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
+        d = np.zeros(3)
+        new_cost, decrease = 0.0, 0.0
+        for landmark in range(chunk_start[chunk], chunk_start[chunk + 1]):
+            first, last = start[landmark], start[landmark + 1]
+            begin_landmark(points, prior, landmark, h, g)
+            for o in range(first, last):
+                if inverse_sigma[o] == 0.0:
+                    continue
+                k, c = pose_of[o], camera_of[o]
+                reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+                if CAMERA_COLUMNS > 0:
+                    add_time_offset(out, uv_motion, time_offset, o, c)
+                weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                decrease += out[0] * out[0] + out[1] * out[1]
+                for e in range(6):
+                    out[0] += out[POSE + 2 * e] * pose_step[k, e]
+                    out[1] += out[POSE + 2 * e + 1] * pose_step[k, e]
+                for w in range(CAMERA_COLUMNS):
+                    out[0] += out[CAMERA + 2 * w] * camera_step[c, w]
+                    out[1] += out[CAMERA + 2 * w + 1] * camera_step[c, w]
+                decrease -= out[0] * out[0] + out[1] * out[1]
+                add_landmark_sums(out, h, g)
+            d[:] = 0.0
+            if move_points:
+                factor_3x3(h, damping, f)
+                decrease += step_landmark(h, f, g, d)
+            for j in range(3):
+                new_points[landmark, j] = points[landmark, j] + d[j]
+            new_cost += begin_landmark(new_points, prior, landmark, h, g)
+            for o in range(first, last):
+                if inverse_sigma[o] == 0.0:
+                    continue
+                k, c = pose_of[o], camera_of[o]
+                reproject_only(
+                    new_poses,
+                    k,
+                    new_extrinsics,
+                    c,
+                    new_parameters,
+                    new_points,
+                    landmark,
+                    uv,
+                    o,
+                    out,
+                )
+                if CAMERA_COLUMNS > 0:
+                    add_time_offset(out, uv_motion, new_time_offset, o, c)
+                s = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma[o] * inverse_sigma[o]
+                new_cost += rho_and_weight(loss_kind, s, scale2[o])[0]
+        sums[chunk, 0] = new_cost
+        sums[chunk, 1] = decrease
+    for chunk in range(1, chunks):
+        sums[0, 0] += sums[chunk, 0]
+        sums[0, 1] += sums[chunk, 1]
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def evaluate(data, at, error_depth):
+    """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
+    start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px
+    poses, extrinsics, parameters, points, _ = at
+    for landmark in prange(len(start) - 1):
+        out = np.empty(NUM_OUT)
+        for o in range(start[landmark], start[landmark + 1]):
+            k, c = pose_of[o], camera_of[o]
+            reproject_only(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+            error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
+            error_depth[o, 1] = out[2]
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def pixel_motion(data, at, tangent, motion):
+    """Write the velocity (O, 2) [px/s] of every projection for velocities (P, 6) of the poses."""
+    start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px
+    poses, extrinsics, parameters, points, _ = at
+    for landmark in prange(len(start) - 1):
+        out = np.empty(NUM_OUT)
+        for o in range(start[landmark], start[landmark + 1]):
+            k, c = pose_of[o], camera_of[o]
+            reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+            a, b = 0.0, 0.0
+            for e in range(6):
+                a += out[POSE + 2 * e] * tangent[k, e]
+                b += out[POSE + 2 * e + 1] * tangent[k, e]
+            motion[o, 0] = a
+            motion[o, 1] = b

@@ -1,0 +1,1 @@
+"""The least-squares problem, its solver, gauge and marginal covariances."""

@@ -1,0 +1,78 @@
+"""Uncertainty of an optimum: blocks of the inverse of the normal equations.
+
+The gauge is that of the problem: what is held has no variance, and covariances are relative to it.
+With robust losses the weights at the optimum count, so down-weighted measurements tell little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maplab_py.array_types import F64
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.states import States, pose_nodes
+from maplab_py.geometry import se3, so3
+
+_LANDMARK_DAMPING = 1e-12
+"""Relative damping of landmarks' own 3 x 3 systems: those without parallax stay solvable."""
+
+
+class Marginals:
+    """Covariances of any states of a problem, from one factorisation."""
+
+    def __init__(self, problem: Problem, states: States) -> None:
+        """Factorise the normal equations at the states.
+
+        Raises:
+            EstimationError: They are singular; the message names where.
+        """
+        self._problem, self._states = problem, states
+        with single_blas_thread():
+            problem.relinearize(states)
+            linear = problem.linearize(states, _LANDMARK_DAMPING)
+            try:
+                problem.factorise(linear, 0.0)
+            except NotPositiveDefinite as error:
+                raise EstimationError(
+                    "no covariance: the measurements do not determine "
+                    f"{problem.name_of_node(states, error.node)}; fix it or add a prior"
+                ) from None
+
+    def nodes(self, nodes: ArrayLike) -> F64:
+        """Return the joint covariance (3 k, 3 k) of nodes (k,), in the given order."""
+        chosen = np.asarray(nodes, dtype=np.int64).reshape(-1)
+        with single_blas_thread():
+            return self._problem.marginal_covariance(chosen)
+
+    def block(self, name: str) -> F64:
+        """Return the joint covariance (N d, N d) of a block's N parameters, without padding."""
+        block, nodes = self._states.blocks[name], self._states.nodes(name)
+        full = self.nodes(nodes)
+        width = 3 * block.nodes_each
+        kept = np.arange(len(block) * width).reshape(len(block), width)[:, : block.dimension]
+        return np.asarray(full[np.ix_(kept.reshape(-1), kept.reshape(-1))])
+
+    def poses(self, vertices: ArrayLike) -> F64:
+        """Return the covariances (N, 6, 6) of poses: position in G [m^2], rotation in I [rad^2]."""
+        rows = np.asarray(vertices, dtype=np.int64).reshape(-1)
+        result = np.empty((len(rows), 6, 6))
+        for chunk in np.array_split(np.arange(len(rows)), max(1, len(rows) // 64)):
+            joint = self.nodes(pose_nodes(rows[chunk]))
+            local = np.arange(6 * len(chunk)).reshape(-1, 6)
+            result[chunk] = joint[local[:, :, None], local[:, None, :]]
+        return result
+
+    def relative_pose(self, first: int, second: int) -> F64:
+        """Return the covariance (6, 6) of T_A_B: position in A, rotation in B."""
+        joint = self.nodes(pose_nodes(np.array([first, second])))
+        T_A_B = se3.relative(self._states.T_G_I[first], self._states.T_G_I[second])
+        R_A_G = so3.to_matrix(self._states.T_G_I[first, :4]).T
+        J = np.zeros((6, 12))
+        J[:3, :3], J[:3, 6:9] = -R_A_G, R_A_G
+        J[:3, 3:6] = so3.skew(T_A_B[4:])
+        J[3:, 3:6], J[3:, 9:] = -so3.to_matrix(T_A_B[:4]).T, np.eye(3)
+        return np.asarray(J @ joint @ J.T)

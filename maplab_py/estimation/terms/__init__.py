@@ -1,0 +1,1 @@
+"""Cost terms: residuals and Jacobians of one kind of measurement each."""

@@ -1,0 +1,371 @@
+"""Reprojection errors of landmarks: data, structure, and calls of the compiled kernels."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.array_types import F64, I32, I64
+from maplab_py.estimation.codegen.kernels import CameraModel, visual_kernels
+from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
+from maplab_py.estimation.kernels.visual_arguments import (
+    VisualData,
+    VisualRule,
+    VisualStates,
+    VisualSums,
+    VisualTarget,
+)
+from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces
+from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.loss_values import loss_and_weight
+from maplab_py.estimation.states import NODES_PER_VERTEX, States
+from maplab_py.estimation.terms.cameras import (
+    EXTRINSICS,
+    INTRINSICS,
+    TIME_OFFSET,
+    Cameras,
+    border_places,
+    border_values,
+    camera_blocks,
+    camera_nodes,
+)
+from maplab_py.estimation.terms.visual_structure import (
+    EliminationPlan,
+    elimination_plan,
+    landmark_chunks,
+)
+from maplab_py.geometry import se3
+from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+
+_BLOCKS_AT_ONCE = 65_536
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Observations:
+    """O observations grouped by landmark, vertices ascending within a landmark."""
+
+    start: I64  # (L + 1,) offsets by landmark
+    vertex: I32  # (O,) row of the states
+    camera: I32  # (O,) row of cameras
+    uv_px: F64  # (O, 2)
+    inverse_sigma: F64  # (O,) [1/px]; 0 = the observation does not take part
+    loss_scale: F64  # (O,) in sigmas
+
+    def __len__(self) -> int:
+        return len(self.vertex)
+
+    @cached_property
+    def scale2(self) -> F64:
+        """Squared loss scale (O,)."""
+        return np.square(self.loss_scale)
+
+    @property
+    def landmark(self) -> I64:
+        """Landmark row of every observation (O,)."""
+        return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+
+    def switched(self, is_used: NDArray[np.bool_], sigma_px: F64) -> Observations:
+        """Return the same observations of which only some (O,) take part."""
+        return dataclasses.replace(self, inverse_sigma=np.where(is_used, 1.0 / sigma_px, 0.0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VisualPlaces:
+    """Where the blocks of the visual terms lie in a solver's storage."""
+
+    target: VisualTarget
+    border: BlockPlaces | None  # of cameras that are estimated
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NodeSystem:
+    """Reduced normal equations by node; the blocks are in the solver's storage."""
+
+    gradient: F64  # (nodes, 3)
+    diagonal: F64  # (nodes, 3) of the unreduced equations
+    cost: float
+
+
+class VisualTerms:
+    """All reprojection errors of a problem.
+
+    With kernels that estimate cameras the states have the blocks of `camera_blocks`. What shall not
+    move is fixed in the problem; columns beyond a camera's own parameters are padding, without
+    effect, and have to be fixed too.
+    """
+
+    def __init__(
+        self,
+        kernels: ModuleType,
+        observations: Observations,
+        cameras: Cameras,
+        num_vertices: int,
+        *,
+        loss: Loss = Loss.HUBER,
+        move_points: bool = True,
+        landmark_prior: F64 | None = None,
+    ) -> None:
+        """Analyse who sees what together.
+
+        Args:
+            kernels: Compiled for the cameras' models, and to estimate them or not.
+            observations: Grouped by landmark.
+            cameras: As `observations` count them.
+            num_vertices: V.
+            loss: Robust loss of reprojection errors.
+            move_points: Whether landmarks are estimated.
+            landmark_prior: Places and inverse standard deviations (L, 4) [m, 1/m]; 0 = none.
+        """
+        self._kernels, self._cameras = kernels, cameras
+        self.loss, self.moves_points = loss, move_points
+        count = len(observations.start) - 1
+        self._prior = np.zeros((count, 4)) if landmark_prior is None else landmark_prior
+        self.observations = observations
+        self.num_vertices = num_vertices
+        self.chunk_start = landmark_chunks(observations.start)
+        self.estimates_cameras = kernels.CAMERA_COLUMNS > 0
+        self._uv_motion = np.zeros((len(observations) if self.estimates_cameras else 0, 2))
+        self._angular_velocity: F64 | None = None
+
+    @cached_property
+    def plan(self) -> EliminationPlan:
+        """Blocks of the reduced system, which only solvers that form it need.
+
+        Raises:
+            NotEnoughMemory: It does not fit.
+        """
+        data = self.observations
+        return elimination_plan(data.start, data.vertex, self.num_vertices)
+
+    def forget_plan(self) -> None:
+        """Give back the memory of the plan, which is made again when somebody needs it."""
+        self.__dict__.pop("plan", None)
+
+    @cached_property
+    def _Y(self) -> F64:
+        return np.empty((self.plan.largest_slab, 3, 6))
+
+    @cached_property
+    def _sums(self) -> VisualSums:
+        width = self._kernels.CAMERA_COLUMNS
+        return VisualSums.zeros(self.num_chunks, self.num_vertices, len(self._cameras.T_I_C), width)
+
+    @property
+    def num_chunks(self) -> int:
+        """How many sums are kept apart, whatever the number of threads."""
+        return len(self.chunk_start) - 1
+
+    @property
+    def has_landmark_prior(self) -> bool:
+        """Whether some landmark has a prior."""
+        return bool(self._prior[:, 3].any())
+
+    def use(self, observations: Observations) -> None:
+        """Exchange weights and losses; the structure must be the same."""
+        self.observations = observations
+
+    def follow_motion(self, angular_velocity_I: F64) -> None:
+        """Take time offsets into account, with angular velocities (V, 3) [rad/s] of the vertices.
+
+        The pixels' velocities are those of the states at the latest `refresh`.
+        """
+        self._angular_velocity = angular_velocity_I
+
+    def refresh(self, states: States) -> bool:
+        """Compute the pixels' velocities again; tell whether there are any."""
+        if self._angular_velocity is None:
+            return False
+        tangent = np.concatenate([states.v_G, self._angular_velocity], axis=1)
+        self._kernels.pixel_motion(self._data(), self._at(states), tangent, self._uv_motion)
+        self._uv_motion[~np.isfinite(self._uv_motion).all(axis=1)] = 0.0
+        return True
+
+    def block_nodes(self, states: States) -> tuple[I32, I32]:
+        """Return node row and column (B,) of every block of the system."""
+        row, col = node_blocks(self.plan.rows, self.plan.cols)
+        if not self.estimates_cameras:
+            return row, col
+        border_row, border_col = border_places(states)
+        rows, cols = np.concatenate([row, border_row]), np.concatenate([col, border_col])
+        return rows.astype(np.int32), cols.astype(np.int32)
+
+    def places(self, states: States, solver: AssembledSolver) -> VisualPlaces:
+        """Find where the blocks lie in the storage of a solver that has analysed them."""
+        rows, cols = self.plan.rows, self.plan.cols
+        parts = [np.zeros(0, dtype=np.int32)]
+        for first in range(0, len(cols), _BLOCKS_AT_ONCE):
+            part = slice(first, first + _BLOCKS_AT_ONCE)
+            parts.append(solver.places(*node_blocks(rows[part], cols[part])))
+        layout = solver.layout
+        target = VisualTarget(
+            NODES_PER_VERTEX, np.concatenate(parts), layout.position, layout.column_start,
+            layout.leading,
+        )  # fmt: skip
+        border = BlockPlaces.of(solver, *border_places(states)) if self.estimates_cameras else None
+        return VisualPlaces(target, border)
+
+    def linearize(
+        self, states: States, damping: float, solver: AssembledSolver, places: VisualPlaces
+    ) -> NodeSystem:
+        """Eliminate the landmarks; add what is left to the solver's matrix and the result."""
+        cost = np.zeros(self.num_chunks)
+        for sums in self._sums:
+            sums.fill(0.0)
+        self._kernels.eliminate(
+            self._data(), self._at(states), self._prior, self._rule(damping), self.plan, self._Y,
+            self._sums, cost, places.target, solver.numbers,
+        )  # fmt: skip
+        gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))
+        pose_part(gradient, states)[:] = self._sums.gradient[0]
+        pose_part(diagonal, states)[:] = self._sums.diagonal[0]
+        if places.border is not None:
+            self._add_camera_chunks()
+            nodes = camera_nodes(states)
+            gradient[nodes] = self._sums.camera_gradient[0].reshape(*nodes.shape, 3)
+            diagonal[nodes] = self._sums.camera_diagonal[0].reshape(*nodes.shape, 3)
+            places.border.add(solver, border_values(self._sums, nodes))
+        return NodeSystem(gradient, diagonal, 0.5 * float(cost[0]))
+
+    def _add_camera_chunks(self) -> None:
+        """Add the cameras' sums of all chunks into chunk 0."""
+        sums = self._sums
+        for part in (sums.border, sums.camera_square, sums.camera_gradient, sums.camera_diagonal):
+            for chunk in part[1:]:
+                part[0] += chunk
+
+    def keep_jacobians(self, states: States, kept: KeptSystem, sums: PoseSums) -> float:
+        """Evaluate all observations and keep their Jacobians; return the cost.
+
+        Cameras must not be estimated.
+        """
+        cost = np.zeros(self.num_chunks)
+        self._kernels.keep_jacobians(
+            self._data(), self._at(states), self._prior, int(self.loss), self.chunk_start, kept,
+            sums, cost,
+        )  # fmt: skip
+        return 0.5 * float(cost.sum())
+
+    def take_step(
+        self, states: States, step: F64, moved: States, damping: float
+    ) -> tuple[F64, float, float]:
+        """Return landmarks, cost and promised decrease for a step (nodes, 3) to `moved` states."""
+        new_p_G, sums = np.empty_like(states.p_G), np.zeros((self.num_chunks, 2))
+        camera_step = np.zeros((len(self._cameras.T_I_C), 0))
+        if self.estimates_cameras:
+            camera_step = step[camera_nodes(states)].reshape(len(camera_step), -1)
+        self._kernels.substitute(
+            self._data(), self._at(states), self._prior, self._rule(damping),
+            np.ascontiguousarray(pose_part(step, states)), camera_step, self.chunk_start,
+            self._at(moved)._replace(p_G=new_p_G), sums,
+        )  # fmt: skip
+        return new_p_G, 0.5 * float(sums[0, 0]), 0.5 * float(sums[0, 1])
+
+    def errors(self, states: States) -> tuple[F64, F64]:
+        """Return reprojection error [px] and depth [m] (O,) of every observation, used or not."""
+        data, at, result = self._data(), self._at(states), np.empty((len(self.observations), 2))
+        if self.estimates_cameras:
+            offset_px = self._uv_motion * at.time_offset_s[data.camera]
+            data = data._replace(uv_px=data.uv_px - offset_px)
+        self._kernels.evaluate(data, at, result)
+        return result[:, 0], result[:, 1]
+
+    def cost(self, states: States) -> float:
+        """Return half the sum of rho at some states, without forming any equations."""
+        return self.cost_of_errors(self.errors(states)[0], states)
+
+    def cost_of_errors(self, error_px: F64, states: States) -> float:
+        """Return the cost at some states for the reprojection errors (O,) that they have."""
+        data = self.observations
+        used = data.inverse_sigma > 0.0
+        squared = np.square(error_px[used] * data.inverse_sigma[used])
+        total = float(np.sum(loss_and_weight(self.loss, data.scale2[used], squared)[0]))
+        off = (states.p_G - self._prior[:, :3]) * self._prior[:, 3:]
+        return 0.5 * (total + float(np.sum(off * off)))
+
+    def _data(self) -> VisualData:
+        data = self.observations
+        return VisualData(
+            data.start,
+            data.vertex,
+            data.camera,
+            data.uv_px,
+            data.inverse_sigma,
+            data.scale2,
+            self._uv_motion,
+        )
+
+    def _at(self, states: States) -> VisualStates:
+        T_I_C, parameters = self._cameras.T_I_C, self._cameras.parameters
+        time_offset_s = np.zeros((len(T_I_C), 1))
+        if self.estimates_cameras:
+            blocks = states.blocks
+            T_I_C = np.ascontiguousarray(blocks[EXTRINSICS].values)
+            parameters = np.concatenate([parameters[:, :1], blocks[INTRINSICS].values], axis=1)
+            time_offset_s = blocks[TIME_OFFSET].values
+        return VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, time_offset_s)
+
+    def _rule(self, damping: float) -> VisualRule:
+        return VisualRule(int(self.loss), float(damping), self.moves_points)
+
+
+def node_blocks(rows: I32, cols: I32) -> tuple[I32, I32]:
+    """Return node row and column of the 3 x 3 parts of pose blocks, (4 B,) each.
+
+    A pose block has the parts (position, orientation) x (position, orientation); of a diagonal
+    block the upper part is given the place of the lower one and is not added.
+    """
+    node_row = np.int32(NODES_PER_VERTEX) * rows[:, None] + np.array([0, 0, 1, 1], dtype=np.int32)
+    node_col = np.int32(NODES_PER_VERTEX) * cols[:, None] + np.array([0, 1, 0, 1], dtype=np.int32)
+    return np.maximum(node_row, node_col).reshape(-1), np.minimum(node_row, node_col).reshape(-1)
+
+
+def pose_part(by_node: F64, states: States) -> F64:
+    """View the position and orientation nodes of (nodes, 3) as (V, 6)."""
+    by_vertex = by_node[: states.num_vertex_nodes].reshape(-1, NODES_PER_VERTEX * 3)
+    return by_vertex[:, :6]
+
+
+def compile_kernels(models: tuple[CameraModel, ...], *, calibrating: bool) -> None:
+    """Compile reprojection for a rig of camera models."""
+    visual, states = sample_terms(models, calibrating=calibrating)
+    rows, cols = visual.block_nodes(states)
+    solver = SupernodalCholesky(rows, cols, states.num_nodes, 3)
+    solver.clear()
+    visual.linearize(states, 1e-4, solver, visual.places(states, solver))
+    visual.take_step(states, np.zeros((states.num_nodes, 3)), states, 1e-4)
+    visual.errors(states)
+
+
+def sample_terms(
+    models: tuple[CameraModel, ...], *, calibrating: bool
+) -> tuple[VisualTerms, States]:
+    """Return the terms of a landmark that two vertices see, small enough for compilation."""
+    widest = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in models)
+    projection, distortion = models[0]
+    intrinsics = [0.1, 100.0, 100.0, 50.0, 50.0][5 - INTRINSICS_SIZE[projection] :]
+    parameters = np.zeros((1, 1 + widest))
+    used = [*intrinsics, *[0.1] * DISTORTION_SIZE[distortion]]
+    parameters[0, 1 : 1 + len(used)] = used
+    T_G_I = se3.identity(2)
+    T_G_I[1, 4] = 1.0
+    observations = Observations(
+        start=np.array([0, 2], dtype=np.int64),
+        vertex=np.array([0, 1], dtype=np.int32),
+        camera=np.zeros(2, dtype=np.int32),
+        uv_px=np.array([[60.0, 50.0], [40.0, 50.0]]),
+        inverse_sigma=np.ones(2),
+        loss_scale=np.full(2, 3.0),
+    )
+    cameras, zero = Cameras(se3.identity(1), parameters), np.zeros((2, 3))
+    states = States(T_G_I, zero, zero, zero, np.array([[0.5, 0.0, 5.0]]))
+    visual = VisualTerms(visual_kernels(models, calibrating=calibrating), observations, cameras, 2)
+    if calibrating:
+        states = states.with_blocks(*camera_blocks(cameras, np.zeros(1)))
+        visual.follow_motion(zero)
+        visual.refresh(states)
+    return visual, states

@@ -1,0 +1,53 @@
+"""The kernels of the optimiser, compiled before they are needed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+
+from maplab_py.estimation.codegen.kernels import CameraModel, residual_kernel
+from maplab_py.estimation.imu import preintegration
+from maplab_py.estimation.linear import block_cholesky
+from maplab_py.estimation.problem import iterative
+from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.terms import factor, visual
+from maplab_py.sensors import Distortion, Projection
+
+_RESIDUALS = (
+    "inertial",
+    "inertial_with_intrinsics",
+    "relative_pose",
+    "relative_pose_with_mounting",
+    "switched_relative_pose",
+    "absolute_pose",
+    "absolute_pose_with_mounting",
+)
+"""Functions of `symbolic.sources`."""
+
+
+def optimizer_jobs() -> dict[str, Callable[[], None]]:
+    """Return by name what compiles kernels that are needed together."""
+    jobs: dict[str, Callable[[], None]] = {
+        name: partial(_compile_residual, name) for name in _RESIDUALS
+    }
+    jobs["losses and normal equations"] = factor.compile_kernels
+    jobs["block Cholesky"] = block_cholesky.compile_kernels
+    jobs["conjugate gradients"] = iterative.compile_without_images
+    jobs["preintegration"] = preintegration.compile_kernels
+    for projection, distortion in itertools.product(Projection, Distortion):
+        model = f"{projection.name} {distortion.name}"
+        models = ((projection, distortion),)
+        jobs[f"reprojection {model}"] = partial(_compile_reprojection, models)
+        calibration = partial(visual.compile_kernels, models, calibrating=True)
+        jobs[f"camera calibration {model}"] = calibration
+    return jobs
+
+
+def _compile_residual(name: str) -> None:
+    residual_kernel(name, getattr(sources, name)).compile_kernel()
+
+
+def _compile_reprojection(models: tuple[CameraModel, ...]) -> None:
+    visual.compile_kernels(models, calibrating=False)
+    iterative.compile_kernels(models)

@@ -1,0 +1,86 @@
+"""All factors of a window that are not observations of landmarks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import Mask
+from maplab_py.estimation.kernels import window as kernels
+from maplab_py.estimation.kernels.window_arguments import DenseSystem
+from maplab_py.estimation.window.inertial import InertialChain
+from maplab_py.estimation.window.standstill import Factors, Standstill
+from maplab_py.estimation.window.states import WindowStates
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Part:
+    """Some of the factors: edges, consecutive ones, and what is known of single frames."""
+
+    edges: slice
+    frames: slice
+
+
+EVERY = Part(slice(None), slice(None))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrameFactors:
+    """Inertial edges, walk of the biases, and what is known of frames at rest."""
+
+    chain: InertialChain
+    standstill: Standstill
+    is_resting: Mask  # (F,) frames surely without velocity
+    is_turning: Mask  # (F,) frames that only turn, which is less sure
+
+    def costs(self, states: WindowStates) -> dict[str, float]:
+        """Return half the sum of squares of every kind at some states."""
+        residual, _ = self.chain.evaluate(states.T_M_I, states.motion, EVERY.edges)
+        costs = {"inertial": 0.5 * float(np.vdot(residual, residual))}
+        nothing = DenseSystem.zeros(0)
+        weight = self.chain.walk_weight
+        costs["bias walk"] = float(kernels.add_walks(states.motion, weight, nothing))
+        still = self._still(states, EVERY)
+        if still:
+            costs["standstill"] = sum(0.5 * float(np.vdot(r, r)) for r, _, _ in still)
+        return costs
+
+    def add_to(
+        self, system: DenseSystem, states: WindowStates, at: WindowStates, part: Part = EVERY
+    ) -> dict[str, float]:
+        """Add the normal equations of some factors; return the costs.
+
+        Residuals are those at `states`, Jacobians those at `at`.
+        """
+        edges = part.edges
+        residual, jacobian = self.chain.evaluate(states.T_M_I, states.motion, edges)
+        if at is not states:
+            _, jacobian = self.chain.evaluate(at.T_M_I, at.motion, edges)
+        rows = 15 * np.arange(len(self.chain), dtype=np.int64)[edges]
+        costs = {"inertial": float(kernels.add_factors(residual, jacobian, rows, system))}
+        weight = np.zeros((len(self.chain), 2))
+        weight[edges] = self.chain.walk_weight[edges]
+        costs["bias walk"] = float(kernels.add_walks(states.motion, weight, system))
+        still = self._still(states, part)
+        if still:
+            where = still if at is states else self._still(at, part)
+            pairs = zip(still, where, strict=True)
+            costs["standstill"] = sum(
+                float(kernels.add_factors(r, np.ascontiguousarray(J), first, system))
+                for (r, _, first), (_, J, _) in pairs
+            )
+        return costs
+
+    def _still(self, states: WindowStates, part: Part) -> list[Factors]:
+        """Return the factors of edges and frames at rest."""
+        edges, frames = np.arange(len(self.chain))[part.edges], np.arange(len(states))[part.frames]
+        resting = edges[self.chain.is_resting[edges]]
+        still = frames[self.is_resting[frames] | self.is_turning[frames]]
+        factors: list[Factors] = []
+        if len(still):
+            is_sure = self.is_resting[still]
+            factors.append(self.standstill.velocities(still, ~is_sure, states.motion))
+        if len(resting):
+            factors.append(self.standstill.poses(resting, states.T_M_I))
+        return factors

@@ -1,0 +1,204 @@
+"""The inertial edges between neighbouring frames of a window, as a chain that grows and shrinks."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.errors import MapError
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
+from maplab_py.estimation.terms.inertial import measured_arguments, outdated_edges, whitening
+from maplab_py.geometry import se3, so3
+from maplab_py.sensors import Imu
+from maplab_py.vimap.table import starts_of_counts
+
+_SHORTEST_WALK_S = 1e-9
+_INPUTS, _MEASURED = 100, 74
+"""Inputs of the inertial residual, and how many of them do not depend on states."""
+
+
+_COLUMNS = (
+    "_arguments", "_whitening", "_integrated_at", "_seen_at",
+    "duration_s", "is_resting", "is_open", "_is_stale",
+)  # fmt: skip
+
+Samples = list[tuple[I64, F64]]
+"""Times (S,) [ns] and values (S, 6) of the samples of each of some edges."""
+
+
+class InertialChain:
+    """Edges e = 0 .. E - 1 from frame e to frame e + 1 with all their samples.
+
+    An open edge has no information: the prior has it.
+    """
+
+    def __init__(self, kernel: ModuleType, imu: Imu) -> None:
+        """Begin without edges; the kernel is that of the residual `inertial`."""
+        self._kernel, self._imu = kernel, imu
+        self._g_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
+        self._samples: Samples = []
+        self._arguments, self._whitening = np.zeros((0, _MEASURED)), np.zeros((0, 9, 9))
+        self._integrated_at, self._seen_at = np.zeros((0, 6)), np.zeros((0, 6))
+        self.duration_s = np.zeros(0)
+        self.is_resting: Mask = np.zeros(0, dtype=np.bool_)
+        self.is_open: Mask = np.zeros(0, dtype=np.bool_)
+        self._is_stale: Mask = np.zeros(0, dtype=np.bool_)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @property
+    def walk_weight(self) -> F64:
+        """Inverse standard deviations (E, 2) of the walk of a bias' component, gyroscope first."""
+        imu = self._imu
+        densities = [
+            imu.gyro_bias_random_walk_noise_density,
+            imu.acc_bias_random_walk_noise_density,
+        ]
+        root_s = np.sqrt(np.maximum(self.duration_s, _SHORTEST_WALK_S))
+        weight = 1.0 / np.maximum(root_s[:, None] * np.array(densities), 1e-9)
+        return np.where(self.is_open[:, None], 0.0, weight)
+
+    def append(self, times_ns: I64, accel_gyro: F64, motion: F64, *, is_resting: bool) -> None:
+        """Add the edge to a new frame; its biases are those in the motion (9,) of the last one.
+
+        Raises:
+            MapError: Times run backwards, or a sample is not a number.
+        """
+        self.extend([(times_ns, accel_gyro)], motion[None], is_resting=is_resting)
+
+    def extend(self, samples: Samples, motion: F64, *, is_resting: bool = False) -> None:
+        """Add N edges to new frames; their biases are those in the motion (N, 9) where they begin.
+
+        Raises:
+            MapError: Times run backwards, or a sample is not a number.
+        """
+        count, biases = len(samples), motion[:, 3:]
+        new = (
+            np.zeros((count, _MEASURED)), np.zeros((count, 9, 9)), biases, biases,
+            np.zeros(count), np.full(count, is_resting), np.zeros(count, dtype=np.bool_),
+            np.ones(count, dtype=np.bool_),
+        )  # fmt: skip
+        self._samples += samples
+        for name, values in zip(_COLUMNS, new, strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
+        try:
+            self._integrate_stale()
+        except MapError:
+            for _ in range(count):
+                self.drop_last()
+            raise
+
+    def predict(self, T_M_I: F64, motion: F64) -> tuple[F64, F64]:
+        """Return pose (7,) and motion (9,) at the end of the last edge, from those at its start."""
+        values = self._arguments[-1]
+        q_A_B, dp, dv, dt = values[:4], values[4:7], values[7:10], self.duration_s[-1]
+        R_M_A = so3.to_matrix(T_M_I[:4])
+        p_M_B = T_M_I[4:] + R_M_A @ dp + motion[:3] * dt + 0.5 * self._g_M * dt * dt
+        T_M_B = se3.make(so3.normalize(so3.multiply(T_M_I[:4], q_A_B)), p_M_B)
+        v_M = motion[:3] + R_M_A @ dv + self._g_M * dt
+        return T_M_B, np.concatenate([v_M, motion[3:]])
+
+    def drop_first(self) -> None:
+        """Remove the edge from the first frame."""
+        self._drop(0)
+
+    def join(self, frame: int, motion: F64) -> None:
+        """Remove a frame inside: make a single edge of those that meet in it.
+
+        Args:
+            frame: Row of the frame.
+            motion: (9,) of the frame before, with its biases.
+        """
+        first, second = self._samples[frame - 1], self._samples[frame]
+        times_ns = np.concatenate([first[0], second[0][1:]])
+        accel_gyro = np.concatenate([first[1], second[1][1:]])
+        self._samples[frame - 1] = times_ns, accel_gyro
+        self._integrated_at[frame - 1], self._is_stale[frame - 1] = motion[3:], True
+        self.is_resting[frame - 1] &= self.is_resting[frame]
+        self.duration_s[frame - 1] += self.duration_s[frame]
+        self._drop(frame)
+
+    def joined_s(self, frame: int) -> float:
+        """Return how long the edge without a frame inside would be [s]; infinite when not known."""
+        if self.is_open[frame - 1] or self.is_open[frame]:
+            return np.inf
+        return float(self.duration_s[frame - 1] + self.duration_s[frame])
+
+    def open(self, frame: int) -> None:
+        """Remove a frame inside: the edges that meet in it become an open one."""
+        self._whitening[frame - 1] = 0.0
+        self.duration_s[frame - 1] = 0.0
+        self.is_resting[frame - 1], self.is_open[frame - 1] = False, True
+        self._is_stale[frame - 1] = False
+        self._drop(frame)
+
+    def drop_last(self) -> None:
+        """Remove the edge to the last frame."""
+        self._drop(len(self) - 1)
+
+    def last_samples(self) -> tuple[I64, F64]:
+        """Return times (S,) and samples (S, 6) of the last edge."""
+        return self._samples[-1]
+
+    def relinearize(self, motion: F64) -> bool:
+        """Integrate edges again whose biases (in F, 9) have moved far; tell whether any have."""
+        self._integrate_stale()
+        biases = motion[: len(self), 3:]
+        outdated = outdated_edges(
+            (biases[:, :3], biases[:, 3:]),
+            (self._integrated_at[:, :3], self._integrated_at[:, 3:]),
+            (self._seen_at[:, :3], self._seen_at[:, 3:]),
+            self.duration_s,
+        )
+        self._seen_at = biases.copy()
+        self._integrate(outdated, biases[outdated])
+        return len(outdated) > 0
+
+    def evaluate(self, T_M_I: F64, motion: F64, edges: slice) -> tuple[F64, F64]:
+        """Return whitened residuals (N, 9) and Jacobians (N, 9, 24) of some edges.
+
+        The columns are the 15 rows of the first frame and the first 9 of the second.
+        """
+        self._integrate_stale()
+        count = len(range(len(self))[edges])
+        arguments = np.empty((count, _INPUTS))
+        arguments[:, :7], arguments[:, 7:16] = T_M_I[:-1][edges], motion[:-1][edges]
+        arguments[:, 16:23], arguments[:, 23:26] = T_M_I[1:][edges], motion[1:, :3][edges]
+        arguments[:, 26:] = self._arguments[edges]
+        residual, jacobian = self._kernel.evaluated(arguments, self._whitening[edges])
+        return residual, jacobian
+
+    def _integrated(self, samples: Samples, biases: F64) -> Preintegrated:
+        data = InertialData(
+            sample_start=starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples])),
+            timestamp_ns=np.concatenate([times_ns for times_ns, _ in samples], dtype=np.int64),
+            accel_gyro=np.concatenate([values for _, values in samples], dtype=np.float64),
+            imus=(self._imu,),
+            imu_of_edge=np.zeros(len(samples), dtype=np.int64),
+        )
+        return integrate(data, biases[:, :3], biases[:, 3:])
+
+    def _integrate_stale(self) -> None:
+        """Integrate edges whose samples are new or have been joined."""
+        if self._is_stale.any():
+            rows = np.flatnonzero(self._is_stale)
+            self._integrate(rows, self._integrated_at[rows])
+
+    def _integrate(self, rows: I64, biases: F64) -> None:
+        if not len(rows):
+            return
+        measured = self._integrated([self._samples[row] for row in rows.tolist()], biases)
+        self._arguments[rows] = measured_arguments(measured, self._g_M)
+        self._whitening[rows] = whitening(measured)
+        self._integrated_at[rows] = self._seen_at[rows] = biases
+        self.duration_s[rows] = measured.duration_s
+        self._is_stale[rows] = False
+
+    def _drop(self, edge: int) -> None:
+        del self._samples[edge]
+        for name in _COLUMNS:
+            setattr(self, name, np.delete(getattr(self, name), edge, axis=0))

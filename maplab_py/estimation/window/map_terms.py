@@ -1,0 +1,269 @@
+"""Observations of landmarks of a map by the frames of a window, whose base frame T_G_M is estimated.
+
+The residual is e = (proj(T_C_I T_I_M T_M_G p_G) - z) / sigma (Schneider 2019, Paper I, eq. 4.4). A window
+has few of them, so they are evaluated by array operations, with the exact derivatives of
+`sensors.projection`. The landmark p_G is known, or a state with a prior N(p_G, Sigma_G) that is eliminated
+with all its observations, so that several views of a wrong landmark are not independent facts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.loss_values import loss_and_weight
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.geometry import so3
+from maplab_py.sensors import Camera
+from maplab_py.sensors.projection import project_with_jacobians
+
+_BEHIND = 1e4
+"""Squared whitened residual of a landmark that the camera cannot see: an outlier of a fixed size."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapObservations:
+    """O observations of A landmarks of a map, those of a landmark in a row; each has at least one."""
+
+    start: I64  # (A + 1,) offsets by landmark
+    frame: I32  # (O,) of the window
+    camera: I32  # (O,)
+    uv_px: F64  # (O, 2)
+    sigma_px: F64  # (O,)
+    p_G: F64  # (A, 3) as the map has them
+    information_G: F64 | None  # (A, 3, 3) of the landmarks [1/m^2]; None = they are known exactly
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def landmark(self) -> I64:
+        """Landmark row of every observation (O,)."""
+        return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapResiduals:
+    """Whitened residuals with exact Jacobians; zero where the camera cannot see the landmark."""
+
+    residual: F64  # (O, 2)
+    of_frame: F64  # (O, 2, 6) by [p, theta] of T_M_I
+    of_base: F64  # (O, 2, 6) by [p, theta] of T_G_M
+    of_landmark: F64  # (O, 2, 3) by p_G
+    is_visible: Mask  # (O,)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapElimination:
+    """What it takes to step the map's landmarks when the other states' steps are known."""
+
+    columns: I64  # (N,) of the dense system that the landmarks touch
+    square: F64  # (A, 3, 3)
+    coupling: F64  # (A, 3, N)
+    gradient: F64  # (A, 3)
+
+    def step(self, p_G: F64, step: F64) -> tuple[F64, float]:
+        """Return the landmarks (A, 3) after a step (n,) of all else, and the decrease it promises."""
+        right = self.gradient + self.coupling @ step[self.columns]
+        moved = -np.linalg.solve(self.square, right[:, :, None])[:, :, 0]
+        return p_G + moved, -0.5 * float(np.vdot(self.gradient, moved))
+
+
+class MapTerms:
+    """All residuals that a window localised in a map has beyond those of its odometry."""
+
+    def __init__(
+        self,
+        observations: MapObservations,
+        cameras: tuple[Camera, ...],
+        T_I_C: F64,
+        *,
+        huber_sigmas: float,
+        tilt_sigma_rad: float = np.inf,
+    ) -> None:
+        """Join what was observed.
+
+        Args:
+            observations: Observations of the map's landmarks.
+            cameras: As the observations count them.
+            T_I_C: Their poses (C, 7) on the IMU.
+            huber_sigmas: Scale of the Huber loss.
+            tilt_sigma_rad: How level the frames G and M are to each other; infinite = not stated.
+        """
+        self.observations = observations
+        self._cameras, self._T_I_C = cameras, T_I_C
+        self._huber2, self._tilt_weight = huber_sigmas**2, 1.0 / tilt_sigma_rad
+        self._latest: tuple[WindowStates, MapResiduals] | None = None
+        self.estimates_landmarks = observations.information_G is not None and len(observations) > 0
+
+    def evaluate(self, T_M_I: F64, T_G_M: F64, p_G: F64) -> MapResiduals:
+        """Evaluate all observations.
+
+        Args:
+            T_M_I: Poses (F, 7) of the frames.
+            T_G_M: Base frame (7,).
+            p_G: Landmarks (A, 3).
+        """
+        seen = self.observations
+        count = len(seen)
+        R_G_M, R_M_I = so3.to_matrix(T_G_M[:4]), so3.to_matrix(T_M_I[seen.frame, :4])
+        p_M = (p_G - T_G_M[4:]) @ R_G_M
+        p_M = p_M[seen.landmark]
+        p_I = ((p_M - T_M_I[seen.frame, 4:])[:, None] @ R_M_I)[:, 0]
+        residual, of_I = np.zeros((count, 2)), np.zeros((count, 2, 3))
+        is_visible: Mask = np.zeros(count, dtype=np.bool_)
+        for row, camera in enumerate(self._cameras):
+            mine = np.flatnonzero(seen.camera == row)
+            R_I_C = so3.to_matrix(self._T_I_C[row, :4])
+            p_C = (p_I[mine] - self._T_I_C[row, 4:]) @ R_I_C
+            uv_px, of_C, _, is_visible[mine] = project_with_jacobians(camera, p_C)
+            residual[mine], of_I[mine] = uv_px - seen.uv_px[mine], of_C @ R_I_C.T
+        weight = np.where(is_visible, 1.0 / seen.sigma_px, 0.0)
+        residual, of_I = residual * weight[:, None], of_I * weight[:, None, None]
+        of_M = of_I @ R_M_I.transpose(0, 2, 1)
+        of_G = of_M @ R_G_M.T
+        of_frame = np.concatenate([-of_M, of_I @ so3.skew(p_I)], axis=2)
+        of_base = np.concatenate([-of_G, of_M @ so3.skew(p_M)], axis=2)
+        return MapResiduals(residual, of_frame, of_base, of_G, is_visible)
+
+    def errors_px(self, states: WindowStates) -> F64:
+        """Return the reprojection error (O,) of every observation; infinite where it is not visible."""
+        at = self._evaluated(states)
+        error = np.linalg.norm(at.residual, axis=1) * self.observations.sigma_px
+        return np.where(at.is_visible, error, np.inf)
+
+    def costs(self, states: WindowStates) -> dict[str, float]:
+        """Return half the sum of rho of every kind at some states."""
+        at = self._evaluated(states)
+        rho, _ = self._weighed(at)
+        tilt, _ = self._tilt(states.T_G_M[0])
+        return self._costs(rho, tilt, states)
+
+    def add_to(
+        self, system: DenseSystem, states: WindowStates, at: WindowStates
+    ) -> tuple[MapElimination | None, dict[str, float]]:
+        """Add the normal equations, landmarks eliminated; return how to step these, and the costs.
+
+        Residuals are those at `states`, Jacobians those at `at`.
+        """
+        now = self._evaluated(states)
+        where = now
+        if at is not states:
+            where = self.evaluate(at.T_M_I, at.T_G_M[0], self._landmarks(states))
+        rho, root = self._weighed(now)
+        root = np.where(where.is_visible, root, 0.0)
+        r = now.residual * root[:, None]
+        J = np.concatenate([where.of_frame, where.of_base], axis=2) * root[:, None, None]
+        square, gradient = self._summed(J, r, len(states))
+        tilt, of_tilt = self._tilt(at.T_G_M[0])
+        if at is not states:
+            tilt, _ = self._tilt(states.T_G_M[0])
+        square[-3:, -3:] += of_tilt.T @ of_tilt
+        gradient[-3:] += of_tilt.T @ tilt
+        columns = _columns(len(states))
+        system.gradient[columns] += gradient
+        system.diagonal[columns] += np.diagonal(square)
+        kept = None
+        if self.estimates_landmarks:
+            Q = where.of_landmark * root[:, None, None]
+            kept = self._eliminated(J, Q, r, states)
+            Y, z = _half_solved(kept)
+            square -= Y.T @ Y
+            system.reduced_gradient[columns] -= Y.T @ z
+        system.matrix[np.ix_(columns, columns)] += square
+        return kept, self._costs(rho, tilt, states)
+
+    def _evaluated(self, states: WindowStates) -> MapResiduals:
+        """Evaluate all observations, unless these states (values) were the last ones evaluated."""
+        if self._latest is None or self._latest[0] is not states:
+            p_G = self._landmarks(states)
+            self._latest = states, self.evaluate(states.T_M_I, states.T_G_M[0], p_G)
+        return self._latest[1]
+
+    def _summed(self, J: F64, r: F64, frames: int) -> tuple[F64, F64]:
+        """Return the normal equations (N, N), (N,) of Jacobians (O, 2, 12) by frame and base frame."""
+        is_of_frame = (np.arange(frames)[:, None] == self.observations.frame).astype(np.float64)
+        turned = J.transpose(0, 2, 1)
+        squares = (is_of_frame @ (turned @ J).reshape(-1, 144)).reshape(frames, 12, 12)
+        gradients = is_of_frame @ (turned @ r[:, :, None])[:, :, 0]
+        size, rows = 6 * frames, np.arange(frames)
+        square, gradient = np.zeros((size + 6, size + 6)), np.empty(size + 6)
+        blocks = square[:size, :size].reshape(frames, 6, frames, 6)
+        blocks[rows, :, rows] = squares[:, :6, :6]
+        square[size:, :size] = squares[:, 6:, :6].transpose(1, 0, 2).reshape(6, size)
+        square[:size, size:] = square[size:, :size].T
+        square[size:, size:] = squares[:, 6:, 6:].sum(axis=0)
+        gradient[:size], gradient[size:] = (
+            gradients[:, :6].reshape(-1),
+            gradients[:, 6:].sum(axis=0),
+        )
+        return square, gradient
+
+    def _landmarks(self, states: WindowStates) -> F64:
+        return states.p_G if self.estimates_landmarks else self.observations.p_G
+
+    def _weighed(self, at: MapResiduals) -> tuple[F64, F64]:
+        """Return rho (O,) and the square root of the robust weight (O,), zero where not visible."""
+        square = np.where(at.is_visible, np.sum(at.residual**2, axis=1), _BEHIND)
+        rho, weight = loss_and_weight(Loss.HUBER, self._huber2, square)
+        return rho, np.where(at.is_visible, np.sqrt(weight), 0.0)
+
+    def _tilt(self, T_G_M: F64) -> tuple[F64, F64]:
+        """Return the whitened tilt of M against G (2,), and its Jacobian (2, 3) by the orientation.
+
+        The upward axis of G, given in M, is the last row u of R_G_M; u exp(d) = u + u x d.
+        """
+        up_M = so3.to_matrix(T_G_M[:4])[2]
+        return self._tilt_weight * up_M[:2], self._tilt_weight * so3.skew(up_M)[:2]
+
+    def _offset(self, p_G: F64) -> F64:
+        return p_G - self.observations.p_G
+
+    def _costs(self, rho: F64, tilt: F64, states: WindowStates) -> dict[str, float]:
+        costs = {"map": 0.5 * float(rho.sum()), "map tilt": 0.5 * float(tilt @ tilt)}
+        information = self.observations.information_G
+        if self.estimates_landmarks and information is not None:
+            offset = self._offset(states.p_G)
+            costs["map landmarks"] = 0.5 * float(
+                np.einsum("ai,aij,aj", offset, information, offset)
+            )
+        return costs
+
+    def _eliminated(self, J: F64, Q: F64, r: F64, states: WindowStates) -> MapElimination:
+        """Return the normal equations of the landmarks, at least one."""
+        seen, frames = self.observations, len(states)
+        assert seen.information_G is not None
+        first, turned = seen.start[:-1], Q.transpose(0, 2, 1)
+        square = np.add.reduceat(turned @ Q, first) + seen.information_G
+        gradient = np.add.reduceat((turned @ r[:, :, None])[:, :, 0], first)
+        gradient += (seen.information_G @ self._offset(states.p_G)[:, :, None])[:, :, 0]
+        products = turned @ J
+        by_frame = np.zeros((len(first) * frames, 3, 6))
+        np.add.at(by_frame, seen.landmark * frames + seen.frame, products[:, :, :6])
+        of_frames = by_frame.reshape(-1, frames, 3, 6).transpose(0, 2, 1, 3)
+        coupling = np.concatenate(
+            [
+                of_frames.reshape(len(first), 3, 6 * frames),
+                np.add.reduceat(products[:, :, 6:], first),
+            ],
+            axis=2,
+        )
+        return MapElimination(_columns(frames), square, coupling, gradient)
+
+
+def _columns(frames: int) -> I64:
+    """Return the columns (6 F + 6,) of the poses of all frames and of the base frame."""
+    of_frames = FRAME_SIZE * np.arange(frames)[:, None] + np.arange(6)
+    return np.concatenate([of_frames.reshape(-1), FRAME_SIZE * frames + np.arange(6)])
+
+
+def _half_solved(kept: MapElimination) -> tuple[F64, F64]:
+    """Return L^-1 W (3 A, N) and L^-1 g (3 A,) with the landmarks' squares L L^T."""
+    L = np.linalg.cholesky(kept.square)
+    both = np.concatenate([kept.coupling, kept.gradient[:, :, None]], axis=2)
+    solved = np.linalg.solve(L, both)
+    return solved[:, :, :-1].reshape(-1, solved.shape[2] - 1), solved[:, :, -1].reshape(-1)

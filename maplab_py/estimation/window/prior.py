@@ -1,0 +1,202 @@
+"""What frames that have left the window said about those that are still there."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg.lapack
+
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.geometry import so3
+
+_LEAST_PIVOT = 1e-13
+"""Pivots of the scaled information below this share of the largest are rounding errors."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowPrior:
+    """The residual root (x - x0) + residual over F frames; x - x0 is the tangent from x0 to x.
+
+    Frames it does not touch have zero columns. The linearisation point x0 of a fixed frame stays what it
+    was when a marginalisation first touched it. The columns of a base frame follow those of the frames.
+    """
+
+    root: F64  # (k, 15 F + 6 B)
+    residual: F64  # (k,)
+    T_M_I: F64  # (F, 7) x0
+    motion: F64  # (F, 9) x0
+    is_fixed: Mask  # (F,)
+    T_G_M: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))  # (B, 7) x0
+    is_base_fixed: bool = False
+
+    @classmethod
+    def of_state(cls, T_M_I: F64, motion: F64, sigma: F64) -> WindowPrior:
+        """Return the prior of a first frame with standard deviations (15,), infinite = unknown."""
+        known = np.flatnonzero(np.isfinite(sigma))
+        root = np.zeros((len(known), FRAME_SIZE))
+        root[np.arange(len(known)), known] = 1.0 / sigma[known]
+        is_fixed = np.zeros(1, dtype=np.bool_)
+        return cls(root, np.zeros(len(known)), T_M_I[None], motion[None], is_fixed)
+
+    @classmethod
+    def of_information(
+        cls, information: F64, gradient: F64, states: WindowStates, is_fixed: Mask
+    ) -> WindowPrior:
+        """Return the root form of normal equations (n, n), (n,) at x0 = `states`.
+
+        The information may be singular: the root comes from Cholesky with pivoting, of the matrix
+        scaled to a unit diagonal, and has as many rows as there are directions with information.
+        """
+        count = len(information)
+        rows = np.flatnonzero(np.diagonal(information) > 0.0)
+        scale = np.sqrt(np.diagonal(information)[rows])
+        scaled = information[np.ix_(rows, rows)] / (scale[:, None] * scale[None, :])
+        upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(scaled, tol=_LEAST_PIVOT, lower=0)
+        factor = np.triu(upper)[:rank]
+        root, order = np.zeros((rank, count)), pivot - 1
+        root[:, rows[order]] = factor * scale[order]
+        right = (gradient[rows] / scale)[order][:rank]
+        residual, _ = scipy.linalg.lapack.dtrtrs(factor[:, :rank], right, lower=0, trans=1)
+        return cls(root, residual, states.T_M_I, states.motion, is_fixed, states.T_G_M)
+
+    @cached_property
+    def information(self) -> F64:
+        """root^T root, n x n with n = 15 F + 6 B."""
+        return self.root.T @ self.root
+
+    @cached_property
+    def touched(self) -> Mask:
+        """Which frames (F,) it has information about."""
+        columns: Mask = np.any(self.root[:, : self._frame_columns] != 0.0, axis=0)
+        return np.asarray(columns.reshape(-1, FRAME_SIZE).any(axis=1))
+
+    @cached_property
+    def touches_base(self) -> bool:
+        """Whether it has information about the base frame."""
+        return bool(np.any(self.root[:, self._frame_columns :]))
+
+    @property
+    def _frame_columns(self) -> int:
+        return FRAME_SIZE * len(self.T_M_I)
+
+    @cached_property
+    def _free(self) -> I64:
+        """First column of the orientation of all that it touches and that is not fixed."""
+        columns = FRAME_SIZE * np.flatnonzero(self.touched & ~self.is_fixed) + 3
+        if self.touches_base and not self.is_base_fixed:
+            columns = np.append(columns, self._frame_columns + 3)
+        return columns
+
+    def offsets(self, states: WindowStates) -> F64:
+        """Return the tangent vectors from x0 to some states."""
+        return states.offsets(self.T_M_I, self.motion, self.T_G_M)
+
+    def linearization_point(self, states: WindowStates) -> WindowStates:
+        """Return the states at x0 where that is fixed, as they are elsewhere."""
+        T_M_I, motion = states.T_M_I.copy(), states.motion.copy()
+        fixed = self.is_fixed
+        T_M_I[fixed], motion[fixed] = self.T_M_I[fixed], self.motion[fixed]
+        T_G_M = self.T_G_M if self.is_base_fixed else states.T_G_M
+        return WindowStates(T_M_I, motion, states.h, T_G_M, states.p_G)
+
+    def evaluate(self, states: WindowStates) -> F64:
+        """Return the residual (k,) at some states."""
+        return np.asarray(self.root @ self.offsets(states) + self.residual)
+
+    def linearized(self, states: WindowStates) -> tuple[F64, F64, F64]:
+        """Return residual (k,), its Jacobian's square (n, n), and gradient (n,), n = 15 F + 6 B.
+
+        The Jacobian of a fixed frame is that at x0; of the others the exact one, which differs by
+        the right Jacobian of the rotation from x0.
+        """
+        offset = self.offsets(states)
+        residual = np.asarray(self.root @ offset + self.residual)
+        free = self._free
+        if not len(free):
+            return residual, self.information, self.root.T @ residual
+        root = self.root.copy()
+        columns = free[:, None] + np.arange(3)
+        slope = so3.right_jacobian_inverse(offset[columns])
+        root[:, columns] = np.einsum("kfi,fij->kfj", root[:, columns], slope)
+        return residual, root.T @ root, root.T @ residual
+
+    def with_frame(self, T_M_I: F64, motion: F64) -> WindowPrior:
+        """Return the prior with a later frame that it does not touch."""
+        padding = np.zeros((len(self.root), FRAME_SIZE))
+        frames, base = np.split(self.root, [self._frame_columns], axis=1)
+        return dataclasses.replace(
+            self,
+            root=np.concatenate([frames, padding, base], axis=1),
+            T_M_I=np.concatenate([self.T_M_I, T_M_I[None]]),
+            motion=np.concatenate([self.motion, motion[None]]),
+            is_fixed=np.append(self.is_fixed, False),
+        )
+
+    def with_base(self, T_G_M: F64, sigma: F64) -> WindowPrior:
+        """Return the prior with a base frame (7,) in place of another; sigma (6,) of [p, theta]."""
+        prior = self.without_base()
+        rows, columns = prior.root.shape
+        root = np.zeros((rows + 6, columns + 6))
+        root[:rows, :columns] = prior.root
+        root[rows:, columns:] = np.diag(1.0 / sigma)
+        residual = np.concatenate([prior.residual, np.zeros(6)])
+        T_G_M = T_G_M[None]
+        return dataclasses.replace(
+            prior, root=root, residual=residual, T_G_M=T_G_M, is_base_fixed=False
+        )
+
+    def without_base(self) -> WindowPrior:
+        """Return the prior of the frames: what it says of the base frame is marginalised."""
+        if not len(self.T_G_M):
+            return self
+        x0 = WindowStates(self.T_M_I, self.motion, np.zeros((0, 3)))
+        return self._without(self._frame_columns + np.arange(6), x0, self.is_fixed)
+
+    def without_frame(self, frame: int) -> WindowPrior:
+        """Return the prior of all other frames: what it says of this frame is marginalised."""
+        columns = FRAME_SIZE * frame + np.arange(FRAME_SIZE)
+        x0 = WindowStates(
+            np.delete(self.T_M_I, frame, axis=0),
+            np.delete(self.motion, frame, axis=0),
+            np.zeros((0, 3)),
+            self.T_G_M,
+        )
+        return self._without(columns, x0, np.delete(self.is_fixed, frame))
+
+    def _without(self, columns: I64, x0: WindowStates, is_fixed: Mask) -> WindowPrior:
+        """Return the prior with some columns marginalised; x0 is that of the others."""
+        is_base_fixed = self.is_base_fixed and len(x0.T_G_M) > 0
+        if not self.root[:, columns].any():
+            root = np.delete(self.root, columns, axis=1)
+            result = WindowPrior(root, self.residual, x0.T_M_I, x0.motion, is_fixed, x0.T_G_M)
+        else:
+            information, gradient = schur_complement(
+                self.information, self.root.T @ self.residual, columns
+            )
+            result = WindowPrior.of_information(information, gradient, x0, is_fixed)
+        return dataclasses.replace(result, is_base_fixed=is_base_fixed)
+
+
+def schur_complement(information: F64, gradient: F64, rows: I64) -> tuple[F64, F64]:
+    """Marginalise some rows (m,) of normal equations (n, n), (n,); return those of the others.
+
+    Directions of the rows without information are left out (pseudo-inverse of the block, scaled
+    to a unit diagonal). Source: Sibley, Matthies and Sukhatme, Sliding Window Filter with Application to
+    Planetary Landing, JFR 2010, eq. (31)-(36).
+    """
+    is_other: Mask = np.ones(len(information), dtype=np.bool_)
+    is_other[rows] = False
+    others = np.flatnonzero(is_other)
+    block = information[np.ix_(rows, rows)]
+    diagonal = np.diagonal(block)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(scale[:, None] * block * scale[None, :])
+    kept = values > _LEAST_PIVOT * values[-1]
+    half = (vectors[:, kept] / np.sqrt(values[kept])).T * scale
+    coupling = half @ information[np.ix_(rows, others)]
+    reduced = information[np.ix_(others, others)] - coupling.T @ coupling
+    return 0.5 * (reduced + reduced.T), gradient[others] - coupling.T @ (half @ gradient[rows])

@@ -1,0 +1,211 @@
+"""A window as a least-squares problem: one dense system, landmarks eliminated as it is filled in."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import ModuleType
+
+import numpy as np
+import scipy.linalg.lapack
+
+from maplab_py.array_types import F64, I64
+from maplab_py.estimation.kernels.window_arguments import (
+    FRAME_SIZE,
+    DenseSystem,
+    Elimination,
+    WindowData,
+    WindowPoint,
+    WindowRule,
+)
+from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.problem.protocol import Step
+from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.factors import EVERY, FrameFactors, Part
+from maplab_py.estimation.window.map_terms import MapElimination, MapTerms
+from maplab_py.estimation.window.prior import WindowPrior
+from maplab_py.estimation.window.states import WindowStates
+
+_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
+_LANDMARK_DAMPING, _NEARLY_UNDAMPED = 1e-12, 1e-4
+"""Relative damping of landmarks for covariances: those without parallax stay solvable; and largest."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowLinearization:
+    """Normal equations at some states, and what is needed to step the landmarks."""
+
+    system: DenseSystem
+    kept: Elimination
+    rule: WindowRule
+    costs: dict[str, float]
+    of_map: MapElimination | None = None
+
+
+class WindowProblem:
+    """Observations, factors between frames, and the prior; see `problem.protocol.LeastSquares`."""
+
+    def __init__(
+        self,
+        kernels: ModuleType,
+        data: WindowData,
+        cameras: Cameras,
+        factors: FrameFactors,
+        prior: WindowPrior,
+        *,
+        loss: Loss = Loss.HUBER,
+        keep_first_estimates: bool = True,
+        map_terms: MapTerms | None = None,
+    ) -> None:
+        """Join what was measured.
+
+        Args:
+            kernels: Compiled from the template `window` for the cameras' models.
+            data: Observations, grouped by landmark.
+            cameras: As the observations count them.
+            factors: Of the frames.
+            prior: From what has left the window.
+            loss: Robust loss of reprojection errors.
+            keep_first_estimates: Evaluate Jacobians of frames in the prior where they entered it.
+            map_terms: Observations of a map, for states with a base frame; None = there are none.
+        """
+        self._kernels, self._data, self._cameras = kernels, data, cameras
+        self._factors, self._prior, self._loss = factors, prior, loss
+        self._keeps_first_estimates = keep_first_estimates
+        self._map_terms = map_terms
+        self._latest: WindowLinearization | None = None
+
+    def relinearize(self, states: WindowStates) -> bool:
+        """Integrate edges again whose biases have moved far; tell whether there were any."""
+        return self._factors.chain.relinearize(states.motion)
+
+    def linearize(self, states: WindowStates, damping: float) -> WindowLinearization:
+        """Form the normal equations; `damping` enters the elimination of the landmarks."""
+        self._latest = self._linearize(states, damping, EVERY)
+        return self._latest
+
+    def undamped(self, states: WindowStates, part: Part) -> WindowLinearization:
+        """Form the equations of some factors, the prior and all observations of this problem."""
+        return self._linearize(states, _LANDMARK_DAMPING, part)
+
+    def try_step(
+        self, states: WindowStates, linear: WindowLinearization, damping: float
+    ) -> Step[WindowStates]:
+        """Return the states after the damped step, landmarks moved along with it.
+
+        Raises:
+            NotPositiveDefinite: The damped equations are singular.
+        """
+        system, rule = linear.system, linear.rule
+        added = damping * np.clip(system.diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
+        matrix = system.matrix.copy()
+        matrix.reshape(-1)[:: len(matrix) + 1] += added
+        step = -self._solved(_factorised(matrix), system.reduced_gradient)
+        moved = states.moved(step, np.empty_like(states.h))
+        rho, promised, norm2 = self._kernels.substitute(
+            self._data, self._point(states), rule, linear.kept, step, self._point(moved)
+        )
+        promised += 0.5 * float(np.dot(added * step - system.gradient, step))
+        costs = self._factors.costs(moved)
+        residual = self._prior.evaluate(moved)
+        costs |= {"visual": 0.5 * rho, "prior": 0.5 * float(np.vdot(residual, residual))}
+        if linear.of_map is not None:
+            p_G, promised_by_map = linear.of_map.step(states.p_G, step)
+            norm2 += float(np.sum((p_G - states.p_G) ** 2))
+            moved, promised = dataclasses.replace(moved, p_G=p_G), promised + promised_by_map
+        if self._map_terms is not None:
+            costs |= self._map_terms.costs(moved)
+        return Step(moved, costs, promised, float(np.sqrt(norm2 + np.vdot(step, step))))
+
+    def is_stationary(self, linear: WindowLinearization, tolerance: float) -> bool:
+        """Tell whether no entry of the gradient is above a tolerance."""
+        gradients = (linear.system.gradient, linear.kept.gradient)
+        return all(np.abs(g).max(initial=0.0) <= tolerance for g in gradients)
+
+    def norm(self, states: WindowStates) -> float:
+        """Return the norm of all values."""
+        return states.size()
+
+    def errors(self, states: WindowStates) -> tuple[F64, F64]:
+        """Return reprojection error [px] and depth [m] (O,) of every observation."""
+        result = np.empty((len(self._data.frame), 2))
+        self._kernels.evaluate(self._data, self._point(states), result)
+        return result[:, 0], result[:, 1]
+
+    def covariance_of_pose_and_base(self, linear: WindowLinearization, frame: int) -> F64:
+        """Return the joint covariance (12, 12) of a frame's pose and the base frame, [p, theta] each.
+
+        Raises:
+            NotPositiveDefinite: The measurements do not determine them.
+        """
+        size = len(linear.system.matrix)
+        rows = np.concatenate([FRAME_SIZE * frame + np.arange(6), np.arange(size - 6, size)])
+        return self._covariance(linear, rows)
+
+    def undamped_near(self, states: WindowStates) -> WindowLinearization:
+        """Return equations for covariances at converged states.
+
+        Those of the last iteration serve unless landmarks were damped: a step smaller than the tolerance
+        of the solver changes no covariance that matters, and to linearise takes a tenth of an update.
+        """
+        if self._latest is not None and self._latest.rule.damping <= _NEARLY_UNDAMPED:
+            return self._latest
+        return self.linearize(states, _LANDMARK_DAMPING)
+
+    def covariance(self, linear: WindowLinearization, frame: int) -> F64:
+        """Return the covariance (15, 15) of a frame, order [p, theta, v, b_g, b_a].
+
+        Raises:
+            NotPositiveDefinite: The measurements do not determine the frames.
+        """
+        return self._covariance(linear, FRAME_SIZE * frame + np.arange(FRAME_SIZE))
+
+    def _covariance(self, linear: WindowLinearization, rows: I64) -> F64:
+        matrix = linear.system.matrix.copy()
+        columns = np.zeros((len(matrix), len(rows)))
+        columns[rows, np.arange(len(rows))] = 1.0
+        block = self._solved(_factorised(matrix), columns)[rows]
+        return np.asarray(0.5 * (block + block.T))
+
+    def _linearize(self, states: WindowStates, damping: float, part: Part) -> WindowLinearization:
+        frames, landmarks = len(states), len(states.h)
+        system = DenseSystem.zeros(FRAME_SIZE * frames + 6 * len(states.T_G_M))
+        kept = Elimination.empty(landmarks, frames)
+        at, is_elsewhere = states, np.zeros(frames, dtype=np.bool_)
+        fixed = self._prior.is_fixed
+        if self._keeps_first_estimates and (fixed.any() or self._prior.is_base_fixed):
+            at, is_elsewhere = self._prior.linearization_point(states), fixed
+        rule = WindowRule(int(self._loss), float(damping), at.T_M_I, is_elsewhere)
+        rho = self._kernels.eliminate(self._data, self._point(states), rule, system, kept)
+        costs = {"visual": 0.5 * float(rho), **self._factors.add_to(system, states, at, part)}
+        residual, information, gradient = self._prior.linearized(states)
+        costs["prior"] = 0.5 * float(np.vdot(residual, residual))
+        of_map = None
+        if self._map_terms is not None:
+            of_map, of_kind = self._map_terms.add_to(system, states, at)
+            costs |= of_kind
+        np.add(system.matrix, information, out=system.matrix)
+        np.add(system.diagonal, np.diagonal(information), out=system.diagonal)
+        np.add(system.gradient, gradient, out=system.gradient)
+        np.add(system.reduced_gradient, system.gradient, out=system.reduced_gradient)
+        return WindowLinearization(system, kept, rule, costs, of_map)
+
+    def _point(self, states: WindowStates) -> WindowPoint:
+        return WindowPoint(states.T_M_I, states.h, self._cameras.T_I_C, self._cameras.parameters)
+
+    @staticmethod
+    def _solved(factor: F64, right: F64) -> F64:
+        solution, _ = scipy.linalg.lapack.dpotrs(factor, right, lower=0)
+        return np.asarray(solution)
+
+
+def _factorised(matrix: F64) -> F64:
+    """Return the Cholesky factor of a matrix given by its lower triangle, which is overwritten.
+
+    Raises:
+        NotPositiveDefinite: The matrix is singular; the node is the frame's.
+    """
+    factor, info = scipy.linalg.lapack.dpotrf(matrix.T, lower=0, clean=0, overwrite_a=1)
+    if info > 0:
+        raise NotPositiveDefinite((info - 1) // FRAME_SIZE)
+    return np.asarray(factor)

@@ -1,0 +1,478 @@
+"""The fixed-lag smoother: frames come in, states come out.
+
+Source of the frame policy: Leutenegger et al., Keyframe-based Visual-Inertial Odometry Using Nonlinear
+Optimization, IJRR 2015, section 4.2; of the marginal prior: Usenko et al., Visual-Inertial Mapping with
+Non-Linear Factor Recovery, RA-L 2020, section IV.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
+from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.linear.threads import single_thread
+from maplab_py.estimation.problem.solver import SolverOptions, SolverSummary, optimize_states
+from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import BackProjection, camera_table
+from maplab_py.estimation.window.factors import FrameFactors
+from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
+from maplab_py.estimation.window.inertial import InertialChain
+from maplab_py.estimation.window.keyframes import needs_keyframe
+from maplab_py.estimation.window.map_terms import MapTerms
+from maplab_py.estimation.window.marginalization import marginalized
+from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.prior import WindowPrior
+from maplab_py.estimation.window.problem import WindowProblem
+from maplab_py.estimation.window.standstill import Standstill
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.estimation.window.tracks import Observations, Tracks
+from maplab_py.estimation.window.triangulation import Triangulator
+from maplab_py.estimation.window.update import ReleasedStates, WindowUpdate
+from maplab_py.progress import SILENT
+from maplab_py.sensors import Camera, Imu
+
+_MIN_KNOWN_DEPTHS = 10
+"""Landmarks of which the median depth is taken."""
+
+
+class FixedLagSmoother:
+    """Estimates the frames of a window from tracks and inertial samples.
+
+    A window has `num_keyframes` keyframes and the latest frames. The latest become keyframes or are
+    dropped, their inertial intervals joined and their observations forgotten. The oldest keyframe is
+    marginalised together with the landmarks anchored in it whose tracks have ended. Landmarks still
+    tracked lose its observation and are anchored where they were seen next (see decision 40).
+    """
+
+    def __init__(
+        self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu, options: WindowOptions
+    ) -> None:
+        """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU."""
+        models, self._cameras = camera_table(cameras, T_I_C)
+        self.options = options
+        self._kernels = window_kernels(models)
+        self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
+        self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
+        still = residual_kernel("relative_pose", sources.relative_pose)
+        self._standstill = Standstill(still, options.standstill)
+        self._triangulator = Triangulator(self._kernels, self._cameras, options)
+        self.tracks = Tracks()
+        self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
+        self._velocity_covariance: F64 = np.full((3, 3), np.inf)  # of the newest frame
+        self._time_ns: I64 = np.zeros(0, dtype=np.int64)
+        self._is_keyframe: Mask = np.zeros(0, dtype=np.bool_)
+        self._is_resting: Mask = np.zeros(0, dtype=np.bool_)  # or surely turns on the spot
+        self._is_turning: Mask = np.zeros(0, dtype=np.bool_)
+        self._states = WindowStates(np.zeros((0, 7)), np.zeros((0, 9)), np.zeros((0, 3)))
+        self._stage_ms: dict[str, float] = {}
+        self._released: list[tuple[int, F64, F64]] = []
+
+    def start(self, frame: WindowFrame, state: StartState) -> None:
+        """Begin with a first frame, whose IMU samples are not read, at a state.
+
+        Raises:
+            EstimationError: The smoother has been started before.
+        """
+        if len(self._states):
+            raise EstimationError("the smoother has been started already: make a new one")
+        motion = np.concatenate([state.v_M, state.gyro_bias, state.accel_bias])
+        T_M_I = np.array(state.T_M_I, dtype=np.float64)
+        self._prior = WindowPrior.of_state(T_M_I, motion, np.asarray(state.sigma))
+        self._states = WindowStates(T_M_I[None], motion[None], np.zeros((0, 3)))
+        self._append_frame(frame, is_keyframe=True)
+        self._see(frame)
+
+    def add(self, frame: WindowFrame) -> WindowUpdate:
+        """Add a frame, estimate all states again, and make room for the next frame.
+
+        Raises:
+            EstimationError: The smoother has not been started, or the cost is not finite.
+            MapError: Times of IMU samples run backwards, or a sample is not a number.
+        """
+        if not len(self._states):
+            raise EstimationError("the smoother has not been started: call start() first")
+        self._stage_ms, self._released = {}, []
+        with single_thread():
+            with self._stage("predict"):
+                self._predict(frame)
+            with self._stage("landmarks"):
+                self._see(frame)
+                self._gate_new()
+                self._triangulate(frame.motion)
+            with self._stage("optimise"):
+                map_terms = self._map_terms()
+                problem, rows, order = self._problem(self.tracks.landmark_rows, map_terms)
+                self._states, summary = optimize_states(
+                    problem, self._states, self._solver_options(), SILENT
+                )
+                self.tracks.h[rows] = self._states.h
+                self._take_map_states()
+            with self._stage("covariance"):
+                covariance = self._covariance(problem)
+                self._velocity_covariance = covariance[6:9, 6:9]
+            with self._stage("outliers"):
+                error_px = self._remove_outliers(problem, order)
+            with self._stage("slide"):
+                newest = self._states.T_M_I[-1], self._states.motion[-1]
+                self._is_keyframe[-1] = self._decide(frame.motion)
+                is_keyframe = bool(self._is_keyframe[-1])
+                self._slide()
+        used = len(rows), len(order)
+        return self._update(
+            frame, newest, covariance, error_px, summary, used, is_keyframe=is_keyframe
+        )
+
+    def landmarks(self) -> tuple[I64, F64]:
+        """Return track ids (L,) and places p_M (L, 3) of the landmarks in the window that are not too far."""
+        rows = self.tracks.landmark_rows
+        rows = rows[self.tracks.h[rows, 2] * self.options.max_depth_m >= 1.0]
+        return self.tracks.id[rows], self.tracks.points(rows, self._poses())
+
+    @property
+    def states(self) -> WindowStates:
+        """States of the frames in the window; of landmarks as of the last update."""
+        return self._states
+
+    @property
+    def prior(self) -> WindowPrior:
+        """What frames that have left say about those in the window."""
+        return self._prior
+
+    @property
+    def times_ns(self) -> I64:
+        """Times (F,) of the frames in the window."""
+        return self._time_ns
+
+    @property
+    def is_keyframe(self) -> Mask:
+        """Which frames (F,) are, or will become, keyframes."""
+        return self._is_keyframe
+
+    def problem(self) -> tuple[WindowProblem, WindowStates]:
+        """Return the least-squares problem of the window as it is now, and its states."""
+        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
+        return problem, self._states
+
+    # -- a new frame ------------------------------------------------------------------------------
+
+    def _predict(self, frame: WindowFrame) -> None:
+        """Append the frame where the IMU says it is; at rest it replaces the latest one."""
+        is_resting = frame.motion is Motion.RESTING
+        times_ns, accel_gyro = frame.imu_times_ns, frame.accel_gyro
+        if is_resting and self._may_replace(frame):
+            before_ns, before = self._chain.last_samples()
+            times_ns = np.concatenate([before_ns, times_ns[1:]])
+            accel_gyro = np.concatenate([before, accel_gyro[1:]])
+            self._drop_last()
+        motion = self._states.motion[-1]
+        self._chain.append(times_ns, accel_gyro, motion, is_resting=is_resting)
+        if is_resting:
+            self._is_resting[-1] = True
+        T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)
+        self._states = self._states.with_frame(T_M_I, new_motion)
+        self._prior = self._prior.with_frame(T_M_I, new_motion)
+        self._append_frame(frame, is_keyframe=False)
+
+    def _may_replace(self, frame: WindowFrame) -> bool:
+        """Tell whether the latest frame rests, too, and the joined interval is not too long."""
+        if len(self._states) < 2 or not self._chain.is_resting[-1] or self._is_keyframe[-1]:
+            return False
+        duration_ns = frame.time_ns - int(self._time_ns[-2])
+        return duration_ns * 1e-9 <= self.options.max_joined_s
+
+    def _append_frame(self, frame: WindowFrame, *, is_keyframe: bool) -> None:
+        speed = float(np.linalg.norm(self._states.motion[-1, :3]))
+        turns = frame.motion is Motion.TURNING and speed <= self.options.turning_max_mps
+        is_sure = turns and self._surely_turns_on_the_spot(frame)
+        self._time_ns = np.append(self._time_ns, frame.time_ns)
+        self._is_keyframe = np.append(self._is_keyframe, is_keyframe)
+        self._is_resting = np.append(self._is_resting, frame.motion is Motion.RESTING or is_sure)
+        self._is_turning = np.append(self._is_turning, turns)
+
+    def _surely_turns_on_the_spot(self, frame: WindowFrame) -> bool:
+        """Tell whether the newest frame turns, with a velocity that is well known to be zero."""
+        options, v_M = self.options, self._states.motion[-1, :3]
+        rate = np.mean(frame.accel_gyro[:, 3:], axis=0) - self._states.gyro_bias[-1]
+        covariance = self._velocity_covariance
+        if not np.isfinite(covariance).all():
+            return False
+        variance = np.linalg.eigvalsh(covariance)
+        if variance[0] <= 0.0 or variance[-1] > options.turning_max_sigma_mps**2:
+            return False
+        distance = float(v_M @ np.linalg.solve(covariance, v_M))
+        return distance <= options.gate_chi2 and (
+            float(np.linalg.norm(rate)) >= options.turning_min_radps
+        )
+
+    def _see(self, frame: WindowFrame) -> None:
+        """Add the observations of the newest frame."""
+        rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
+        nothing = np.zeros(len(rays), dtype=np.int64)
+        seen = Observations(
+            nothing, nothing.astype(np.int32), frame.camera.astype(np.int32),
+            np.asarray(frame.uv_px, dtype=np.float64),
+            np.asarray(frame.sigma_px, dtype=np.float64), rays,
+        )  # fmt: skip
+        newest = len(self._states) - 1
+        self.tracks.add(newest, frame.track_id[valid].astype(np.int64), seen.take(valid))
+
+    def _gate_new(self) -> None:
+        """Remove observations of the newest frame far from where landmarks are expected.
+
+        When most are, the expectation is wrong and all stay.
+        """
+        tracks, newest = self.tracks, len(self._states) - 1
+        problem, _, order = self._problem(tracks.landmark_rows)
+        error, depth = problem.errors(self._states)
+        sigma2 = tracks.observations.sigma_px[order] ** 2 + self.options.prediction_sigma_px**2
+        is_new = tracks.observations.frame[order] == newest
+        far = is_new & ((error**2 > self.options.gate_chi2 * sigma2) | (depth <= 0.0))
+        if 2 * np.count_nonzero(far) < np.count_nonzero(is_new):
+            self._remove(order[far])
+
+    def _triangulate(self, motion: Motion) -> None:
+        tracks, options = self.tracks, self.options
+        counts = tracks.counts()
+        is_candidate = ~tracks.is_landmark & ~tracks.is_closed & (counts >= 2)
+        is_candidate &= self._may_be_landmark()
+        num_best = None
+        if options.follows_thesis:
+            long = tracks.num_frames() >= options.thesis_track_length
+            is_candidate &= long | ~tracks.is_active
+            num_best = options.thesis_landmarks_per_update
+        candidates = np.flatnonzero(is_candidate)
+        candidates = candidates[np.argsort(-counts[candidates], kind="stable")]
+        narrow = self._triangulator.add_landmarks(
+            tracks, candidates, self._states.T_M_I,
+            only_stereo=motion is not Motion.MOVING, num_best=num_best,
+        )  # fmt: skip
+        if not options.follows_thesis:
+            self._expect_depths(narrow, motion)
+
+    def _expect_depths(self, rows: I64, motion: Motion) -> None:
+        """While only turning, make landmarks of tracks (rows) without parallax.
+
+        At about the median depth of the landmarks before the turn, they show that there is no translation.
+        """
+        tracks, options = self.tracks, self.options
+        known = tracks.landmark_rows
+        if len(known) >= _MIN_KNOWN_DEPTHS:
+            self._inverse_depth = float(np.median(tracks.h[known, 2]))
+        if motion is Motion.TURNING and self._inverse_depth > 0.0:
+            room = max(options.max_landmarks - len(known), 0)
+            tracks.expect(rows[:room], self._inverse_depth, options.expected_depth_share)
+
+    # -- estimation -------------------------------------------------------------------------------
+
+    def _problem(
+        self, rows: I64, map_terms: MapTerms | None = None
+    ) -> tuple[WindowProblem, I64, I64]:
+        """Return the problem with some landmarks, their rows, and its observations' rows."""
+        data, order = self.tracks.data(rows, self.options.huber_sigmas)
+        factors = FrameFactors(self._chain, self._standstill, self._is_resting, self._is_turning)
+        problem = WindowProblem(
+            self._kernels, data, self._cameras, factors, self._prior,
+            keep_first_estimates=self.options.keep_first_estimates, map_terms=map_terms,
+        )  # fmt: skip
+        self._states = dataclasses.replace(self._states, h=self.tracks.h[rows])
+        return problem, rows, order
+
+    def _solver_options(self) -> SolverOptions:
+        return SolverOptions(
+            num_iterations=self.options.num_iterations,
+            function_tolerance=self.options.function_tolerance,
+        )
+
+    def _covariance(self, problem: WindowProblem) -> F64:
+        try:
+            linear = problem.undamped_near(self._states)
+            return problem.covariance(linear, len(self._states) - 1)
+        except NotPositiveDefinite:
+            return np.full((15, 15), np.inf)
+
+    def _remove_outliers(self, problem: WindowProblem, order: I64) -> float:
+        """Remove observations with errors beyond the gate; return the median error [px]."""
+        if not len(order):
+            return float("nan")
+        error, depth = problem.errors(self._states)
+        sigma = self.tracks.observations.sigma_px[order]
+        bad = (error**2 > self.options.gate_chi2 * sigma**2) | (depth <= 0.0)
+        self._remove(order[bad])
+        return float(np.median(error))
+
+    def _remove(self, observations: I64) -> None:
+        if not len(observations):
+            return
+        is_removed: Mask = np.zeros(len(self.tracks.observations), dtype=np.bool_)
+        is_removed[observations] = True
+        self.tracks.remove_observations(is_removed, self._poses())
+
+    # -- what a localised smoother adds -----------------------------------------------------------
+
+    def _may_be_landmark(self) -> Mask | bool:
+        """Tell which tracks (T,) may become landmarks of the odometry."""
+        return True
+
+    def _map_terms(self) -> MapTerms | None:
+        """Return the observations of a map."""
+        return None
+
+    def _leaving_map_terms(self) -> MapTerms | None:
+        """Return the observations of a map that leave with the first frame."""
+        return None
+
+    def _take_map_states(self) -> None:
+        """Keep the estimated landmarks of the map."""
+
+    def _forget_leaving_map_tracks(self) -> None:
+        """Remove the tracks that have left with the first frame."""
+
+    # -- frames leave -----------------------------------------------------------------------------
+
+    def _decide(self, motion: Motion) -> bool:
+        """Tell whether the newest frame becomes a keyframe."""
+        if motion is Motion.RESTING:
+            return False
+        last = int(np.flatnonzero(self._is_keyframe)[-1])
+        return needs_keyframe(
+            self.tracks, self._states.T_M_I, self._cameras.T_I_C, last, self.options
+        )
+
+    def _slide(self) -> None:
+        """Keep at most the wanted number of keyframes and of frames after them."""
+        options = self.options
+        if options.follows_thesis:
+            self._marginalize_used()
+        leaving = len(self._states) - options.num_recent_frames
+        if leaving > 0 and not self._is_keyframe[leaving]:
+            self._drop(leaving)
+        elif leaving >= options.keyframes_kept:
+            self._marginalize_first()
+
+    def _drop(self, frame: int) -> None:
+        """Remove a frame that is not a keyframe, without its observations.
+
+        The intervals that meet in it are joined, or marginalised when they would become too long.
+        """
+        self._release(frame)
+        self.tracks.remove_frame(frame, self._poses())
+        if self._chain.joined_s(frame) <= self.options.max_joined_s:
+            self._chain.join(frame, self._states.motion[frame - 1])
+            self._prior = self._prior.without_frame(frame)
+        else:
+            self._marginalize(np.zeros(0, dtype=np.int64), frame)
+            self._chain.open(frame)
+        self._forget_frame(frame)
+
+    def _drop_last(self) -> None:
+        """Remove the newest frame, the edge to it, and its observations."""
+        frame = len(self._states) - 1
+        self._release(frame)
+        self.tracks.remove_frame(frame, self._poses())
+        self._chain.drop_last()
+        self._prior = self._prior.without_frame(frame)
+        self._forget_frame(frame)
+
+    def _marginalize_first(self) -> None:
+        """Marginalise the first frame and the landmarks anchored in it whose tracks have ended."""
+        tracks = self.tracks
+        rows = tracks.landmark_rows
+        rows = rows[(tracks.anchor_frame[rows] == 0) & ~tracks.is_active[rows]]
+        self._marginalize(rows, 0, self._leaving_map_terms())
+        self._forget_leaving_map_tracks()
+        self._release(0)
+        tracks.remove_frame(0, self._poses(), rows)
+        self._chain.drop_first()
+        self._forget_frame(0)
+
+    def _marginalize_used(self) -> None:
+        """Marginalise all landmarks but a few of those that are still tracked.
+
+        Source: Schneider 2019, Paper I, sections 3.3 and 3.4.
+        """
+        tracks = self.tracks
+        tracks.is_persistent &= tracks.is_landmark & tracks.is_active
+        others = np.flatnonzero(tracks.is_landmark & tracks.is_active & ~tracks.is_persistent)
+        order = np.argsort(-tracks.counts()[others], kind="stable")
+        room = self.options.thesis_persistent_landmarks - np.count_nonzero(tracks.is_persistent)
+        tracks.is_persistent[others[order[: max(room, 0)]]] = True
+        rows = np.flatnonzero(tracks.is_landmark & ~tracks.is_persistent)
+        if len(rows):
+            self._marginalize(rows, None)
+            tracks.remove_tracks(rows, self._poses(), close=False)
+
+    def _marginalize(self, rows: I64, frame: int | None, map_terms: MapTerms | None = None) -> None:
+        """Put all that landmarks (rows) and a frame say about other states into the prior."""
+        problem, _, _ = self._problem(rows, map_terms)
+        keeps = self.options.keep_first_estimates
+        self._prior = marginalized(
+            problem, self._prior, self._states, frame=frame, keep_first_estimates=keeps
+        )
+
+    def _release(self, frame: int) -> None:
+        states = self._states
+        self._released.append(
+            (int(self._time_ns[frame]), states.T_M_I[frame], states.motion[frame])
+        )
+
+    def _forget_frame(self, frame: int) -> None:
+        self._states = self._states.without_frame(frame)
+        for name in ("_time_ns", "_is_keyframe", "_is_resting", "_is_turning"):
+            setattr(self, name, np.delete(getattr(self, name), frame))
+
+    def _poses(self) -> CameraPoses:
+        return CameraPoses.of(self._states.T_M_I, self._cameras.T_I_C)
+
+    # -- report -----------------------------------------------------------------------------------
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        began = time.thread_time()
+        yield
+        self._stage_ms[name] = 1e3 * (time.thread_time() - began)
+
+    def _update(
+        self,
+        frame: WindowFrame,
+        newest: tuple[F64, F64],
+        covariance: F64,
+        error_px: float,
+        summary: SolverSummary,
+        used: tuple[int, int],
+        *,
+        is_keyframe: bool,
+    ) -> WindowUpdate:
+        T_M_I, motion = newest
+        return WindowUpdate(
+            time_ns=frame.time_ns,
+            T_M_I=T_M_I,
+            v_M=motion[:3],
+            gyro_bias=motion[3:6],
+            accel_bias=motion[6:],
+            covariance=covariance,
+            is_keyframe=is_keyframe,
+            num_frames=len(self._states),
+            num_landmarks=used[0],
+            num_observations=used[1],
+            median_error_px=error_px,
+            costs=summary.final_costs,
+            iterations=summary.iterations,
+            termination=summary.termination,
+            released=self._released_states(),
+            stage_ms=self._stage_ms,
+        )
+
+    def _released_states(self) -> ReleasedStates:
+        times = np.array([t for t, _, _ in self._released], dtype=np.int64)
+        T_M_I = np.array([T for _, T, _ in self._released]).reshape(-1, 7)
+        motion = np.array([m for _, _, m in self._released]).reshape(-1, 9)
+        return ReleasedStates(times, T_M_I, motion[:, :3], motion[:, 3:6], motion[:, 6:])

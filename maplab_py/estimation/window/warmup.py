@@ -1,0 +1,83 @@
+"""Compile the kernels of the window by running each once on a tiny window."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from maplab_py.estimation.codegen.kernels import window_kernels
+from maplab_py.estimation.kernels import window as kernels
+from maplab_py.estimation.kernels.window_arguments import (
+    FRAME_SIZE,
+    DenseSystem,
+    Elimination,
+    WindowData,
+    WindowPoint,
+    WindowRule,
+)
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import BackProjection, camera_table
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.geometry import se3
+from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+
+
+def window_jobs() -> dict[str, Callable[[], None]]:
+    """Return by name what compiles one kernel each."""
+    jobs: dict[str, Callable[[], None]] = {"window": _run_frames}
+    for projection, distortion in itertools.product(Projection, Distortion):
+        name = f"window {projection.name} {distortion.name}"
+        jobs[name] = partial(_run_landmarks, projection, distortion)
+    return jobs
+
+
+def _states() -> WindowStates:
+    T_M_I = se3.identity(2)
+    T_M_I[1, 4] = 0.5
+    return WindowStates(T_M_I, np.zeros((2, 9)), np.array([[0.1, 0.0, 0.2]]))
+
+
+def _run_landmarks(projection: Projection, distortion: Distortion) -> None:
+    intrinsics = np.array([0.1, 100.0, 100.0, 50.0, 50.0][5 - INTRINSICS_SIZE[projection] :])
+    parameters = np.full(DISTORTION_SIZE[distortion], 0.1)
+    camera = Camera("0" * 32, projection, distortion, intrinsics, parameters, 100, 100)
+    models, table = camera_table((camera,), se3.identity(1))
+    module, states = window_kernels(models), _states()
+    frame, row = np.array([0, 1], dtype=np.int32), np.zeros(2, dtype=np.int32)
+    uv = np.array([[60.0, 50.0], [50.0, 50.0]])
+    data = WindowData(
+        np.array([0, 2], dtype=np.int64),
+        frame,
+        row,
+        uv,
+        np.ones(2),
+        np.ones(2),
+        row[:1],
+        row[:1],
+        np.zeros((1, 2)),
+    )
+    at = WindowPoint(states.T_M_I, states.h, table.T_I_C, table.parameters)
+    rule = WindowRule(int(Loss.HUBER), 1e-5, states.T_M_I, np.array([True, False]))
+    system, kept = DenseSystem.zeros(2 * FRAME_SIZE), Elimination.empty(1, 2)
+    module.eliminate(data, at, rule, system, kept)
+    new = at._replace(h=np.empty_like(states.h))
+    module.substitute(data, at, rule, kept, np.zeros(2 * FRAME_SIZE), new)
+    module.evaluate(data, at, np.empty((2, 2)))
+    BackProjection(module, (camera,), table).rays(row, uv)
+
+
+def _run_frames() -> None:
+    states, system = _states(), DenseSystem.zeros(2 * FRAME_SIZE)
+    first_row = np.zeros(1, dtype=np.int64)
+    kernels.add_factors(np.ones((1, 3)), np.ones((1, 3, 3)), first_row, system)
+    kernels.add_walks(states.motion, np.ones((1, 2)), system)
+    states.moved(states.offsets(states.T_M_I, states.motion), states.h)
+    CameraPoses.of(states.T_M_I, se3.identity(1))
+    origin, start = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0, 2], dtype=np.int64)
+    ray = np.array([[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]])
+    kernels.triangulate(origin, ray, start, np.empty((1, 3)), np.empty(1, dtype=np.bool_))

@@ -1,0 +1,43 @@
+"""States of the body at several times."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BodyStates:
+    """Estimated states at N times, in the mission frame M."""
+
+    times_ns: I64  # (N,)
+    T_M_I: F64  # (N, 7)
+    v_M_I: F64  # (N, 3) [m/s], expressed in M
+    gyro_bias: F64  # (N, 3) [rad/s]
+    accel_bias: F64  # (N, 3) [m/s^2]
+
+    @classmethod
+    def single(
+        cls, time_ns: int, T_M_I: F64, v_M_I: F64, gyro_bias: F64, accel_bias: F64
+    ) -> BodyStates:
+        """Return the state at one time, from columns without a first axis."""
+        time = np.array([time_ns], dtype=np.int64)
+        return cls(time, T_M_I[None], v_M_I[None], gyro_bias[None], accel_bias[None])
+
+    @classmethod
+    def none(cls) -> BodyStates:
+        """Return no states."""
+        zeros = np.zeros((0, 3))
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), zeros, zeros, zeros)
+
+    @classmethod
+    def concatenate(cls, parts: list[BodyStates]) -> BodyStates:
+        """Stack states, at least of one part."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+    def __len__(self) -> int:
+        return len(self.times_ns)

@@ -1,0 +1,213 @@
+"""The end of a run: landmarks, localisation map, files, report."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
+from maplab_py.errors import Cancelled, MaplabError
+from maplab_py.frontend.localization.record import summarised
+from maplab_py.frontend.localization.reports import LocalizationSummary
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.reports import MappingReport
+from maplab_py.frontend.run_options import OutputOptions
+from maplab_py.interop.trajectories import write_euroc
+from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
+from maplab_py.storage.native import DiskCopy, save_map
+from maplab_py.vimap import LandmarkQuality, VIMap
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """What came of a run."""
+
+    report: MappingReport
+    vi_map: VIMap | None  # None without a map builder, and if there are too few vertices
+    disk_copy: DiskCopy | None  # of the map in the folder, None if it was not saved
+
+
+def finish(
+    mapping: Mapping,
+    recording_name: str,
+    *,
+    map_key: str = "",
+    progress: Progress = SILENT,
+    is_to_end: Callable[[], bool] = lambda: False,
+) -> FinishedRun:
+    """Make the map of a run, save what is to be saved, and report.
+
+    A run that ended early is saved, too. What fails here is told in the report; the map stays in
+    memory, so that it can be saved elsewhere.
+
+    Args:
+        mapping: A run that has ended.
+        recording_name: For the report.
+        map_key: Name of the map in memory, for the report.
+        progress: Told of the progress; may cancel.
+        is_to_end: Tells whether to end now with what there is: the map is then not optimised.
+
+    Raises:
+        Cancelled: The run was cancelled.
+    """
+    output = mapping.options.output
+    problems = [mapping.problem] if mapping.problem else []
+    notes = [*mapping.statistics.notes, *_stream_notes(mapping), *_localization_notes(mapping)]
+    vi_map: VIMap | None = None
+    disk_copy: DiskCopy | None = None
+    try:
+        if mapping.builder is not None:
+            vi_map, _ = mapping.builder.finish(progress=progress)
+            if output.optimize_map_to_localization_map:
+                try:
+                    vi_map = localization_map(
+                        vi_map, output, progress=_UntilEnd(progress, is_to_end)
+                    )
+                except _EndRequested:
+                    notes.append("ended early: the map is not optimised to a localisation map")
+        if output.export_estimated_poses_to_csv is not None:
+            write_euroc(
+                mapping.trajectory(),
+                output.export_estimated_poses_to_csv,
+                overwrite=output.overwrite_existing_map,
+            )
+        if output.export_localized_poses_to_csv is not None:
+            mapping.localized.write(
+                output.export_localized_poses_to_csv, overwrite=output.overwrite_existing_map
+            )
+        if vi_map is not None and output.save_map_folder is not None:
+            disk_copy = _saved(vi_map, output.save_map_folder, output)
+    except Cancelled:
+        raise
+    except MaplabError as error:
+        if vi_map is None:
+            raise
+        problems.append(f"{error} (the map is in memory as '{map_key}': save it)")
+    report = _report(mapping, recording_name, vi_map, notes, "; ".join(problems))
+    saved_folder = output.save_map_folder if disk_copy is not None else None
+    report = dataclasses.replace(report, map_key=map_key, map_folder=saved_folder)
+    return FinishedRun(report, vi_map, disk_copy)
+
+
+def localization_map(vi_map: VIMap, output: OutputOptions, *, progress: Progress = SILENT) -> VIMap:
+    """Return the localisation map of a map, with the share of good landmarks that shall be kept.
+
+    Raises:
+        EstimationError: Nothing can be optimised.
+    """
+    result, _ = make_localization_map(vi_map, WorkflowOptions(), progress=progress)
+    share = output.localization_map_keep_landmark_fraction
+    if share:
+        keep = max(1, round(share * _good(result)))
+        result, _, _ = sparsify(result, keep, SparsificationOptions(), progress=progress)
+    return result
+
+
+class _EndRequested(Cancelled):
+    """The user wants the result as it is."""
+
+
+class _UntilEnd:
+    """Progress of work that is left out when the user wants the end."""
+
+    def __init__(self, progress: Progress, is_to_end: Callable[[], bool]) -> None:
+        self._progress, self._is_to_end = progress, is_to_end
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        self._progress.step(done, total, what)
+        self.check()
+
+    def line(self, text: str) -> None:
+        self._progress.line(text)
+
+    def check(self) -> None:
+        self._progress.check()
+        if self._is_to_end():
+            raise _EndRequested("ended")
+
+
+def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> DiskCopy:
+    saved = save_map(vi_map, folder, overwrite=output.overwrite_existing_map)
+    return DiskCopy(folder.resolve(), saved.fingerprint)
+
+
+def _stream_notes(mapping: Mapping) -> list[str]:
+    """Return what was left out of the recording, or looks wrong in it."""
+    read, notes = mapping.stream.statistics, []
+    if read.dropped_before_imu or mapping.odometry.counts.frames_before_imu:
+        count = read.dropped_before_imu + mapping.odometry.counts.frames_before_imu
+        notes.append(f"{counted(count, 'frame')} before the first IMU sample left out")
+    if any(read.unmatched_images):
+        notes.append(
+            f"{counted(sum(read.unmatched_images), 'image')} without a partner in the other cameras: "
+            "check the trigger, or raise --vio_nframe_sync_tolerance_ns"
+        )
+    if read.imu_gaps:
+        notes.append(
+            f"{read.imu_gaps} intervals between IMU samples are longer than "
+            f"{mapping.options.stream.imu_gap_s:g} s: check the driver of the IMU"
+        )
+    if read.saturated_samples:
+        notes.append(
+            f"{read.saturated_samples} IMU samples are saturated: move more gently, or set a larger "
+            "range of the sensor"
+        )
+    return notes
+
+
+def _localization_notes(mapping: Mapping) -> list[str]:
+    localization = mapping.localization
+    if localization is None:
+        return []
+    notes = list(localization.notes)
+    if localization.problem:
+        notes.append(f"localisation has ended: {localization.problem}")
+    elif not localization.counts.localized_frames:
+        notes.append(
+            f"never localised in {localization.map_name}: check that it shows the same place, or "
+            "lower --localization_min_inlier_count"
+        )
+    return notes
+
+
+def _report(
+    mapping: Mapping, recording_name: str, vi_map: VIMap | None, notes: list[str], problem: str
+) -> MappingReport:
+    statistics, output = mapping.statistics, mapping.options.output
+    return MappingReport(
+        recording=recording_name,
+        duration_s=statistics.duration_s,
+        frames=statistics.frames,
+        estimated_frames=statistics.estimated_frames,
+        distance_m=statistics.distance_m,
+        real_time_factor=statistics.real_time_factor(),
+        starts=tuple(statistics.starts),
+        missions=0 if vi_map is None else len(vi_map.missions),
+        vertices=0 if vi_map is None else len(vi_map.vertices),
+        landmarks=0 if vi_map is None else len(vi_map.landmarks),
+        good_landmarks=0 if vi_map is None else _good(vi_map),
+        frame_times=statistics.stages(),
+        map_key="",
+        map_folder=None,
+        poses_file=output.export_estimated_poses_to_csv,
+        notes=tuple(notes),
+        problem=problem,
+        localization=_localization(mapping),
+    )
+
+
+def _localization(mapping: Mapping) -> LocalizationSummary | None:
+    if mapping.localization is None:
+        return None
+    csv_file = mapping.options.output.export_localized_poses_to_csv
+    return summarised(mapping.localization, mapping.statistics.first_ns, csv_file)
+
+
+def _good(vi_map: VIMap) -> int:
+    return int(np.count_nonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD))

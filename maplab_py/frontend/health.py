@@ -1,0 +1,73 @@
+"""Recognising that an estimate has diverged."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.array_types import F64
+from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.odometry_options import HealthOptions
+
+_TILT = slice(3, 5)
+_VELOCITY = slice(6, 9)
+
+
+class HealthMonitor:
+    """Compares the estimates of one start with the limits."""
+
+    def __init__(self, options: HealthOptions) -> None:
+        """Start with a healthy estimate."""
+        self._options = options
+        self._tracked_ns = -1
+
+    @property
+    def healthy_until_ns(self) -> int:
+        """Time of the last frame with enough tracks."""
+        return self._tracked_ns
+
+    def problem(self, state: BodyStates, covariance: F64, tracks: int) -> str:
+        """Return why an estimate has diverged, empty if it has not.
+
+        Args:
+            state: The estimate at one time.
+            covariance: Of it (15, 15), order [p, theta, v, b_g, b_a].
+            tracks: Number of keypoints that were seen in the frame before, too.
+        """
+        options, time_ns = self._options, int(state.times_ns[0])
+        columns = (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias)
+        if not all(np.isfinite(column).all() for column in columns):
+            return "the estimate is not a number"
+        if tracks >= options.min_tracks or self._tracked_ns < 0:
+            self._tracked_ns = time_ns
+        blind_s = (time_ns - self._tracked_ns) * 1e-9
+        if blind_s > options.max_time_without_tracks_s:
+            return f"fewer than {options.min_tracks} keypoints tracked for {blind_s:.1f} s"
+        speed = float(np.linalg.norm(state.v_M_I))
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        checks = (
+            (speed, options.max_speed, "speed {:.1f} m/s"),
+            (
+                float(sigma[_VELOCITY].max()),
+                options.max_velocity_sigma,
+                "standard deviation of the velocity {:.2f} m/s",
+            ),
+            (
+                float(np.degrees(sigma[_TILT].max())),
+                options.max_tilt_sigma_deg,
+                "standard deviation of the tilt {:.1f} deg",
+            ),
+            (
+                float(np.linalg.norm(state.accel_bias)),
+                options.max_accel_bias,
+                "bias of the accelerometer {:.2f} m/s^2",
+            ),
+            (
+                float(np.linalg.norm(state.gyro_bias)),
+                options.max_gyro_bias,
+                "bias of the gyroscope {:.2f} rad/s",
+            ),
+        )
+        for value, limit, text in checks:
+            if not value <= limit:
+                return text.format(value)
+        return ""

@@ -1,0 +1,179 @@
+"""Start in motion: gyroscope bias, closed form, refinement, and what is still unknown afterwards."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64
+from maplab_py.estimation.window.frame import StartState
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.frontend.initialization.gyro_bias import (
+    Turns,
+    estimate_gyro_bias,
+    integrate_turns,
+    ray_pairs,
+)
+from maplab_py.frontend.initialization.linear import LinearMotion, solve_motion
+from maplab_py.frontend.initialization.options import InitializationOptions
+from maplab_py.frontend.initialization.rays import RayMaker, SegmentRays
+from maplab_py.frontend.initialization.refinement import (
+    BiasSigmas,
+    Refined,
+    Refinement,
+    mission_frame,
+)
+from maplab_py.frontend.initialization.segment import Segment
+from maplab_py.geometry import se3, so3
+from maplab_py.sensors import Camera, Imu
+
+_MIN_PAIRS = 3
+_MIN_SHARE_IN_FRONT = 0.7
+_POSITION_SIGMA_M = 1e-4
+_BIAS_WALK_S = 3600.0
+_MAX_BIAS_SIGMAS = 4.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Attempt:
+    """A start in motion, or why there is none."""
+
+    state: StartState | None
+    reason: str  # empty when there is a state
+    refined: Refined | None = None  # what the state was taken from
+
+
+class MotionStart:
+    """Solves segments of a rig in motion."""
+
+    def __init__(
+        self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu, options: InitializationOptions
+    ) -> None:
+        """Prepare for cameras with poses T_I_C (C, 7) on the IMU."""
+        self._options = options
+        # vibrations and errors of scale are not in the densities of a data sheet
+        self.imu = dataclasses.replace(
+            imu,
+            gyro_noise_density=max(imu.gyro_noise_density, options.least_gyro_noise_density),
+            acc_noise_density=max(imu.acc_noise_density, options.least_accel_noise_density),
+        )
+        self._rays = RayMaker(cameras, T_I_C)
+        self._accel_bias_sigma = accel_bias_sigma(imu, options)
+        biases = BiasSigmas(options.gyro_bias_sigma_radps, self._accel_bias_sigma)
+        self._refinement = Refinement(cameras, T_I_C, self.imu, biases)
+
+    def solve(self, segment: Segment, leniency: float = 1.0) -> Attempt:
+        """Estimate the state of the last frame of a segment.
+
+        Args:
+            segment: Frames.
+            leniency: Factor of the limits of scale and gravity.
+        """
+        rays = self._rays.of(segment)
+        pairs = ray_pairs(rays)
+        if len(pairs.first_frame) < _MIN_PAIRS:
+            return Attempt(
+                None,
+                "too few points are seen in several images: give more light, or point the camera "
+                "at things with texture",
+            )
+        gyro_bias = estimate_gyro_bias(segment.inertial, pairs)
+        turns = integrate_turns(segment.inertial, gyro_bias)
+        sigma = self._accel_bias_sigma
+        motion = solve_motion(segment.inertial, turns, gyro_bias, rays, sigma)
+        if motion is None:
+            return Attempt(
+                None,
+                "the points show no parallax: move the camera sideways, turning it is not enough",
+            )
+        if motion.share_in_front < _MIN_SHARE_IN_FRONT:
+            return Attempt(
+                None,
+                f"{100 * (1 - motion.share_in_front):.0f} % of the points would lie behind the "
+                "cameras: move the camera sideways, and faster",
+            )
+        refined = self._refinement.refine(segment, _states(turns, gyro_bias, motion))
+        reason = self._objection(refined, rays, leniency)
+        if refined is None or reason:
+            return Attempt(None, reason, refined)
+        return Attempt(_start_state(refined), "", refined)
+
+    def _objection(self, refined: Refined | None, rays: SegmentRays, leniency: float) -> str:
+        """Return what is still unknown, empty when the estimator may start."""
+        options = self._options
+        if refined is None:
+            return (
+                "the motion is not determined yet: move the camera sideways, with changes "
+                "of speed and direction"
+            )
+        if refined.num_landmarks < options.min_landmarks:
+            return (
+                f"{refined.num_landmarks} points have parallax, {options.min_landmarks} are needed: "
+                "move the camera sideways, or point it at things that are nearer"
+            )
+        if refined.median_error_px > options.max_error_px:
+            return (
+                f"images and IMU disagree by {refined.median_error_px:.1f} px, "
+                f"{options.max_error_px:g} are allowed: check the time offset and the pose of the "
+                "camera on the IMU, and that the scene does not move"
+            )
+        bias = float(np.linalg.norm(refined.states.accel_bias[-1]))
+        if bias > _MAX_BIAS_SIGMAS * self._accel_bias_sigma:
+            return (
+                f"the accelerometer's bias would be {bias:.1f} m/s^2: change speed and direction, "
+                "and turn; if this stays, calibrate the IMU"
+            )
+        tilt_deg = float(np.degrees(refined.tilt_sigma_rad))
+        max_tilt_deg = leniency * options.max_tilt_sigma_deg
+        if tilt_deg > max_tilt_deg:
+            return (
+                f"the direction of gravity is known to {tilt_deg:.1f} deg, "
+                f"{max_tilt_deg:.1f} are needed: change speed and direction, and turn"
+            )
+        scale_sigma = refined.travelled_sigma_m / max(refined.travelled_m, 1e-6)
+        is_known = shares_points(rays) and refined.travelled_sigma_m <= options.max_rig_sigma_m
+        max_scale_sigma = leniency * options.max_scale_sigma
+        if scale_sigma > max_scale_sigma and not is_known:
+            return (
+                f"the scale is known to {100 * min(scale_sigma, 9.99):.0f} %, "
+                f"{100 * max_scale_sigma:.0f} % are needed: change speed and direction more"
+            )
+        return ""
+
+
+def accel_bias_sigma(imu: Imu, options: InitializationOptions) -> float:
+    """Return the standard deviation [m/s^2] of a component of the accelerometer's bias at the start.
+
+    Sensors whose bias walks far are those that begin far off (Tango: 0.8 m/s^2).
+    """
+    walked = imu.acc_bias_random_walk_noise_density * float(np.sqrt(_BIAS_WALK_S))
+    return max(options.accel_bias_sigma_mps2, walked)
+
+
+def shares_points(rays: SegmentRays) -> bool:
+    """Tell whether most frames have points that several cameras see, which gives the scale."""
+    order = np.lexsort((rays.frame, rays.track))
+    same = (np.diff(rays.frame[order]) == 0) & (np.diff(rays.track[order]) == 0)
+    frames = len(np.unique(rays.frame))
+    shared = np.bincount(rays.frame[order][1:][same], minlength=1)
+    return bool(np.count_nonzero(shared >= 10) >= 0.5 * max(frames, 1))
+
+
+def _states(turns: Turns, gyro_bias: F64, motion: LinearMotion) -> WindowStates:
+    """Return the states of the frames in M."""
+    q_M_A, frames = mission_frame(motion.g_A), len(turns.q_A_I)
+    T_M_I = se3.make(so3.multiply(q_M_A, turns.q_A_I), so3.rotate(q_M_A, motion.p_A))
+    biases = np.tile(np.concatenate([gyro_bias, motion.accel_bias]), (frames, 1))
+    velocity = so3.rotate(q_M_A, motion.v_A)
+    return WindowStates(T_M_I, np.concatenate([velocity, biases], axis=1), np.zeros((0, 3)))
+
+
+def _start_state(refined: Refined) -> StartState:
+    """Return the state of the last frame, in a mission frame that begins there."""
+    T_M_I, motion = refined.states.T_M_I[-1].copy(), refined.states.motion[-1]
+    T_M_I[4:] = 0.0
+    sigma = np.sqrt(np.maximum(np.diagonal(refined.covariance), 0.0))
+    # heading is free to choose: what is known of it is what is known of the tilt
+    sigma[:3], sigma[3:6] = _POSITION_SIGMA_M, refined.tilt_sigma_rad
+    return StartState(T_M_I, motion[:3], motion[3:6], motion[6:], sigma)

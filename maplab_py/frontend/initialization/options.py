@@ -1,0 +1,97 @@
+"""Options of the initialisation."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class InitializationOptions:
+    """When the estimator may start."""
+
+    flag_prefix: ClassVar[str] = "vio_initialization_"
+
+    rest_s: float = option(1.0, unit="s", help="Time at rest from which the estimator starts")
+    rest_disparity_px: float = option(
+        0.5, unit="px", help="Largest median disparity in 0.1 s at rest, turns included"
+    )
+    rest_accel_deviation_mps2: float = option(
+        0.25, unit="m/s^2", help="Largest deviation of the accelerometer at rest"
+    )
+    rest_gyro_deviation_radps: float = option(
+        0.05, unit="rad/s", help="Largest deviation of the gyroscope at rest"
+    )
+    min_rig_s: float = option(
+        1.5, unit="s", help="Shortest time in motion for cameras that see the same points"
+    )
+    min_mono_s: float = option(1.5, unit="s", help="Shortest time in motion for a single camera")
+    longest_s: float = option(4.0, unit="s", help="Time in motion that is used, the latest part")
+    retry_s: float = option(0.25, unit="s", help="Time between two attempts")
+    keyframe_interval_s: float = option(
+        0.1, unit="s", help="Shortest time between the frames that are used"
+    )
+    most_keyframes: int = option(16, help="Largest number of frames that are used")
+    min_landmarks: int = option(20, help="Smallest number of landmarks")
+    max_scale_sigma: float = option(
+        0.03, help="Largest standard deviation of the scale, as a share of it"
+    )
+    max_rig_sigma_m: float = option(
+        0.01,
+        unit="m",
+        help="Cameras that see the same points need not move when the distance moved is known so well",
+    )
+    max_tilt_sigma_deg: float = option(
+        1.5, unit="deg", help="Largest standard deviation of the direction of gravity"
+    )
+    patience_s: float = option(
+        5.0,
+        unit="s",
+        help="Time after which the limits of scale and gravity grow with the time that has passed",
+    )
+    max_error_px: float = option(
+        1.5, unit="px", help="Largest median reprojection error after the refinement"
+    )
+    gyro_bias_sigma_radps: float = option(
+        0.1, unit="rad/s", help="Standard deviation of the gyroscope's bias before the start"
+    )
+    accel_bias_sigma_mps2: float = option(
+        0.2,
+        unit="m/s^2",
+        help="Standard deviation of the accelerometer's bias before the start, unless it walks "
+        "farther in an hour",
+    )
+    least_gyro_noise_density: float = option(
+        7e-4, unit="rad/s/sqrt(Hz)", help="Noise of the gyroscope, if the calibration says less"
+    )
+    least_accel_noise_density: float = option(
+        0.016,
+        unit="m/s^2/sqrt(Hz)",
+        help="Noise of the accelerometer, if the calibration says less",
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A number is not positive, or the longest time is too short.
+        """
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not 0 < value < 1e6:
+                raise FlagError(
+                    f"--{self.flag_prefix}{field.name}={value:g}: wants a number above 0"
+                )
+        if self.most_keyframes < 4:
+            raise FlagError(
+                f"--{self.flag_prefix}most_keyframes={self.most_keyframes}: wants 4 or more"
+            )
+        for name in ("rest_s", "min_rig_s", "min_mono_s"):
+            if getattr(self, name) > self.longest_s:
+                raise FlagError(
+                    f"--{self.flag_prefix}{name}={getattr(self, name):g} is longer than "
+                    f"--{self.flag_prefix}longest_s={self.longest_s:g}"
+                )

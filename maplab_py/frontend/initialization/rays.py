@@ -1,0 +1,63 @@
+"""The observations of a segment as rays in the frame of the IMU."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64, I32, I64
+from maplab_py.frontend.initialization.segment import Segment
+from maplab_py.geometry import so3
+from maplab_py.sensors import Camera
+from maplab_py.vision.tracking.ray_table import RayTable
+from maplab_py.vision.tracking.views import focal_length_px
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SegmentRays:
+    """N rays, those of the same track next to each other, in the order of time."""
+
+    frame: I32  # (N,)
+    camera: I32  # (N,)
+    track: I64  # (N,) consecutive numbers, ascending
+    track_id: I64  # (N,)
+    ray_I: F64  # (N, 3) unit
+    p_I_C: F64  # (N, 3) where they begin
+    sigma: F64  # (N,) [rad]
+
+    @property
+    def start(self) -> I64:
+        """Offsets (T + 1,) of the tracks."""
+        count = int(self.track[-1]) + 1 if len(self.track) else 0
+        return np.searchsorted(self.track, np.arange(count + 1)).astype(np.int64)
+
+
+class RayMaker:
+    """Makes rays of the pixels of a rig."""
+
+    def __init__(self, cameras: tuple[Camera, ...], T_I_C: F64) -> None:
+        """Prepare for cameras with poses (C, 7) on the IMU."""
+        self._tables = [RayTable.of(camera) for camera in cameras]
+        self._R_I_C, self._p_I_C = so3.to_matrix(T_I_C[:, :4]), T_I_C[:, 4:]
+        self._focal_px = np.array([focal_length_px(camera) for camera in cameras])
+
+    def of(self, segment: Segment) -> SegmentRays:
+        """Return the rays of a segment; pixels without rays are left out."""
+        ray_C, exists = np.zeros((len(segment.frame), 3)), np.zeros(len(segment.frame), dtype=bool)
+        for camera, table in enumerate(self._tables):
+            rows = np.flatnonzero(segment.camera == camera)
+            ray_C[rows], exists[rows] = table.rays(segment.uv_px[rows])
+        order = np.lexsort((segment.camera, segment.frame, segment.track_id))
+        order = order[exists[order]]
+        camera_of = segment.camera[order]
+        _, track = np.unique(segment.track_id[order], return_inverse=True)
+        return SegmentRays(
+            frame=segment.frame[order],
+            camera=camera_of,
+            track=np.asarray(track, dtype=np.int64).reshape(-1),
+            track_id=segment.track_id[order],
+            ray_I=(self._R_I_C[camera_of] @ ray_C[order][:, :, None])[:, :, 0],
+            p_I_C=self._p_I_C[camera_of],
+            sigma=segment.sigma_px[order] / self._focal_px[camera_of],
+        )

@@ -1,0 +1,124 @@
+"""The latest frames before the estimator has started, and some of them to start from."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import itertools
+
+import numpy as np
+
+from maplab_py.array_types import F64, I32, I64
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.sensors import Imu
+from maplab_py.vimap.table import starts_of_counts
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Segment:
+    """F frames in the order of time, their N observations, and F - 1 inertial edges between them."""
+
+    time_ns: I64  # (F,)
+    inertial: InertialData  # (F - 1) edges
+    frame: I32  # (N,) ascending
+    camera: I32  # (N,)
+    track_id: I64  # (N,)
+    uv_px: F64  # (N, 2)
+    sigma_px: F64  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last frame."""
+        return float(self.time_ns[-1] - self.time_ns[0]) * 1e-9
+
+    def samples(self, edge: int) -> tuple[I64, F64]:
+        """Return times (S,) and samples (S, 6) of an edge."""
+        rows = slice(*self.inertial.sample_start[edge : edge + 2].tolist())
+        return self.inertial.timestamp_ns[rows], self.inertial.accel_gyro[rows]
+
+
+class History:
+    """The latest frames."""
+
+    def __init__(self, longest_s: float) -> None:
+        """Keep the frames of so many seconds."""
+        self._longest_ns = round(longest_s * 1e9)
+        self._frames: collections.deque[WindowFrame] = collections.deque()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def push(self, frame: WindowFrame) -> None:
+        """Add a frame; if its samples do not begin at the frame before, that is forgotten."""
+        frames = self._frames
+        times_ns = frame.imu_times_ns
+        if frames and (
+            len(times_ns) < 2
+            or times_ns[0] != frames[-1].time_ns
+            or times_ns[-1] != frame.time_ns
+            or frame.time_ns <= frames[-1].time_ns
+        ):
+            frames.clear()
+        frames.append(frame)
+        while frame.time_ns - frames[0].time_ns > self._longest_ns:
+            frames.popleft()
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last frame."""
+        if not self._frames:
+            return 0.0
+        return (self._frames[-1].time_ns - self._frames[0].time_ns) * 1e-9
+
+    def latest(self, duration_s: float) -> list[WindowFrame]:
+        """Return the frames of the last so many seconds, in the order of time."""
+        since_ns = self._frames[-1].time_ns - round(duration_s * 1e9)
+        return [frame for frame in self._frames if frame.time_ns >= since_ns]
+
+    def samples(self, duration_s: float) -> tuple[I64, F64]:
+        """Return the IMU samples (S,), (S, 6) between the frames of the last so many seconds."""
+        frames = self.latest(duration_s)[1:]
+        if not frames:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        return _joined(frames)
+
+    def segment(self, imu: Imu, interval_s: float) -> Segment:
+        """Return frames about so far apart, the newest among them, and all samples between them."""
+        frames = list(self._frames)
+        chosen = [len(frames) - 1]
+        # half the usual interval of images is tolerance for their jitter
+        for row in range(len(frames) - 2, -1, -1):
+            if (frames[chosen[-1]].time_ns - frames[row].time_ns) * 1e-9 >= interval_s - 5e-3:
+                chosen.append(row)
+        chosen.reverse()
+        edges = [_joined(frames[a + 1 : b + 1]) for a, b in itertools.pairwise(chosen)]
+        none = (np.zeros(0, dtype=np.int64), np.zeros((0, 6)))
+        inertial = InertialData(
+            sample_start=starts_of_counts(np.array([len(t) for t, _ in edges], dtype=np.int64)),
+            timestamp_ns=np.concatenate([t for t, _ in [none, *edges]]),
+            accel_gyro=np.concatenate([values for _, values in [none, *edges]]),
+            imus=(imu,),
+            imu_of_edge=np.zeros(len(edges), dtype=np.int64),
+        )
+        kept = [frames[row] for row in chosen]
+        counts = [len(frame.track_id) for frame in kept]
+        return Segment(
+            time_ns=np.array([frame.time_ns for frame in kept], dtype=np.int64),
+            inertial=inertial,
+            frame=np.repeat(np.arange(len(kept), dtype=np.int32), counts),
+            camera=np.concatenate([frame.camera for frame in kept]).astype(np.int32),
+            track_id=np.concatenate([frame.track_id for frame in kept]).astype(np.int64),
+            uv_px=np.concatenate([frame.uv_px for frame in kept]),
+            sigma_px=np.concatenate([frame.sigma_px for frame in kept]),
+        )
+
+
+def _joined(frames: list[WindowFrame]) -> tuple[I64, F64]:
+    """Return the samples on the way to consecutive frames; the common ones are kept once."""
+    times = [frames[0].imu_times_ns, *(frame.imu_times_ns[1:] for frame in frames[1:])]
+    values = [frames[0].accel_gyro, *(frame.accel_gyro[1:] for frame in frames[1:])]
+    return np.concatenate(times).astype(np.int64), np.concatenate(values).astype(np.float64)

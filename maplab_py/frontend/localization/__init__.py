@@ -1,0 +1,1 @@
+"""Localisation of the odometry in a map while a recording is read."""

@@ -1,0 +1,252 @@
+"""Estimators of the pose in the map: tightly coupled (VIL), and the baselines of Paper I.
+
+All see the same answers. VIL changes the odometry, the others read it: T_G_I = T_G_M T_M_I.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from maplab_py.array_types import F64
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.window.alignment import aligned
+from maplab_py.estimation.window.localized import LocalizedSmoother, composition_jacobian
+from maplab_py.estimation.window.map_rule import MapRule
+from maplab_py.estimation.window.map_terms import MapTerms
+from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
+from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.frontend.localization.matcher import Answer
+from maplab_py.geometry import se3
+from maplab_py.interop.recordings.protocol import RecordedSensors
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapPose:
+    """Where the newest frame is in the map."""
+
+    T_G_M: F64  # (7,)
+    T_G_I: F64  # (7,)
+    covariance: F64  # (6, 6) of [dp, dtheta] of T_G_I, baselines: given T_M_I; infinite = not known
+
+
+class MapEstimator(Protocol):
+    """Estimates T_G_M from matches."""
+
+    @property
+    def associated(self) -> MapTracks | None:
+        """The tracks that observe the map now; None where matches are not kept."""
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """Begin at T_G_M (7,), or begin again there."""
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:
+        """Take an answer of a frame; its matches are those that shall be associated."""
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:
+        """Forget everything; the odometry has started again if there is no smoother."""
+
+    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
+        """Return where the newest frame is; None while that is not known."""
+
+
+class TightEstimator:
+    """VIL: the smoother has T_G_M among its states."""
+
+    @property
+    def associated(self) -> MapTracks | None:
+        """See `MapEstimator`."""
+        return self._tracks
+
+    def __init__(self) -> None:
+        """Begin without a map."""
+        self._tracks: MapTracks | None = None
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`."""
+        localized = _localized(smoother)
+        localized.start_base_frame(T_G_M)
+        self._tracks = localized.map_tracks
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
+        """See `MapEstimator`."""
+        _localized(smoother).associate(matches)
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:
+        """See `MapEstimator`."""
+        self._tracks = None
+        if smoother is not None:
+            _localized(smoother).stop_base_frame()
+
+    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
+        """See `MapEstimator`."""
+        estimate = _localized(smoother).map_estimate
+        if estimate is None:
+            return None
+        return MapPose(estimate.T_G_M, estimate.T_G_I, estimate.covariance)
+
+
+class _LooseEstimator:
+    """What the estimators share that do not change the odometry."""
+
+    def __init__(self) -> None:
+        """Begin without a map."""
+        self.T_G_M: F64 | None = None
+        # of T_G_M
+        self.covariance = np.full((6, 6), np.inf)
+
+    @property
+    def associated(self) -> MapTracks | None:
+        """See `MapEstimator`."""
+        return None
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
+        """See `MapEstimator`."""
+        self.T_G_M = T_G_M
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:  # noqa: ARG002
+        """See `MapEstimator`."""
+        self.T_G_M = None
+        self.covariance = np.full((6, 6), np.inf)
+
+    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
+        """See `MapEstimator`."""
+        if self.T_G_M is None:
+            return None
+        T_M_I = smoother.states.T_M_I[-1]
+        covariance = self.covariance
+        if np.isfinite(covariance).all():
+            J = composition_jacobian(self.T_G_M, T_M_I)[:, 6:]
+            covariance = J @ covariance @ J.T
+        return MapPose(self.T_G_M, se3.compose(self.T_G_M, T_M_I), covariance)
+
+
+class SlidingWindowEstimator(_LooseEstimator):
+    """SWL: T_G_M over the window's matches, all poses fixed, whenever there is an answer."""
+
+    def __init__(self, device: RecordedSensors, rule: MapRule, options: WindowOptions) -> None:
+        """Take the cameras, and the weights of the tight estimator."""
+        super().__init__()
+        self._device, self._rule, self._options = device, rule, options
+        self._tracks = MapTracks(estimates_landmarks=False)
+
+    @property
+    def associated(self) -> MapTracks | None:
+        """See `MapEstimator`."""
+        return self._tracks
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`."""
+        super().start(T_G_M, smoother)
+        self._tracks.clear()
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
+        """See `MapEstimator`."""
+        if self.T_G_M is None:
+            return
+        exact = dataclasses.replace(matches, covariance_G=None)
+        self._tracks.forget(smoother.tracks)
+        self._tracks.add(exact, smoother.tracks)
+        rule = self._rule
+        observations, used = self._tracks.observations(smoother.tracks, rule.sigma_px)
+        if not len(used):
+            return
+        terms = MapTerms(
+            observations, self._device.cameras, self._device.T_I_C,
+            huber_sigmas=self._options.huber_sigmas, tilt_sigma_rad=rule.tilt_sigma_rad,
+        )  # fmt: skip
+        states = dataclasses.replace(smoother.states, T_G_M=self.T_G_M[None])
+        sigma = np.repeat([rule.base_sigma_m, rule.base_sigma_rad], 3)
+        try:
+            self.T_G_M, self.covariance = aligned(terms, states, sigma)
+        except EstimationError:
+            return
+        states = dataclasses.replace(states, T_G_M=self.T_G_M[None])
+        mean2 = np.add.reduceat(terms.errors_px(states) ** 2, observations.start[:-1])
+        mean2 /= np.diff(observations.start)
+        self._tracks.refuse(used[~(mean2 <= self._options.gate_chi2 * rule.sigma_px**2)])
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:
+        """See `MapEstimator`."""
+        super().stop(smoother)
+        self._tracks = MapTracks(estimates_landmarks=False)
+
+
+class PoseEstimator(_LooseEstimator):
+    """ROVIOLI's loose coupling: T_G_M from the poses of single images with their covariances."""
+
+    def __init__(self) -> None:
+        """Begin without poses."""
+        super().__init__()
+        self._poses: dict[int, tuple[F64, F64]] = {}
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`."""
+        super().start(T_G_M, smoother)
+        self._poses = {}
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
+        """Take the mean of all answers to frames in the window, weighted by information."""
+        if self.T_G_M is None or answer.T_G_I is None or answer.covariance is None:
+            return
+        if np.isfinite(answer.covariance).all():
+            self._poses[answer.time_ns] = answer.T_G_I, answer.covariance
+        times_ns = smoother.times_ns.tolist()
+        self._poses = {t: pose for t, pose in self._poses.items() if t in times_ns}
+        if not self._poses:
+            return
+        information, right = np.zeros((6, 6)), np.zeros(6)
+        for time_ns, (T_G_I, covariance) in self._poses.items():
+            T_M_I = smoother.states.T_M_I[times_ns.index(time_ns)]
+            J = _alignment_jacobian(T_G_I, T_M_I)
+            weight = np.linalg.inv(J @ covariance @ J.T)
+            T_G_M = se3.compose(T_G_I, se3.inverse(T_M_I))
+            information += weight
+            right += weight @ se3.local(self.T_G_M, T_G_M)
+        self.covariance = np.asarray(np.linalg.inv(information))
+        self.T_G_M = se3.retract(self.T_G_M, self.covariance @ right)
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:
+        """See `MapEstimator`."""
+        super().stop(smoother)
+        self._poses = {}
+
+
+class OdometryEstimator(_LooseEstimator):
+    """ODO: aligned once, at the first matches; drift stays."""
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`."""
+        if self.T_G_M is None:
+            super().start(T_G_M, smoother)
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`: later answers do not matter."""
+
+
+def make_estimator(
+    mode: str, device: RecordedSensors, rule: MapRule, options: WindowOptions
+) -> MapEstimator:
+    """Return the estimator of a mode: vil, swl, pose or odo."""
+    if mode == "swl":
+        return SlidingWindowEstimator(device, rule, options)
+    makers: dict[str, type[TightEstimator] | type[PoseEstimator] | type[OdometryEstimator]] = {
+        "vil": TightEstimator,
+        "pose": PoseEstimator,
+        "odo": OdometryEstimator,
+    }
+    return makers[mode]()
+
+
+def _localized(smoother: FixedLagSmoother) -> LocalizedSmoother:
+    if not isinstance(smoother, LocalizedSmoother):
+        raise EstimationError("mode vil needs a localised smoother: see Odometry(map_rule=...)")
+    return smoother
+
+
+def _alignment_jacobian(T_G_I: F64, T_M_I: F64) -> F64:
+    """Return the Jacobian (6, 6) of T_G_M = T_G_I T_M_I^-1 by the tangent of T_G_I."""
+    return composition_jacobian(T_G_I, se3.inverse(T_M_I))[:, 6:]

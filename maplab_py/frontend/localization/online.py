@@ -1,0 +1,277 @@
+"""Localisation of the odometry, frame by frame: when to match, what to believe, what to report."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import time
+from enum import Enum
+
+import numpy as np
+
+from maplab_py.algorithms.localization.localizer import Outcome
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.estimation.window.map_tracks import MapMatches
+from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.frontend.localization.agreement import AgreementFilter, Verdict
+from maplab_py.frontend.localization.estimators import MapEstimator, MapPose, make_estimator
+from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keypoints
+from maplab_py.frontend.localization.map_source import SearchedMap, calibration_notes
+from maplab_py.frontend.localization.matcher import Answer, MapMatcher
+from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.geometry import se3
+from maplab_py.interop.recordings.protocol import RecordedSensors
+
+_EARLY = 0.95
+"""A frame may be matched this share of the interval after the one before."""
+_HISTORY = 200
+"""Frames back to which a late answer is used."""
+
+
+class LocalizationState(Enum):
+    """Whether the odometry knows where it is in the map."""
+
+    SEARCHING = "searching"
+    LOCALIZED = "localized"
+
+
+@dataclasses.dataclass(eq=False)
+class LocalizationCounts:
+    """What a run has counted."""
+
+    frames: int = 0
+    localized_frames: int = 0
+    queries: int = 0
+    answers_by_index: int = 0
+    answers_by_tracking: int = 0
+    matches: int = 0
+    starts: int = 0  # of T_G_M
+    disagreeing: int = 0  # answers that the estimate contradicts
+    late: int = 0  # answers to frames that nobody knows any more
+    refused: dict[str, int] = dataclasses.field(default_factory=dict)  # by reason
+    first_localized_ns: int = -1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LocalizedFrame:
+    """What localisation says of a frame."""
+
+    time_ns: int
+    state: LocalizationState
+    pose: MapPose | None
+    answer: Answer | None  # to this frame
+    stage_ms: dict[str, float]  # elapsed time
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapEvent:
+    """What an estimator was told after a frame: to start at a pose, or an answer to use."""
+
+    time_ns: int
+    answers: tuple[Answer, ...]
+    start: Answer | None  # T_G_M starts at its pose; None = it goes on
+
+
+class OnlineLocalization:
+    """Localises an odometry in a map.
+
+    The odometry never stops because of the map: what goes wrong here ends localisation, with one line
+    in `problem`.
+    """
+
+    def __init__(
+        self,
+        searched: SearchedMap,
+        device: RecordedSensors,
+        options: OnlineLocalizationOptions,
+        window: WindowOptions | None = None,
+    ) -> None:
+        """Index the map.
+
+        Raises:
+            FlagError: An option is out of its range.
+        """
+        options.check()
+        self.counts = LocalizationCounts()
+        self.events: list[MapEvent] = []  # of the last frame
+        self.notes = calibration_notes(searched, device)
+        self.problem = ""
+        self.options, self.map_name = options, searched.name
+        self.map_landmarks = len(searched.database.p_G)
+        self._map, self._device = searched, device
+        self._matcher = MapMatcher(searched, options)
+        self.estimator: MapEstimator = make_estimator(
+            options.mode, device, options.rule, window or WindowOptions()
+        )
+        self._filter = AgreementFilter(options.min_num_estimates, options.max_mean_error_px)
+        self._poses: collections.OrderedDict[int, tuple[F64, F64 | None]] = (
+            collections.OrderedDict()
+        )
+        self._mission = -1
+        self._next_ns = -(1 << 62)
+
+    def after_frame(
+        self, update: OdometryUpdate, smoother: FixedLagSmoother | None
+    ) -> LocalizedFrame:
+        """Match a frame that the odometry has estimated, if it is time, and return its pose."""
+        self.counts.frames += 1
+        self.events = []
+        if update.state is None or smoother is None:
+            return LocalizedFrame(update.time_ns, LocalizationState.SEARCHING, None, None, {})
+        if update.mission != self._mission:
+            self._start_again(update.mission)
+        began = time.perf_counter()
+        pose = self.estimator.pose(smoother)
+        self._remember(update.time_ns, update.state.T_M_I[0], pose)
+        answer = None
+        if not self.problem and update.time_ns >= self._next_ns:
+            interval_ns = 1e9 / self.options.max_frequency_hz
+            self._next_ns = update.time_ns + int(_EARLY * interval_ns)
+            answer = self._asked(update, pose)
+        spent_ms = {"match": 1e3 * (time.perf_counter() - began)}
+        if answer is not None:
+            self.take(answer, smoother)
+            pose = self.estimator.pose(smoother) or pose
+        state = LocalizationState.SEARCHING
+        if pose is not None:
+            state = LocalizationState.LOCALIZED
+            self.counts.localized_frames += 1
+            if self.counts.first_localized_ns < 0:
+                self.counts.first_localized_ns = update.time_ns
+        return LocalizedFrame(update.time_ns, state, pose, answer, spent_ms)
+
+    def take(self, answer: Answer, smoother: FixedLagSmoother) -> bool:
+        """Use an answer, which may be late; tell whether it was used.
+
+        Answers join the frame that they belong to. Those to frames that are no longer known are
+        dropped and counted.
+        """
+        remembered = self._poses.get(answer.time_ns)
+        if remembered is None or not np.isin(answer.track_id, smoother.tracks.id).any():
+            self.counts.late += 1
+            return False
+        T_M_I, T_G_I = remembered
+        verdict = self._filter.judge(answer, T_M_I, T_G_I, self._matcher.p_G)
+        if verdict is Verdict.WAIT:
+            self.counts.disagreeing += T_G_I is not None
+            return False
+        answers: tuple[Answer, ...] = (answer,)
+        start = None
+        if verdict is Verdict.START:
+            answers, start = tuple(self._filter.take()), answer
+        event = MapEvent(answer.time_ns, answers, start)
+        self.events.append(event)
+        self.apply(event, smoother, self.estimator)
+        return True
+
+    def apply(self, event: MapEvent, smoother: FixedLagSmoother, estimator: MapEstimator) -> None:
+        """Tell an estimator of an event, be it this one's or another one's that is compared with it."""
+        if event.start is not None:
+            assert event.start.T_G_I is not None  # only poses agree
+            T_M_I = _pose_at(smoother, event.time_ns)
+            if T_M_I is None:
+                T_M_I, _ = self._poses[event.time_ns]
+            estimator.start(se3.compose(event.start.T_G_I, se3.inverse(T_M_I)), smoother)
+            self.counts.starts += estimator is self.estimator
+        for answer in event.answers:
+            matches = self._chosen(answer, estimator, smoother)
+            if estimator is self.estimator:
+                self.counts.matches += len(matches)
+            estimator.add(answer, matches, smoother)
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _asked(self, update: OdometryUpdate, pose: MapPose | None) -> Answer | None:
+        """Match a frame; remember why not when the map cannot be searched at all."""
+        assert update.state is not None
+        self.counts.queries += 1
+        try:
+            seen = frame_keypoints(update, self._device)
+            return self._answer(seen, update.state.T_M_I[0], pose)
+        except (UserError, EstimationError) as error:
+            self.problem = str(error)
+            return None
+
+    def _answer(self, seen: FrameKeypoints, T_M_I: F64, pose: MapPose | None) -> Answer | None:
+        """Track the map where that is possible, else ask the index; few tracked matches are better
+        than none.
+        """
+        tracked = None
+        if pose is not None and self.options.map_tracking:
+            tracked = self._matcher.track(seen, pose.T_G_I, _finite(pose.covariance))
+            if tracked is not None and len(tracked) >= self.options.min_num_constraints:
+                self.counts.answers_by_tracking += 1
+                return tracked
+        answer, outcome = self._matcher.find(seen, T_M_I[:4])
+        if answer is not None:
+            self.counts.answers_by_index += 1
+            return answer
+        reason = outcome if outcome is not Outcome.LOCALIZED else Outcome.FEW_MATCHES
+        self.counts.refused[reason.value] = self.counts.refused.get(reason.value, 0) + 1
+        self.counts.answers_by_tracking += tracked is not None
+        return tracked
+
+    def _chosen(
+        self, answer: Answer, estimator: MapEstimator, smoother: FixedLagSmoother
+    ) -> MapMatches:
+        """Return new matches, so that at most as many tracks per camera observe the map as may do so.
+
+        Tracks with most observations come first: all of these enter.
+        """
+        associated, tracks = estimator.associated, smoother.tracks
+        most = self.options.max_num_constraints
+        rows = np.flatnonzero(np.isin(answer.track_id, tracks.id))
+        _, first = np.unique(answer.track_id[rows], return_index=True)
+        rows, present = rows[np.sort(first)], 0
+        if associated is not None:
+            rows = rows[~associated.includes(answer.track_id[rows])]
+            rows = rows[~np.isin(answer.landmark[rows], associated.matches.landmark)]
+            present = int(np.count_nonzero(associated.includes(tracks.id[tracks.is_active])))
+        counts = tracks.counts()[np.searchsorted(tracks.id, answer.track_id[rows])]
+        rows = rows[np.argsort(-counts, kind="stable")]
+        if most:
+            room = max(most * len(self._device.cameras) - present, 0)
+            rank = _rank_within(answer.camera[rows].astype(np.int64))
+            rows = rows[rank < most][:room]
+        landmark = answer.landmark[rows]
+        covariance = None
+        if self.options.rule.estimates_landmarks:
+            assert self._map.covariance_G is not None  # the map was opened with them
+            covariance = self._map.covariance_G[landmark]
+        return MapMatches(answer.track_id[rows], landmark, self._matcher.p_G[landmark], covariance)
+
+    def _remember(self, time_ns: int, T_M_I: F64, pose: MapPose | None) -> None:
+        self._poses[time_ns] = T_M_I, None if pose is None else pose.T_G_I
+        if len(self._poses) > _HISTORY:
+            self._poses.popitem(last=False)
+
+    def _start_again(self, mission: int) -> None:
+        """Forget T_G_M and all answers: M is another frame now."""
+        self._mission = mission
+        self.estimator.stop(None)
+        self._filter.clear()
+        self._poses.clear()
+
+
+def _finite(covariance: F64) -> F64:
+    """Return a covariance, that of a well-known pose where there is none."""
+    return covariance if np.isfinite(covariance).all() else np.diag(np.repeat([1e-4, 1e-5], 3))
+
+
+def _pose_at(smoother: FixedLagSmoother, time_ns: int) -> F64 | None:
+    """Return the pose (7,) of a frame in the window."""
+    row = np.flatnonzero(smoother.times_ns == time_ns)
+    return smoother.states.T_M_I[row[0]] if len(row) else None
+
+
+def _rank_within(group: I64) -> I64:
+    """Return how many entries of the same group (N,) come before each (N,)."""
+    order = np.argsort(group, kind="stable")
+    counts = np.bincount(group)
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    rank = np.empty(len(group), dtype=np.int64)
+    rank[order] = np.arange(len(group)) - first
+    return rank

@@ -1,0 +1,144 @@
+"""Options of localisation while a recording is read, with rovioli's flag names."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.errors import FlagError
+from maplab_py.estimation.window.map_rule import MapRule
+from maplab_py.options import option
+
+MODES = ("vil", "swl", "pose", "odo")
+LANDMARK_UNCERTAINTIES = ("none", "map")
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlineLocalizationOptions:
+    """How the odometry is localised in a map."""
+
+    flag_prefix: ClassVar[str] = "localization_"
+
+    matching: LocalizationOptions = LocalizationOptions()
+    map_folder: Path | None = option(
+        None,
+        help="Map folder, or summary map, in which the recording is localised",
+        flag="vio_localization_map_folder",
+    )
+    mode: str = option(
+        "vil",
+        choices=MODES,
+        help="vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, "
+        "poses fixed; pose = T_G_M from poses of single images; odo = T_G_M from the first matches "
+        "only",
+    )
+    max_frequency_hz: float = option(
+        2.0,
+        help="Largest rate at which images are matched with the map",
+        unit="Hz",
+        flag="vio_max_localization_frequency_hz",
+    )
+    map_tracking: bool = option(
+        True, help="Once localised, match landmarks near their predicted places before all others"
+    )
+    max_num_constraints: int = option(
+        25,
+        help="Tracks per camera that observe the map at a time; 0 = any number",
+        flag="rovioli_max_num_localization_constraints",
+    )
+    min_num_constraints: int = option(
+        5,
+        help="Matches that an answer must have to be used",
+        flag="rovioli_min_number_of_structure_constraints",
+    )
+    max_tilt_deg: float = option(
+        5.0,
+        help="Largest angle between gravity in the map and in the odometry",
+        unit="deg",
+        flag="rovioli_localization_max_gravity_misalignment_deg",
+    )
+    init_position_covariance_msq: float = option(
+        20.0,
+        help="Variance of the position of T_G_M before anything is matched",
+        unit="m^2",
+        flag="rovioli_baseframe_init_position_covariance_msq",
+    )
+    init_rotation_covariance_radsq: float = option(
+        float(np.radians(90.0)),
+        help="Variance of the orientation of T_G_M before anything is matched",
+        unit="rad^2",
+        flag="rovioli_baseframe_init_rotation_covariance_radsq",
+    )
+    min_num_estimates: int = option(
+        2,
+        help="Answers in a row that must agree before T_G_M is set, or set again",
+        flag="rovioli_min_num_baseframe_estimates_before_init",
+    )
+    max_mean_error_px: float = option(
+        20.0,
+        help="Mean reprojection error at the estimated pose above which an answer disagrees",
+        unit="px",
+        flag="rovioli_max_mean_localization_reprojection_error_px",
+    )
+    keypoint_sigma_px: float = option(
+        1.0,
+        help="Standard deviation of a keypoint that observes the map",
+        unit="px",
+        flag="vil_keypoint_sigma_px",
+    )
+    tilt_sigma_deg: float = option(
+        0.5,
+        help="Standard deviation of the tilt of the map against the odometry",
+        unit="deg",
+        flag="vil_map_tilt_sigma_deg",
+    )
+    landmark_uncertainty: str = option(
+        "none",
+        choices=LANDMARK_UNCERTAINTIES,
+        help="none = landmarks of the map are exact; map = they are estimated, with the map's "
+        "covariances (mode vil)",
+        flag="vil_landmark_uncertainty",
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of its range.
+        """
+        for flag, value in (
+            ("vio_max_localization_frequency_hz", self.max_frequency_hz),
+            ("rovioli_localization_max_gravity_misalignment_deg", self.max_tilt_deg),
+            ("rovioli_baseframe_init_position_covariance_msq", self.init_position_covariance_msq),
+            (
+                "rovioli_baseframe_init_rotation_covariance_radsq",
+                self.init_rotation_covariance_radsq,
+            ),
+            ("rovioli_max_mean_localization_reprojection_error_px", self.max_mean_error_px),
+            ("vil_keypoint_sigma_px", self.keypoint_sigma_px),
+            ("vil_map_tilt_sigma_deg", self.tilt_sigma_deg),
+        ):
+            if not 0.0 < value < np.inf:
+                raise FlagError(f"--{flag}={value:g}: must be positive")
+        for flag, count, least in (
+            ("rovioli_max_num_localization_constraints", self.max_num_constraints, 0),
+            ("rovioli_min_number_of_structure_constraints", self.min_num_constraints, 1),
+            ("rovioli_min_num_baseframe_estimates_before_init", self.min_num_estimates, 1),
+        ):
+            if count < least:
+                raise FlagError(f"--{flag}={count}: wants {least} or more")
+
+    @property
+    def rule(self) -> MapRule:
+        """How the estimator weighs observations of the map."""
+        return MapRule(
+            sigma_px=self.keypoint_sigma_px,
+            tilt_sigma_rad=float(np.radians(self.tilt_sigma_deg)),
+            base_sigma_m=float(np.sqrt(self.init_position_covariance_msq)),
+            base_sigma_rad=float(np.sqrt(self.init_rotation_covariance_radsq)),
+            estimates_landmarks=self.landmark_uncertainty == "map" and self.mode == "vil",
+        )

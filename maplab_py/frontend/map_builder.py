@@ -1,0 +1,144 @@
+"""Building a map from the states of odometry, tracked keypoints and IMU samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.reports import TrackReport
+from maplab_py.algorithms.landmarks.tracks import init_tracks
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.errors import EstimationError
+from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
+from maplab_py.frontend.run_options import MapBuilderOptions
+from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
+from maplab_py.progress import SILENT, Progress
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.stacking import stack
+
+_EARLY = 0.95
+"""A frame may come this share of the interval after the last vertex (maplab's tolerance)."""
+_MIN_VERTICES = 2
+
+
+class MapBuilder:
+    """Collects vertices; `finish` makes the map. Each start of the odometry is a mission of the map."""
+
+    def __init__(
+        self,
+        device: RecordedSensors,
+        options: MapBuilderOptions | None = None,
+        *,
+        staging_parent: Path | None = None,
+    ) -> None:
+        """Start without missions.
+
+        Args:
+            device: The sensors, with an IMU.
+            options: See there.
+            staging_parent: Folder for the temporary folder of image resources; None = the
+                system's.
+
+        Raises:
+            FlagError: An option is wrong.
+            UserError: The temporary folder cannot be made.
+        """
+        self._device, self._options = device, options or MapBuilderOptions()
+        self._options.check()
+        seed = f"{device.rig_id} {device.imu_id}".encode()
+        self._images = None
+        if self._options.save_image_as_resources:
+            self._images = NewResources(staging_parent, seed=seed)
+        self._missions: list[RecordedMission] = []
+
+    @property
+    def missions(self) -> int:
+        """Number of missions, those without vertices included."""
+        return len(self._missions)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices of all missions."""
+        return sum(len(mission) for mission in self._missions)
+
+    def start_mission(self) -> None:
+        """Begin a mission: the next vertex is its root."""
+        self._missions.append(RecordedMission())
+
+    def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
+        """Add the samples (S, 6) between two frames, those at the times of both included.
+
+        Samples before the first vertex of a mission are not kept.
+        """
+        self._missions[-1].add_imu(times_ns, accel_gyro)
+
+    def is_due(self, time_ns: int) -> bool:
+        """Tell whether a frame of this time becomes a vertex."""
+        interval_ns = _EARLY * 1e9 / self._options.nframe_sync_max_output_frequency_hz
+        last_ns = self._missions[-1].last_ns
+        return last_ns is None or time_ns - last_ns >= interval_ns
+
+    def add_vertex(
+        self,
+        state: BodyStates,
+        frames: Sequence[TrackedFrame | None],
+        images: Sequence[U8 | None] = (),
+    ) -> None:
+        """Add a vertex at the time up to which samples have been added.
+
+        Args:
+            state: The state of the body then.
+            frames: Keypoints by camera; None where a camera has none. Descriptors are required.
+            images: Images by camera, kept as resources if the options say so.
+
+        Raises:
+            UserError: An image cannot be written.
+        """
+        rows = [-1] * len(frames)
+        if self._images is not None:
+            rows = [
+                -1 if image is None or frame is None else self._images.add_image(image)
+                for frame, image in zip(frames, images or [None] * len(frames), strict=True)
+            ]
+        self._missions[-1].add_vertex(state, tuple(frames), rows)
+
+    def refine(self, states: BodyStates) -> None:
+        """Replace the states of vertices of the present mission that have one of these times."""
+        self._missions[-1].refine(states)
+
+    def drop_after(self, time_ns: int) -> None:
+        """Remove the vertices of the present mission after a time: their states are doubtful."""
+        self._missions[-1].drop_after(time_ns)
+
+    def make_map(self) -> VIMap:
+        """Return the map so far, without landmarks; missions of fewer than two vertices are left out.
+
+        Raises:
+            EstimationError: No mission has two vertices.
+        """
+        parts = [
+            mission_map(self._device, mission, self._images)
+            for mission in self._missions
+            if len(mission) >= _MIN_VERTICES
+        ]
+        if not parts:
+            raise EstimationError(
+                "there is no map: the odometry has estimated fewer than two vertices"
+            )
+        result = parts[0]
+        for part in parts[1:]:
+            result = stack(result, part)
+        return result
+
+    def finish(self, *, progress: Progress = SILENT) -> tuple[VIMap, TrackReport]:
+        """Return the map with landmarks: tracks are triangulated, and their quality is evaluated.
+
+        Raises:
+            EstimationError: No mission has two vertices.
+        """
+        return init_tracks(
+            self.make_map(), LandmarkQualityOptions(), across_cameras=True, progress=progress
+        )

@@ -1,0 +1,250 @@
+"""Reading a recording frame by frame: odometry, map building, and what comes of it."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from maplab_py.array_types import F64, U8
+from maplab_py.errors import Cancelled, EstimationError, MaplabError
+from maplab_py.frontend.localization.online import OnlineLocalization
+from maplab_py.frontend.localization.opening import opened_localization
+from maplab_py.frontend.localization.record import LocalizationRecord
+from maplab_py.frontend.map_builder import MapBuilder
+from maplab_py.frontend.odometry import Odometry
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.run_options import RunOptions
+from maplab_py.frontend.run_statistics import RunStatistics
+from maplab_py.frontend.starting import MakeStarter
+from maplab_py.frontend.vertex_keypoints import described_frames
+from maplab_py.interop.recordings.protocol import Event, FrameSet, ImuBatch, Recording
+from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.progress import SILENT, Progress
+
+_HEALTH_EVERY_S = 1.0
+_STATUS_EVERY_S = 0.1
+_LONGEST_SLEEP_S = 0.1
+"""At a low playback rate, the run looks so often whether it is to end."""
+
+
+class Observer(Protocol):
+    """Sees a run while it goes on, as the viewer does."""
+
+    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Observe a frame."""
+
+
+class Mapping:
+    """A run over a recording.
+
+    Attributes:
+        odometry: The estimator.
+        builder: The map so far; None without a map.
+        localization: Where the odometry is in a map; None without a map to localise in.
+        localized: What it has said of all frames.
+        statistics: Counts and times.
+        problem: Why the run ended before the end of the recording; empty if it did not.
+        is_ended_early: The user has ended the run before the end of the recording.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        options: RunOptions | None = None,
+        *,
+        staging_parent: Path | None = None,
+        observer: Observer | None = None,
+        make_starter: MakeStarter | None = None,
+    ) -> None:
+        """Prepare a run.
+
+        Args:
+            recording: Recording with an IMU.
+            options: See there.
+            staging_parent: Folder for the temporary folder of images; None = the system's.
+            observer: Told of every frame.
+            make_starter: See `Odometry`.
+
+        Raises:
+            FlagError: An option is wrong.
+            UserError: The recording has no IMU, or a file cannot be used.
+        """
+        self.options = options or RunOptions()
+        self.options.check()
+        self._recording, self._observer = recording, observer
+        device, localization = recording.device, self.options.localization
+        self.localization = opened_localization(localization, device, self.options.odometry.window)
+        self.localized = LocalizationRecord()
+        is_tight = self.localization is not None and localization.mode == "vil"
+        self.odometry = Odometry(
+            device,
+            self.options.odometry,
+            make_starter=make_starter,
+            map_rule=localization.rule if is_tight else None,
+        )
+        self.builder: MapBuilder | None = None
+        if self.options.output.run_map_builder:
+            self.builder = MapBuilder(
+                recording.device, self.options.builder, staging_parent=staging_parent
+            )
+        self.stream = EventStream(recording, self.options.stream)
+        self.statistics = RunStatistics()
+        self.problem = ""
+        self.is_ended_early = False
+        self._states = array("d")  # time apart, rows of 16 numbers
+        self._times_ns = array("q")
+        self._mission = -1
+        self._told_s = -np.inf
+        self._next_status_s = 0.0
+
+    def run(
+        self, progress: Progress = SILENT, *, is_to_end: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Read the recording to its end, to the first error, or until the user ends it.
+
+        Args:
+            progress: Told of every frame; may cancel the run.
+            is_to_end: Tells whether the run is to end now with what it has.
+
+        Raises:
+            MaplabError: Nothing has been estimated, and the recording ended or cannot be read.
+            Cancelled: The run was cancelled, or ended before anything was estimated.
+        """
+        self.statistics = RunStatistics()
+        try:
+            for event in self.stream:
+                self._keep_pace(event, is_to_end)
+                progress.check()
+                if is_to_end():
+                    self.is_ended_early = True
+                    break
+                for update in self._pushed(event):
+                    self._take(update, progress)
+        except Cancelled:
+            raise
+        except MaplabError as error:
+            if not self._times_ns:
+                raise
+            self.problem = str(error)
+        if not self._times_ns:
+            if self.is_ended_early:
+                raise Cancelled("cancelled")
+            raise EstimationError(self._nothing())
+        if self.builder is not None:
+            self.builder.refine(self.odometry.window_states())
+
+    def trajectory(self) -> Trajectory:
+        """Return the states of all frames as they were estimated at their time, in their mission."""
+        rows = np.array(self._states).reshape(-1, 16)
+        T_M_I, v_M_I, gyro_bias, accel_bias = np.split(rows, [7, 10, 13], axis=1)
+        times_ns = np.array(self._times_ns, dtype=np.int64)
+        return Trajectory(times_ns, T_M_I, v_M_I, gyro_bias, accel_bias, self._recording.name)
+
+    def _pushed(self, event: Event) -> list[OdometryUpdate]:
+        if isinstance(event, ImuBatch):
+            return self.odometry.push_imu(event)
+        if isinstance(event, FrameSet):
+            return self.odometry.push_images(event)
+        return self.odometry.push_tracks(event)
+
+    def _take(self, update: OdometryUpdate, progress: Progress) -> None:
+        """Use the result of a frame."""
+        self.statistics.add(update)
+        if update.state is not None:
+            self._times_ns.append(update.time_ns)
+            state = update.state
+            for column in (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias):
+                self._states.extend(column[0])
+        if self.localization is not None:
+            self._localize(update, self.localization, progress)
+        if self.builder is not None:
+            begin = time.perf_counter()
+            self._build(update, self.builder)
+            self.statistics.add_stage("map", 1e3 * (time.perf_counter() - begin))
+        if update.note.startswith("started again"):
+            progress.line(f"{self.statistics.duration_s:.1f} s  {update.note}")
+        if self.options.enable_health_checking:
+            self._tell_health(update, progress)
+        self._tell_status(update, progress)
+        if self._observer is not None:
+            self._observer.after_frame(update, self)
+
+    def _localize(
+        self, update: OdometryUpdate, localization: OnlineLocalization, progress: Progress
+    ) -> None:
+        """Find the frame in the map; what goes wrong there does not stop the odometry."""
+        had_problem = localization.problem
+        frame = localization.after_frame(update, self.odometry.smoother)
+        self.localized.add(frame, update)
+        self.statistics.add_stage("localise", sum(frame.stage_ms.values()))
+        if localization.problem and not had_problem:
+            progress.line(f"not localised any more: {localization.problem}")
+
+    def _tell_status(self, update: OdometryUpdate, progress: Progress) -> None:
+        """Show the status line, not more often than it can be read."""
+        now_s = time.perf_counter()
+        if now_s >= self._next_status_s:
+            self._next_status_s = now_s + _STATUS_EVERY_S
+            progress.step(self.statistics.duration_s, 0.0, self.statistics.status_line(update))
+
+    def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
+        if update.healthy_until_ns:
+            builder.drop_after(update.healthy_until_ns)
+        if update.state is None:
+            return
+        if update.mission != self._mission:
+            builder.start_mission()
+            self._mission = update.mission
+        elif update.interval is not None:
+            builder.add_imu(update.interval.times_ns, update.interval.accel_gyro)
+        if update.released is not None:
+            builder.refine(update.released)
+        if builder.is_due(update.time_ns):
+            images: tuple[U8, ...] = update.images
+            if update.tracks is not None:
+                builder.add_vertex(update.state, update.tracks.frames)
+            else:
+                frames = described_frames(update.tracked.cameras, images, update.time_ns)
+                builder.add_vertex(update.state, frames, images)
+
+    def _tell_health(self, update: OdometryUpdate, progress: Progress) -> None:
+        """Print how sure the estimate is."""
+        now_s = self.statistics.duration_s
+        if update.state is None or update.window is None or now_s - self._told_s < _HEALTH_EVERY_S:
+            return
+        self._told_s = now_s
+        sigma: F64 = np.sqrt(np.maximum(np.diagonal(update.window.covariance), 0.0))
+        state = update.state
+        progress.line(
+            f"{now_s:.1f} s  speed {np.linalg.norm(state.v_M_I):.2f} +- {sigma[6:9].max():.3f} m/s  "
+            f"tilt +- {np.degrees(sigma[3:5].max()):.2f} deg  "
+            f"gyro bias {np.linalg.norm(state.gyro_bias):.4f} rad/s  "
+            f"accel bias {np.linalg.norm(state.accel_bias):.3f} m/s^2  "
+            f"error {update.window.median_error_px:.2f} px  {update.motion.value}"
+        )
+
+    def _keep_pace(self, event: Event, is_to_end: Callable[[], bool]) -> None:
+        """Wait until an event may be read at the chosen rate, or the run is to end."""
+        rate = self.options.realtime_playback_rate
+        if not rate or isinstance(event, ImuBatch) or not self.statistics.frames:
+            return
+        due_s = (event.time_ns - self.statistics.first_ns) * 1e-9 / rate
+        due_s += self.statistics.began_s
+        while (left_s := due_s - time.perf_counter()) > 0.0 and not is_to_end():
+            time.sleep(min(left_s, _LONGEST_SLEEP_S))
+
+    def _nothing(self) -> str:
+        """Say why nothing was estimated."""
+        name = self._recording.name
+        if not self.statistics.frames:
+            if self.stream.statistics.dropped_before_imu:
+                return f"{name}: all frames come before the first IMU sample: check the clocks"
+            return f"{name}: there are no frames: choose another part or other cameras"
+        reason = self.statistics.waiting_for or "the recording is too short"
+        return f"{name}: the odometry has not started: {reason}"

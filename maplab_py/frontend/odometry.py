@@ -1,0 +1,369 @@
+"""Visual-inertial odometry: IMU samples and images in, states out."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import time
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.errors import EstimationError, MapError, UserError
+from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.window.localized import LocalizedSmoother
+from maplab_py.estimation.window.map_rule import MapRule
+from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.estimation.window.update import WindowUpdate
+from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.gyroscope import turn
+from maplab_py.frontend.health import HealthMonitor
+from maplab_py.frontend.imu_buffer import ImuBuffer, ImuInterval
+from maplab_py.frontend.initialization.initializer import Initializer
+from maplab_py.frontend.motion import MotionDetector
+from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate, WindowSummary
+from maplab_py.frontend.starting import MakeStarter, Starter
+from maplab_py.geometry import so3
+from maplab_py.interop.recordings.protocol import (
+    FrameSet,
+    ImuBatch,
+    RecordedSensors,
+    TrackedFrameSet,
+)
+from maplab_py.vision.tracking.replay import tracked_images_of
+from maplab_py.vision.tracking.tracker import FrameTracker
+from maplab_py.vision.tracking.tracks import TrackedImages
+
+_MAX_WAITING = 200
+"""Frames that may wait for IMU samples."""
+
+
+@dataclasses.dataclass(eq=False)
+class OdometryCounts:
+    """What the odometry has counted."""
+
+    frames: int = 0
+    frames_before_imu: int = 0
+    saturated_samples: int = 0
+    imu_gaps: int = 0  # that made it start again
+    starts: int = 0
+
+
+class Odometry:
+    """Estimates pose, velocity and biases of a rig of cameras with an IMU.
+
+    Samples and frames are pushed in the order of time. A frame is processed as soon as there is a
+    sample at its time or later; so any push may return updates.
+
+    When the estimate diverges or samples are missing for too long, the estimator starts again with
+    a new mission frame M; updates say so.
+    """
+
+    def __init__(
+        self,
+        device: RecordedSensors,
+        options: OdometryOptions | None = None,
+        *,
+        make_starter: MakeStarter | None = None,
+        map_rule: MapRule | None = None,
+    ) -> None:
+        """Prepare for the sensors of a device.
+
+        Args:
+            device: The sensors, with an IMU.
+            options: See there.
+            make_starter: Makes what finds the first state, for drivers that know it from elsewhere;
+                None = the state is found from images and samples.
+            map_rule: How observations of a map are weighed when the smoother is given some; None =
+                it cannot be localised.
+
+        Raises:
+            FlagError: An option is wrong.
+            UserError: The device has no IMU, or a mask cannot be used.
+        """
+        if device.imu is None:
+            raise UserError(
+                "odometry needs an IMU, and the calibration has none: give "
+                "--sensor_calibration_file=FILE with an IMU"
+            )
+        self.options = options or OdometryOptions()
+        self.options.check()
+        self.counts = OdometryCounts()
+        self._device, self._imu = device, device.imu
+        self._make_starter = make_starter or self._initializer
+        self._map_rule = map_rule
+        self._tracker = FrameTracker(device.cameras, device.T_I_C, self.options.tracking)
+        self._buffer = ImuBuffer()
+        self._waiting: collections.deque[FrameSet | TrackedFrameSet] = collections.deque()
+        self._newest_ns = -1  # time of the newest frame that was pushed
+        self._last_ns: int | None = None  # time of the last frame that was processed
+        self._gap_end_ns = -1  # time of the last frame if its samples have a gap
+        self._replayed: TrackedImages | None = None  # tracks of the last frame of a replay
+        self._detector = MotionDetector(self.options.rest)
+        self._smoother: FixedLagSmoother | None = None
+        self._starter: Starter = self._make_starter(device)
+        self._gyro_bias: F64 = np.zeros(3)
+        self._start_again()
+
+    def _initializer(self, device: RecordedSensors) -> Starter:
+        return Initializer(device, self.options.initialization)
+
+    # -- what a driver pushes ---------------------------------------------------------------------
+
+    def push_imu(self, batch: ImuBatch) -> list[OdometryUpdate]:
+        """Take IMU samples; return the updates of frames that have waited for them.
+
+        Raises:
+            MapError: Times do not increase, a value is not a number, or an image cannot be read.
+        """
+        self._buffer.push(batch)
+        self.counts.saturated_samples += int(batch.is_saturated.sum())
+        return self._process_waiting()
+
+    def push_images(self, frame_set: FrameSet) -> list[OdometryUpdate]:
+        """Take the images of a frame set; return updates, mostly its own.
+
+        Raises:
+            MapError: Times do not increase, there are no IMU samples, or an image cannot be read.
+        """
+        return self._push(frame_set)
+
+    def push_tracks(self, frame_set: TrackedFrameSet) -> list[OdometryUpdate]:
+        """Take tracked keypoints in place of images; see `push_images`."""
+        return self._push(frame_set)
+
+    @property
+    def smoother(self) -> FixedLagSmoother | None:
+        """The estimator of the window; None while the odometry initialises."""
+        return self._smoother
+
+    def landmarks(self) -> tuple[I64, F64]:
+        """Return track ids (L,) and places (L, 3) in M of the landmarks in the window."""
+        if self._smoother is None:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        return self._smoother.landmarks()
+
+    def window_states(self) -> BodyStates:
+        """Return the present estimates of the frames in the window."""
+        smoother = self._smoother
+        if smoother is None:
+            return BodyStates.none()
+        states = smoother.states
+        return BodyStates(
+            smoother.times_ns,
+            states.T_M_I,
+            states.motion[:, :3],
+            states.gyro_bias,
+            states.accel_bias,
+        )
+
+    # -- frames -----------------------------------------------------------------------------------
+
+    def _push(self, frame_set: FrameSet | TrackedFrameSet) -> list[OdometryUpdate]:
+        if frame_set.time_ns <= self._newest_ns:
+            raise MapError(
+                f"the frame at {frame_set.time_ns} ns does not come after the frame at "
+                f"{self._newest_ns} ns: send frames in the order of their stamps, each once"
+            )
+        self._newest_ns = frame_set.time_ns
+        self._waiting.append(frame_set)
+        updates = self._process_waiting()
+        if len(self._waiting) > _MAX_WAITING:
+            raise MapError(
+                f"there are {len(self._waiting)} frames after the last IMU sample: check that the "
+                "IMU is recorded, and that the clocks of cameras and IMU agree"
+            )
+        return updates
+
+    def _process_waiting(self) -> list[OdometryUpdate]:
+        updates = []
+        while self._waiting and self._buffer.covers(self._waiting[0].time_ns):
+            frame_set = self._waiting.popleft()
+            first_ns = self._buffer.first_ns
+            if first_ns is not None and frame_set.time_ns < first_ns:
+                self.counts.frames_before_imu += 1
+                continue
+            updates.append(self._process(frame_set))
+        return updates
+
+    def _process(self, frame_set: FrameSet | TrackedFrameSet) -> OdometryUpdate:
+        note = ""
+        interval = None
+        if self._last_ns is None:
+            self._buffer.forget_before(frame_set.time_ns)
+        else:
+            interval = self._buffer.cut(self._last_ns, frame_set.time_ns)
+            if interval.largest_step_ns > self.options.max_imu_gap_s * 1e9:
+                note = self._in_gap(interval)
+                interval = None
+            else:
+                self._gap_end_ns = -1
+        self.counts.frames += 1
+        self._last_ns = frame_set.time_ns
+        tracked, images = self._tracked(frame_set, interval)
+        motion = Motion.MOVING
+        if interval is not None:
+            motion = self._detector.classify(
+                interval,
+                tracked.disparity_px,
+                turn_rad=self._turn_rad(interval),
+                is_turn_only=tracked.is_turn_only,
+                speed_mps=self._speed_mps,
+            )
+        update = OdometryUpdate(
+            time_ns=frame_set.time_ns,
+            status=OdometryStatus.INITIALISING,
+            mission=self.counts.starts - 1,
+            tracked=tracked,
+            motion=motion,
+            interval=interval,
+            stage_ms=dict(tracked.stage_ms),
+            note=note,
+            images=images,
+            tracks=frame_set if isinstance(frame_set, TrackedFrameSet) else None,
+        )
+        if self._gap_end_ns >= 0:
+            return update
+        if self._smoother is None:
+            return self._initialised(update)
+        return self._smoothed(update, self._smoother)
+
+    def _in_gap(self, interval: ImuInterval) -> str:
+        """Start again at a frame inside or after a gap of the IMU; return a note at the first of them."""
+        is_first = self._gap_end_ns < 0
+        self._gap_end_ns = int(interval.times_ns[-1])
+        note = self._start_again(f"no IMU samples for {interval.largest_step_ns * 1e-9:.2f} s")
+        self.counts.imu_gaps += is_first
+        return note if is_first else "waiting for the end of the gap between IMU samples"
+
+    def _tracked(
+        self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None
+    ) -> tuple[TrackedImages, tuple[U8, ...]]:
+        """Return the tracks of a frame set, and its images if it has some."""
+        R_I0_I1 = None if interval is None else turn(self._imu, interval, self._gyro_bias)
+        if isinstance(frame_set, TrackedFrameSet):
+            self._replayed = tracked_images_of(
+                frame_set,
+                self._replayed,
+                self._device.cameras,
+                self._device.T_I_C,
+                R_I0_I1,
+                self.options.tracking,
+            )
+            return self._replayed, ()
+        begin = time.perf_counter()
+        images = tuple(image.grey() for image in frame_set.images)
+        read_ms = 1e3 * (time.perf_counter() - begin)
+        tracked = self._tracker.track(frame_set.time_ns, images, R_I0_I1)
+        return dataclasses.replace(tracked, stage_ms={"read": read_ms, **tracked.stage_ms}), images
+
+    def _turn_rad(self, interval: ImuInterval) -> float:
+        """Return the angle of a turn, 0 while the gyroscope's bias is not known."""
+        if self._smoother is None:
+            return 0.0
+        R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
+        return float(np.linalg.norm(so3.log(so3.from_matrix(R_I0_I1))))
+
+    def _initialised(self, update: OdometryUpdate) -> OdometryUpdate:
+        """Offer the frame to the initialisation; start the smoother when it succeeds."""
+        begin = time.perf_counter()
+        frame = _window_frame(update)
+        start = self._starter.push(frame)
+        update.stage_ms["initialise"] = 1e3 * (time.perf_counter() - begin)
+        if start is None:
+            return dataclasses.replace(update, note=update.note or self._starter.reason)
+        self._smoother = self._new_smoother()
+        self._smoother.start(frame, start)
+        self._health = HealthMonitor(self.options.health)
+        self.counts.starts += 1
+        state = BodyStates.single(
+            update.time_ns, start.T_M_I, start.v_M, start.gyro_bias, start.accel_bias
+        )
+        self._gyro_bias, self._speed_mps = start.gyro_bias, float(np.linalg.norm(start.v_M))
+        return dataclasses.replace(
+            update,
+            status=OdometryStatus.TRACKING,
+            mission=self.counts.starts - 1,
+            interval=None,
+            state=state,
+        )
+
+    def _new_smoother(self) -> FixedLagSmoother:
+        device, window = self._device, self.options.window
+        if self._map_rule is None:
+            return FixedLagSmoother(device.cameras, device.T_I_C, self._imu, window)
+        return LocalizedSmoother(device.cameras, device.T_I_C, self._imu, window, self._map_rule)
+
+    def _smoothed(self, update: OdometryUpdate, smoother: FixedLagSmoother) -> OdometryUpdate:
+        """Add the frame to the window; start again if the estimate diverges."""
+        begin = time.perf_counter()
+        try:
+            result = smoother.add(_window_frame(update))
+            state = BodyStates.single(
+                result.time_ns, result.T_M_I, result.v_M, result.gyro_bias, result.accel_bias
+            )
+            tracked = sum(int((c.num_frames > 1).sum()) for c in update.tracked.cameras)
+            problem = self._health.problem(state, result.covariance, tracked)
+        except EstimationError as error:
+            problem = str(error)
+        update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
+        if problem:
+            healthy_until_ns = self._health.healthy_until_ns
+            note = self._start_again(problem)
+            return dataclasses.replace(
+                update, interval=None, note=note, healthy_until_ns=healthy_until_ns
+            )
+        self._gyro_bias = result.gyro_bias
+        self._speed_mps = float(np.linalg.norm(result.v_M))
+        return dataclasses.replace(
+            update,
+            status=OdometryStatus.TRACKING,
+            state=state,
+            released=_released(result),
+            window=_summary(result),
+        )
+
+    def _start_again(self, reason: str = "") -> str:
+        """Forget all estimates and tracks; return the reason as a note."""
+        self._smoother = None
+        self._health = HealthMonitor(self.options.health)
+        self._starter = self._make_starter(self._device)
+        self._gyro_bias = np.zeros(3)
+        self._speed_mps = 0.0
+        self._tracker.reset()
+        self._replayed = None
+        self._detector.reset()
+        return f"started again: {reason}" if reason else ""
+
+
+def _window_frame(update: OdometryUpdate) -> WindowFrame:
+    """Return a frame as the smoother takes it."""
+    cameras = update.tracked.cameras
+    none = ImuInterval(np.array([update.time_ns] * 2), np.zeros((2, 6)), 0, 0)
+    interval = update.interval or none
+    return WindowFrame(
+        time_ns=update.time_ns,
+        imu_times_ns=interval.times_ns,
+        accel_gyro=interval.accel_gyro,
+        camera=np.repeat(np.arange(len(cameras), dtype=np.int32), [len(c) for c in cameras]),
+        track_id=np.concatenate([c.track_id for c in cameras]),
+        uv_px=np.concatenate([c.uv_px for c in cameras]),
+        sigma_px=np.concatenate([c.sigma_px for c in cameras]),
+        motion=update.motion,
+    )
+
+
+def _released(result: WindowUpdate) -> BodyStates:
+    states = result.released
+    return BodyStates(states.time_ns, states.T_M_I, states.v_M, states.gyro_bias, states.accel_bias)
+
+
+def _summary(result: WindowUpdate) -> WindowSummary:
+    return WindowSummary(
+        covariance=result.covariance,
+        is_keyframe=result.is_keyframe,
+        landmarks=result.num_landmarks,
+        observations=result.num_observations,
+        median_error_px=result.median_error_px,
+    )

@@ -1,0 +1,56 @@
+"""What odometry says after each frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from enum import Enum
+
+from maplab_py.array_types import F64, U8
+from maplab_py.estimation.window.frame import Motion
+from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.imu_buffer import ImuInterval
+from maplab_py.interop.recordings.protocol import TrackedFrameSet
+from maplab_py.vision.tracking.tracks import TrackedImages
+
+
+class OdometryStatus(Enum):
+    """State of the estimator."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowSummary:
+    """What the smoother says about its window."""
+
+    covariance: F64  # (15, 15) of the newest state, order [p, theta, v, b_g, b_a]
+    is_keyframe: bool
+    landmarks: int
+    observations: int
+    median_error_px: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OdometryUpdate:
+    """The result of one frame set."""
+
+    time_ns: int
+    status: OdometryStatus
+    mission: int  # counts starts of the estimator from 0; -1 before the first
+    tracked: TrackedImages
+    motion: Motion
+    interval: ImuInterval | None  # samples since the frame before; None after a start or an IMU gap
+    stage_ms: dict[str, float]  # elapsed time of each stage
+    state: BodyStates | None = None  # of this frame; None while the estimator initialises
+    released: BodyStates | None = None  # final estimates of frames that have left the window
+    window: WindowSummary | None = None
+    note: str = ""  # why the estimator waits, or why it was started again
+    healthy_until_ns: int = 0  # states after this time are doubtful; 0 = none is
+    images: tuple[U8, ...] = ()  # grey, by camera; empty for tracks of a replay
+    tracks: TrackedFrameSet | None = None  # of a replay
+
+    @property
+    def total_ms(self) -> float:
+        """Elapsed time of all stages."""
+        return sum(self.stage_ms.values())

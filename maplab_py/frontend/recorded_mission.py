@@ -1,0 +1,226 @@
+"""One mission while it is recorded, and as tables of a map."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.frontend.body_states import BodyStates
+from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import DescriptorBlock
+from maplab_py.vimap.ids import from_hex, random_ids
+from maplab_py.vimap.table import object_column
+from maplab_py.vimap.tables import (
+    BaseFrames,
+    FrameField,
+    Frames,
+    ImuEdges,
+    ImuSamples,
+    Keypoints,
+    Missions,
+    MissionSensor,
+    Vertices,
+)
+
+Frame = TrackedFrame | None
+
+_PRESENT = FrameField.SIGMA | FrameField.SCALE | FrameField.TRACK_ID
+"""Optional fields of keypoints that frames have; `LANDMARK_ID` follows with the landmarks."""
+
+
+class RecordedMission:
+    """Vertices of a mission with the IMU samples between them."""
+
+    def __init__(self) -> None:
+        """Start without vertices."""
+        self.states: list[BodyStates] = []
+        self.frames: list[tuple[Frame, ...]] = []
+        self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none
+        self.edges: list[tuple[I64, F64]] = []  # times and samples between vertices
+        self._samples: list[tuple[I64, F64]] = []  # since the last vertex
+        self._row_of_time: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @property
+    def last_ns(self) -> int | None:
+        """Time of the last vertex, None if there is none."""
+        return int(self.states[-1].times_ns[0]) if self.states else None
+
+    def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
+        """Add samples; the first repeats the last sample that was added."""
+        if self.states:
+            self._samples.append((times_ns, accel_gyro))
+
+    def add_vertex(
+        self, state: BodyStates, frames: tuple[Frame, ...], image_rows: Sequence[int]
+    ) -> None:
+        """Add a vertex; see `MapBuilder.add_vertex`.
+
+        Raises:
+            ValueError: The samples do not reach from the last vertex to this one.
+        """
+        if self.states:
+            times_ns, accel_gyro = _joined(self._samples)
+            ends = (self.last_ns, int(state.times_ns[0]))
+            if len(times_ns) < 2 or (int(times_ns[0]), int(times_ns[-1])) != ends:
+                raise ValueError(f"IMU samples do not reach from {ends[0]} to {ends[1]} ns")
+            self.edges.append((times_ns, accel_gyro))
+            self._samples = []
+        self._row_of_time[int(state.times_ns[0])] = len(self.states)
+        self.states.append(state)
+        self.frames.append(frames)
+        self.image_rows.append(image_rows)
+
+    def drop_after(self, time_ns: int) -> None:
+        """Remove vertices after a time, with the samples that lead to them."""
+        kept = sum(int(state.times_ns[0]) <= time_ns for state in self.states)
+        for column in (self.states, self.frames, self.image_rows):
+            del column[kept:]
+        del self.edges[max(kept - 1, 0) :]
+        self._samples = []
+        self._row_of_time = {t: row for t, row in self._row_of_time.items() if row < kept}
+
+    def refine(self, states: BodyStates) -> None:
+        """Replace the states of vertices that have one of these times."""
+        for index, time_ns in enumerate(states.times_ns.tolist()):
+            row = self._row_of_time.get(time_ns)
+            if row is not None:
+                self.states[row] = BodyStates.single(
+                    time_ns,
+                    states.T_M_I[index],
+                    states.v_M_I[index],
+                    states.gyro_bias[index],
+                    states.accel_bias[index],
+                )
+
+
+def _joined(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
+    """Join pieces whose first sample repeats the last of the piece before."""
+    first = [slice(None), *([slice(1, None)] * (len(parts) - 1))]
+    if not parts:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+    times = [part[0][rows] for part, rows in zip(parts, first, strict=True)]
+    samples = [part[1][rows] for part, rows in zip(parts, first, strict=True)]
+    return np.concatenate(times), np.concatenate(samples)
+
+
+def mission_map(
+    device: RecordedSensors, mission: RecordedMission, images: NewResources | None
+) -> VIMap:
+    """Return a map of one mission with at least two vertices; keypoints have no landmarks.
+
+    Ids follow from the sensors and the time of the first vertex: equal input gives equal maps.
+    """
+    states = BodyStates.concatenate(mission.states)
+    rng = np.random.default_rng(_id_seed(device, int(states.times_ns[0])))
+    count = len(states)
+    sensor_id = np.zeros((1, len(MissionSensor), 2), dtype=np.uint64)
+    sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
+    sensor_id[0, MissionSensor.NCAMERA] = from_hex(device.rig_id)
+    edges, samples = _imu_tables(mission, rng)
+    frames = _frame_table(mission, rng)
+    vi_map = VIMap(
+        sensors=device.sensors,
+        missions=Missions.filled(
+            1, id=random_ids(1, rng), baseframe=[0], root_vertex=[0], sensor_id=sensor_id
+        ),
+        baseframes=BaseFrames.filled(1, id=random_ids(1, rng)),
+        vertices=Vertices.filled(
+            count,
+            id=random_ids(count, rng),
+            mission=np.zeros(count, dtype=np.int32),
+            T_M_I=states.T_M_I,
+            v_M=states.v_M_I,
+            accel_bias=states.accel_bias,
+            gyro_bias=states.gyro_bias,
+            timestamp_ns=states.times_ns,
+            nframe_id=random_ids(count, rng),
+        ),
+        frames=frames,
+        keypoints=_keypoint_table(mission),
+        imu_edges=edges,
+        imu_samples=samples,
+    )
+    rows = np.array(mission.image_rows, dtype=np.int64).reshape(-1)
+    if images is None or not np.any(rows >= 0):
+        return vi_map
+    return images.attached(vi_map, rows[rows >= 0], np.flatnonzero(rows >= 0))
+
+
+def _id_seed(device: RecordedSensors, start_ns: int) -> int:
+    text = f"{device.rig_id} {device.imu_id} {start_ns}"
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
+
+
+def _imu_tables(mission: RecordedMission, rng: np.random.Generator) -> tuple[ImuEdges, ImuSamples]:
+    count = len(mission.edges)
+    table = ImuEdges.filled(
+        count,
+        id=random_ids(count, rng),
+        from_vertex=np.arange(count),
+        to_vertex=np.arange(1, count + 1),
+        sample_count=np.array([len(times) for times, _ in mission.edges], dtype=np.int32),
+    )
+    times = np.concatenate([times for times, _ in mission.edges])
+    samples = np.concatenate([accel_gyro for _, accel_gyro in mission.edges])
+    return table, ImuSamples.filled(len(times), timestamp_ns=times, accel_gyro=samples)
+
+
+def _frame_table(mission: RecordedMission, rng: np.random.Generator) -> Frames:
+    """Return a row for each camera of each vertex; frames that are missing have no id."""
+    cameras = len(mission.frames[0])
+    frames = [frame for of_vertex in mission.frames for frame in of_vertex]
+    count = len(frames)
+    is_there = np.array([frame is not None for frame in frames])
+    ids = random_ids(count, rng)
+    ids[~is_there] = 0
+    times_ns = np.repeat([int(state.times_ns[0]) for state in mission.states], cameras)
+    return Frames.filled(
+        count,
+        id=ids,
+        vertex=np.repeat(np.arange(len(mission)), cameras),
+        camera_index=np.tile(np.arange(cameras), len(mission)),
+        timestamp_ns=times_ns,
+        is_valid=is_there,
+        keypoint_count=np.array([0 if f is None else len(f.uv_px) for f in frames]),
+        present=np.where(is_there, int(_PRESENT), 0),
+        descriptor_blocks=object_column([_blocks(frame) for frame in frames]),
+    )
+
+
+def _blocks(frame: Frame) -> tuple[DescriptorBlock, ...] | None:
+    """Return the runs of keypoints with descriptors of equal size, None without keypoints."""
+    if frame is None or not len(frame.descriptor_size):
+        return None
+    size = frame.descriptor_size
+    first = np.concatenate([[0], np.flatnonzero(np.diff(size)) + 1])
+    counts = np.diff(np.append(first, len(size)))
+    return tuple(
+        DescriptorBlock(count, width)
+        for count, width in zip(counts.tolist(), size[first].tolist(), strict=True)
+    )
+
+
+def _keypoint_table(mission: RecordedMission) -> Keypoints:
+    frames = [frame for of_vertex in mission.frames for frame in of_vertex if frame is not None]
+    width = max((frame.descriptor.shape[1] for frame in frames), default=0)
+    count = sum(len(frame.uv_px) for frame in frames)
+    descriptor: U8 = np.zeros((count, width), dtype=np.uint8)
+    row = 0
+    for frame in frames:
+        end = row + len(frame.uv_px)
+        descriptor[row:end, : frame.descriptor.shape[1]] = frame.descriptor
+        row = end
+    columns = {
+        name: np.concatenate([getattr(frame, name) for frame in frames] or [np.zeros(0)])
+        for name in ("sigma_px", "scale", "track_id")
+    }
+    uv_px = np.concatenate([frame.uv_px for frame in frames] or [np.zeros((0, 2))])
+    return Keypoints.filled(count, uv_px=uv_px, descriptor=descriptor, **columns)

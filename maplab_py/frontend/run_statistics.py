@@ -1,0 +1,119 @@
+"""What a run over a recording has counted and timed."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from array import array
+
+import numpy as np
+
+from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.reports import EstimatorStart, StageTime
+
+_GROUPS = {
+    "read": "read",
+    "prepare": "tracking",
+    "flow": "tracking",
+    "outliers": "tracking",
+    "stereo": "tracking",
+    "detect": "tracking",
+    "tracks": "tracking",
+    "initialise": "initialise",
+    "window": "window",
+    "localise": "localise",
+    "map": "map",
+}
+"""Stages of the report by the parts that they consist of."""
+_STAGES = tuple(dict.fromkeys(_GROUPS.values()))
+_RECENT = 20
+"""Frames over which the status line takes medians."""
+
+
+@dataclasses.dataclass(eq=False)
+class RunStatistics:
+    """Counts and times of the frames of a run."""
+
+    frames: int = 0
+    estimated_frames: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    distance_m: float = 0.0
+    starts: list[EstimatorStart] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    stage_ms: array[float] = dataclasses.field(default_factory=lambda: array("f"))  # frame by frame
+    began_s: float = dataclasses.field(default_factory=time.perf_counter)
+    waiting_for: str = ""  # why the estimator does not start
+    _reason: str = "beginning of the recording"
+    _lost_ns: int = 0
+    _last_p: tuple[int, np.ndarray] | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last frame."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+    def add(self, update: OdometryUpdate) -> None:
+        """Count one frame."""
+        if not self.frames:
+            self.first_ns = self._lost_ns = update.time_ns
+        self.frames, self.last_ns = self.frames + 1, update.time_ns
+        spent_ms = dict.fromkeys(_STAGES, 0.0)
+        for part, spent in update.stage_ms.items():
+            spent_ms[_GROUPS[part]] += spent
+        self.stage_ms.extend(spent_ms.values())
+        if update.note.startswith("started again: "):
+            self._reason, self._lost_ns = (
+                update.note.removeprefix("started again: "),
+                update.time_ns,
+            )
+            self.notes.append(f"at {self._after_first(update.time_ns):.2f} s {update.note}")
+        self.waiting_for = "" if update.state is not None else update.note
+        if update.state is None:
+            return
+        self.estimated_frames += 1
+        if update.mission == len(self.starts):
+            waited_s = (update.time_ns - self._lost_ns) * 1e-9
+            start = EstimatorStart(self._after_first(update.time_ns), waited_s, self._reason)
+            self.starts.append(start)
+        p = update.state.T_M_I[0, 4:]
+        if self._last_p is not None and self._last_p[0] == update.mission:
+            self.distance_m += float(np.linalg.norm(p - self._last_p[1]))
+        self._last_p = update.mission, p
+
+    def add_stage(self, stage: str, spent_ms: float) -> None:
+        """Count the time of a stage that follows the odometry."""
+        self.stage_ms[_STAGES.index(stage) - len(_STAGES)] += spent_ms
+
+    def status_line(self, update: OdometryUpdate) -> str:
+        """Return time, tracks, landmarks and time per stage in one line."""
+        tracks = sum(len(camera) for camera in update.tracked.cameras)
+        parts = [f"{self.duration_s:.1f} s", f"{tracks} tracks"]
+        if update.status is OdometryStatus.INITIALISING:
+            parts.append(f"not started: {update.note}" if update.note else "not started")
+        elif update.window is not None:
+            parts.append(f"{update.window.landmarks} landmarks")
+        times = {stage.stage: stage.median_ms for stage in self.stages(_RECENT)}
+        total = times.pop("all stages", 0.0)
+        listed = ", ".join(f"{stage} {spent:.0f}" for stage, spent in times.items())
+        return "  ".join([*parts, f"{total:.0f} ms ({listed})"])
+
+    def stages(self, last: int = 0) -> tuple[StageTime, ...]:
+        """Return median and 99th percentile of each stage over the last frames; 0 = over all."""
+        table = np.asarray(self.stage_ms, dtype=np.float64).reshape(-1, len(_STAGES))[-last:]
+        if not len(table):
+            return ()
+        used = [name for name, column in zip(_STAGES, table.T, strict=True) if column.any()]
+        columns = {name: table[:, _STAGES.index(name)] for name in used}
+        columns["all stages"] = table.sum(axis=1)
+        return tuple(
+            StageTime(name, float(np.median(values)), float(np.percentile(values, 99)))
+            for name, values in columns.items()
+        )
+
+    def real_time_factor(self) -> float:
+        """Return the duration of the recording per elapsed time."""
+        return self.duration_s / max(time.perf_counter() - self.began_s, 1e-9)
+
+    def _after_first(self, time_ns: int) -> float:
+        return (time_ns - self.first_ns) * 1e-9

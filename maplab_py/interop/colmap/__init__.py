@@ -1,0 +1,1 @@
+"""COLMAP models: reading, writing, and maps made of them."""

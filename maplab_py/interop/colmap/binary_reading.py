@@ -1,0 +1,224 @@
+"""Read a model in COLMAP's binary format; every count is checked against the bytes that are there.
+
+COLMAP's own reader does not look at the end of a file: it takes what memory holds for the missing part, or
+never returns.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import MapError
+from maplab_py.geometry import so3
+from maplab_py.input_files import read_bytes
+from maplab_py.interop.colmap.binary_writing import KEYPOINT, POINT
+from maplab_py.interop.colmap.camera_models import MODELS
+from maplab_py.interop.colmap.model import (
+    ColmapCamera,
+    ColmapFrames,
+    ColmapImages,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    Sensor,
+    SensorType,
+)
+from maplab_py.interop.colmap.point_scan_kernel import record_starts
+
+_MAX_BYTES = 20_000_000_000
+_MAX_NAME_BYTES = 4096
+_FROM_FILE = [1, 2, 3, 0, 4, 5, 6]
+_UNIT_TOLERANCE = 1e-3
+REMEDY = "copy or write the model again"
+
+
+class _Cursor:
+    """Reads a file from its beginning to its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.data = read_bytes(path, _MAX_BYTES, remedy="split the model", error=MapError)
+        except OSError as error:
+            raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
+        self.place = 0
+
+    def take(self, size: int) -> bytes:
+        if size < 0 or size > len(self.data) - self.place:
+            raise self.damaged("it ends too early")
+        self.place += size
+        return self.data[self.place - size : self.place]
+
+    def numbers(self, layout: str) -> tuple[int, ...]:
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def count(self, least_bytes: int) -> int:
+        """Return a count of records of at least some bytes, 8 bytes wide."""
+        (count,) = self.numbers("Q")
+        if count * least_bytes > len(self.data) - self.place:
+            raise self.damaged("it ends too early")
+        return count
+
+    def doubles(self, count: int) -> F64:
+        values = np.frombuffer(self.take(8 * count), dtype="<f8").astype(np.float64)
+        if not np.all(np.isfinite(values)):
+            raise self.damaged("it has numbers that are not finite")
+        return values
+
+    def pose(self) -> F64:
+        values = self.doubles(7)[_FROM_FILE]
+        if abs(float(np.linalg.norm(values[:4])) - 1.0) > _UNIT_TOLERANCE:
+            raise self.damaged("it has a quaternion that is not of unit length")
+        return np.concatenate([so3.normalize(values[:4]), values[4:]])
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.place, self.place + _MAX_NAME_BYTES)
+        if end < 0:
+            is_cut = len(self.data) - self.place <= _MAX_NAME_BYTES
+            raise self.damaged("it ends too early" if is_cut else "an image name does not end")
+        name = self.take(end + 1 - self.place)[:-1]
+        try:
+            return name.decode()
+        except UnicodeDecodeError:
+            raise self.damaged("an image name is not text") from None
+
+    def finish(self) -> None:
+        if self.place != len(self.data):
+            raise self.damaged(f"{len(self.data) - self.place} bytes follow its last record")
+
+    def damaged(self, reason: str) -> MapError:
+        return MapError(f"{self.path}: is damaged: {reason}; {REMEDY}")
+
+
+def read_binary(folder: Path) -> ColmapModel:
+    """Read the binary files of a model; references between the files are checked by the caller.
+
+    Models of versions without rigs and frames get a rig of each camera, and a frame of each image.
+
+    Raises:
+        MapError: A file is missing, damaged, or cut.
+    """
+    cameras = _cameras(_Cursor(folder / "cameras.bin"))
+    images = _images(_Cursor(folder / "images.bin"))
+    points = _points(_Cursor(folder / "points3D.bin"))
+    if (folder / "rigs.bin").exists() or (folder / "frames.bin").exists():
+        rigs = _rigs(_Cursor(folder / "rigs.bin"))
+        frames = _frames(_Cursor(folder / "frames.bin"))
+        return ColmapModel(cameras, rigs, frames, images, points)
+    used = np.unique(images.camera).tolist()
+    identity = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    rigs = tuple(ColmapRig(number, ((SensorType.CAMERA, number),), identity) for number in used)
+    rows = np.arange(len(images.id))
+    frames = ColmapFrames(images.id, images.camera, images.T_C_W, rows, images.id)
+    return ColmapModel(cameras, rigs, frames, images, points)
+
+
+def _cameras(file: _Cursor) -> tuple[ColmapCamera, ...]:
+    cameras = []
+    for _ in range(file.count(24)):
+        number, model, width, height = file.numbers("IiQQ")
+        if model not in MODELS:
+            raise file.damaged(f"camera {number} has the unknown camera model {model}")
+        parameters = file.doubles(MODELS[model].parameters)
+        if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
+            raise file.damaged(f"the images of camera {number} have no pixels")
+        cameras.append(ColmapCamera(number, model, width, height, parameters))
+    file.finish()
+    return tuple(cameras)
+
+
+def _rigs(file: _Cursor) -> tuple[ColmapRig, ...]:
+    rigs = []
+    for _ in range(file.count(8)):
+        number, count = file.numbers("II")
+        sensors: list[Sensor] = []
+        poses: list[F64] = []
+        for row in range(count):
+            kind, sensor = file.numbers("iI")
+            pose = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+            if row:
+                pose = file.pose() if file.take(1) != b"\0" else np.full(7, np.nan)
+            sensors.append((kind, sensor))
+            poses.append(pose)
+        rigs.append(ColmapRig(number, tuple(sensors), np.array(poses).reshape(-1, 7)))
+    file.finish()
+    return tuple(rigs)
+
+
+def _frames(file: _Cursor) -> ColmapFrames:
+    count = file.count(68)
+    ids, rigs, poses = [], [], []
+    owners: list[int] = []
+    images: list[int] = []
+    for row in range(count):
+        number, rig = file.numbers("II")
+        ids.append(number)
+        rigs.append(rig)
+        poses.append(file.pose())
+        for _ in range(file.numbers("I")[0]):
+            kind, _, data = file.numbers("iIQ")
+            if kind == SensorType.CAMERA:
+                owners.append(row)
+                images.append(data)
+    file.finish()
+    return ColmapFrames(
+        _integers(ids), _integers(rigs), _rows(poses, 7), _integers(owners), _integers(images)
+    )
+
+
+def _images(file: _Cursor) -> ColmapImages:
+    ids, cameras, poses, names, counts = [], [], [], [], []
+    keypoints = [np.zeros(0, dtype=KEYPOINT)]
+    for _ in range(file.count(69)):
+        ids.append(file.numbers("I")[0])
+        poses.append(file.pose())
+        cameras.append(file.numbers("I")[0])
+        names.append(file.text())
+        counts.append(file.count(KEYPOINT.itemsize))
+        rows = np.frombuffer(file.take(counts[-1] * KEYPOINT.itemsize), dtype=KEYPOINT)
+        keypoints.append(rows)
+    file.finish()
+    table = np.concatenate(keypoints)
+    if not np.all(np.isfinite(table["uv"])):
+        raise file.damaged("it has keypoints that are not finite")
+    return ColmapImages(
+        _integers(ids),
+        _integers(cameras),
+        _rows(poses, 7),
+        tuple(names),
+        _integers(counts),
+        np.ascontiguousarray(table["uv"], dtype=np.float64),
+        np.ascontiguousarray(table["point"], dtype=np.int64),
+    )
+
+
+def _points(file: _Cursor) -> ColmapPoints:
+    count = file.count(POINT.itemsize)
+    data = np.frombuffer(file.data, dtype=np.uint8)
+    starts = record_starts(data, file.place, count)
+    if np.any(starts < 0):
+        raise file.damaged("it ends too early")
+    file.place = int(starts[-1])
+    file.finish()
+    records = data[starts[:-1, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
+    p_W = np.ascontiguousarray(records["p_W"], dtype=np.float64)
+    if not np.all(np.isfinite(p_W)):
+        raise file.damaged("it has points that are not finite")
+    return ColmapPoints(
+        records["id"].astype(np.int64),
+        p_W,
+        records["colour"].copy(),
+        records["error"].astype(np.float64),
+    )
+
+
+def _integers(values: list[int]) -> I64:
+    return np.array(values, dtype=np.int64)
+
+
+def _rows(values: list[F64], width: int) -> F64:
+    return np.array(values, dtype=np.float64).reshape(-1, width)

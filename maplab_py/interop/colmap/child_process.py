@@ -1,0 +1,51 @@
+"""Run pycolmap in a child process."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from pathlib import Path
+
+from maplab_py.cancellation import check_cancelled, cleaned_up
+from maplab_py.errors import MapError
+
+_POLL_S = 0.05
+_SILENT_END_S = 5.0
+
+
+def run_job(job: str, folder: Path, source: Path) -> None:
+    """Run a job of `child` on a folder, until it ends or the command is cancelled.
+
+    Args:
+        job: Name of a function of `child`.
+        folder: Folder with the job's files.
+        source: What the user named, for messages.
+
+    Raises:
+        MapError: pycolmap refuses the files, or dies.
+    """
+    module = "maplab_py.interop.colmap.child"
+    log = folder / f"{job}.log"
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, job, str(folder)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+        )
+        with cleaned_up(lambda: _end(process)):
+            while process.poll() is None:
+                check_cancelled()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_POLL_S)
+    if process.returncode:
+        lines = log.read_text(errors="replace").strip().splitlines()
+        reason = lines[-1] if lines else f"it ended with status {process.returncode}"
+        raise MapError(f"{source}: pycolmap cannot do {job}: {reason}")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.kill()
+        process.wait(_SILENT_END_S)

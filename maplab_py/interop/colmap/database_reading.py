@@ -1,0 +1,121 @@
+"""Keypoint scales and descriptors of images, from COLMAP's database (SQLite)."""
+
+from __future__ import annotations
+
+import dataclasses
+import sqlite3
+from pathlib import Path
+from urllib.request import pathname2url
+
+import numpy as np
+
+from maplab_py.array_types import F64, U8
+from maplab_py.errors import MapError, UserError
+from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, FeatureType
+
+_SIFT, _UNDEFINED = 0, -1
+"""COLMAP's numbers of feature types; `export_colmap` writes binary descriptors without type."""
+_SIFT_BYTES = 128
+_REMEDY = "copy it again, or import without --database"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImageFeatures:
+    """Keypoints of an image with their descriptors."""
+
+    scale: F64  # (K,) [px]
+    descriptor: U8  # (K, bytes), no columns where there are none
+    block: DescriptorBlock | None
+
+
+class ColmapDatabase:
+    """A database, opened for reading only."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the database.
+
+        Raises:
+            UserError: There is no such file.
+            MapError: It is no database of COLMAP.
+        """
+        if not path.is_file():
+            raise UserError(f"--database={path}: no such file")
+        self.path = path
+        try:
+            uri = f"file:{pathname2url(str(path.absolute()))}?mode=ro"
+            self._connection = sqlite3.connect(uri, uri=True)
+            self._id_of = dict(self._connection.execute("SELECT name, image_id FROM images"))
+            columns = self._connection.execute("PRAGMA table_info(descriptors)").fetchall()
+        except sqlite3.Error as error:
+            raise self._damaged(str(error)) from error
+        self._has_types = any(column[1] == "type" for column in columns)
+
+    def close(self) -> None:
+        """Close the database."""
+        self._connection.close()
+
+    def features(self, name: str, count: int) -> ImageFeatures:
+        """Return the features of an image.
+
+        Args:
+            name: Name of the image.
+            count: Its keypoints in the model.
+
+        Raises:
+            MapError: The image is not there, has another number of keypoints, or is damaged.
+        """
+        image = self._id_of.get(name)
+        if image is None:
+            raise MapError(f"{self.path}: has no image {name}: name the database of this model")
+        rows, columns, data = self._row("keypoints", "rows, cols, data", image) or (0, 2, b"")
+        values = self._array(data, rows, columns, np.dtype("<f4"), name).astype(np.float64)
+        if rows != count:
+            raise MapError(
+                f"{self.path}: image {name} has {rows} keypoints, and {count} in the model: name the "
+                "database of this model"
+            )
+        return ImageFeatures(_scales(values), *self._descriptors(image, count, name))
+
+    def _descriptors(self, image: int, count: int, name: str) -> tuple[U8, DescriptorBlock | None]:
+        kind_column = "type" if self._has_types else str(_SIFT)
+        row = self._row("descriptors", f"{kind_column}, rows, cols, data", image)
+        if row is None or row[1] == 0:
+            return np.zeros((count, 0), dtype=np.uint8), None
+        kind, rows, columns, data = row
+        is_sift = kind == _SIFT and columns == _SIFT_BYTES
+        if not is_sift and kind != _UNDEFINED:
+            raise MapError(
+                f"{self.path}: descriptors of type {kind} with {columns} bytes: only SIFT of 128 bytes and "
+                "the binary ones of export_colmap can be imported; import without --database"
+            )
+        if rows != count:
+            raise self._damaged(f"image {name} has {rows} descriptors of {count} keypoints")
+        descriptor = self._array(data, rows, columns, np.dtype(np.uint8), name)
+        feature = FeatureType.SIFT if is_sift else FeatureType.BINARY
+        return descriptor, DescriptorBlock(count, columns, DescriptorDepth.UINT8, feature)
+
+    def _row(self, table: str, columns: str, image: int) -> tuple[int, ...] | None:
+        query = f"SELECT {columns} FROM {table} WHERE image_id = ?"
+        try:
+            row: tuple[int, ...] | None = self._connection.execute(query, (image,)).fetchone()
+        except sqlite3.Error as error:
+            raise self._damaged(str(error)) from error
+        return row
+
+    def _array(
+        self, data: object, rows: int, columns: int, kind: np.dtype, name: str
+    ) -> np.ndarray:
+        content = data if isinstance(data, bytes) else b""
+        if columns < 1 or len(content) != rows * columns * kind.itemsize:
+            raise self._damaged(f"the data of image {name} have the wrong size")
+        return np.frombuffer(content, dtype=kind).reshape(rows, columns)
+
+    def _damaged(self, reason: str) -> MapError:
+        return MapError(f"--database={self.path}: is damaged or no database: {reason}; {_REMEDY}")
+
+
+def _scales(values: F64) -> F64:
+    """Return scales (K,) of keypoints: x, y; with scale, orientation; or with an affine shape."""
+    if values.shape[1] >= 6:
+        return np.asarray(np.hypot(values[:, 2], values[:, 4]))
+    return values[:, 2] if values.shape[1] == 4 else np.ones(len(values))

@@ -1,0 +1,410 @@
+"""A map of a COLMAP model: a mission of each rig, odometry between its frames, landmarks."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, U64, Mask
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import se3
+from maplab_py.geometry.alignment import apply_similarity
+from maplab_py.interop.colmap.camera_models import map_camera
+from maplab_py.interop.colmap.model import PIXEL_CENTRE, ColmapModel, ColmapRig, SensorType
+from maplab_py.interop.colmap.side_file import SideFile
+from maplab_py.sensors import CameraRig, SensorSet
+from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
+from maplab_py.vimap import MissionSensor, VIMap
+from maplab_py.vimap.descriptors import no_blocks
+from maplab_py.vimap.ids import from_hex, random_ids, to_hex
+from maplab_py.vimap.scale_marks import KEY
+from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap.tables import (
+    Backbone,
+    BaseFrames,
+    FrameField,
+    Frames,
+    Keypoints,
+    LandmarkQuality,
+    Landmarks,
+    Missions,
+    TransformationEdges,
+    TransformationKind,
+    Vertices,
+)
+
+_PRESENT = FrameField.SIGMA | FrameField.SCALE | FrameField.LANDMARK_ID
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImportedModel:
+    """A map with the rows of the model that its tables were made of."""
+
+    vi_map: VIMap
+    images: I64  # (F,) rows of the model's images, by frame of the map
+    keypoints: I64  # (K,) rows of the model's keypoints
+    unobserved_points: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BodyFrames:
+    """Frames of the model in the order of the map's vertices."""
+
+    frame: I64  # (V,) rows
+    mission: I64  # (V,) numbers from 0
+    time_ns: I64  # (V,)
+    T_W_R: F64  # (V, 7) in units of the model
+    T_R_I: F64  # (V, 7) in metres
+    mission_rig: I64  # (M,) rows of rigs
+    mission_row: I64  # (M,) rows of the side file's missions, -1 = none
+    side_vertex: I64  # (V,) rows of the side file's vertices, -1 = none
+    T_I_R: F64  # (R, 7) by rig row
+
+
+def body_frames(model: ColmapModel, times_ns: I64, side: SideFile | None) -> BodyFrames:
+    """Put the frames that have images into missions: those of the side file, else one of each rig.
+
+    Args:
+        model: Model.
+        times_ns: Times (N,) of its images.
+        side: Side file, None = there is none.
+
+    Raises:
+        UserError: Two frames of a mission have the same time.
+    """
+    image_row = _rows_of(model.images.id, model.frames.image_id)
+    kept = image_row >= 0
+    owner, image = model.frames.image_frame[kept], image_row[kept]
+    order = np.lexsort((image, owner))
+    owner, image = owner[order], image[order]
+    frame, first = np.unique(owner, return_index=True)
+    time_ns = np.minimum.reduceat(times_ns[image], first)
+    side_vertex = np.full(len(frame), -1, dtype=np.int64)
+    rig = _rows_of(np.array([r.id for r in model.rigs]), model.frames.rig[frame])
+    T_I_R = se3.identity(len(model.rigs))
+    side_mission = np.full(len(frame), -1, dtype=np.int64)
+    if side is not None:
+        known = side_images(model, side)[image[first]]
+        side_vertex = np.where(known >= 0, side.image_vertex[known], -1)
+        is_known = side_vertex >= 0
+        time_ns = np.where(is_known, side.vertex_time_ns[side_vertex], time_ns)
+        side_mission = np.where(is_known, side.vertex_mission[side_vertex], -1)
+        rows = _rows_of(side.rig, np.array([r.id for r in model.rigs]))
+        T_I_R[rows >= 0] = side.T_I_R[rows[rows >= 0]]
+    groups, mission = np.unique(
+        np.stack([side_mission < 0, side_mission, rig], axis=1), axis=0, return_inverse=True
+    )
+    mission = mission.reshape(-1)
+    order = np.lexsort((frame, time_ns, mission))
+    frame, mission, time_ns, rig = frame[order], mission[order], time_ns[order], rig[order]
+    same = np.flatnonzero((mission[1:] == mission[:-1]) & (time_ns[1:] == time_ns[:-1]))
+    if len(same):
+        raise UserError(
+            f"frames {model.frames.id[frame[same[0]]]} and {model.frames.id[frame[same[0] + 1]]} have the "
+            f"same time {time_ns[same[0]]} ns: give each image its time (--timestamps_from)"
+        )
+    return BodyFrames(
+        frame=frame,
+        mission=mission,
+        time_ns=time_ns,
+        T_W_R=se3.inverse(model.frames.T_R_W[frame]),
+        T_R_I=se3.inverse(T_I_R[rig]),
+        mission_rig=groups[:, 2],
+        mission_row=groups[:, 1],
+        side_vertex=side_vertex[order],
+        T_I_R=T_I_R,
+    )
+
+
+def map_of_model(
+    model: ColmapModel,
+    bodies: BodyFrames,
+    times_ns: I64,
+    side: SideFile | None,
+    *,
+    T_G_W: F64,
+    scale: float,
+    is_metric: Mask,
+    sigma_px: float,
+    edge_sigma: F64,
+) -> ImportedModel:
+    """Return the map of a model whose world W lies in G by a similarity.
+
+    Args:
+        model: Model.
+        bodies: Its frames by mission.
+        times_ns: Times (N,) of its images.
+        side: Side file, None = there is none.
+        T_G_W: Pose (7,) of the model.
+        scale: Metres per unit of the model.
+        is_metric: Missions (M,) whose scale and gravity are known; others are marked.
+        sigma_px: Standard deviation of keypoints [px].
+        edge_sigma: Standard deviations (6,) of odometry edges, position [m], then rotation [rad].
+
+    Raises:
+        MapError: A rig lacks a pose of a camera that has images.
+        UserError: maplab lacks a camera model.
+    """
+    rng = np.random.default_rng(_seed(model, times_ns))
+    T_G_I = se3.compose(apply_similarity(T_G_W, scale, bodies.T_W_R), bodies.T_R_I)
+    sensors, sensor_id = _sensors(model, bodies, side, scale, is_metric, rng)
+    frames, images = _frames(model, bodies, times_ns, side, rng)
+    keypoints = ragged_rows(model.images.keypoint_start, images)
+    landmarks, landmark_of, unobserved = _landmarks(
+        model, side, frames, keypoints, se3.transform(T_G_W, scale * model.points.p_W), T_G_I, rng
+    )
+    count = len(bodies.frame)
+    missions = len(bodies.mission_rig)
+    vertex_id = None if side is None else side.vertex_id
+    vi_map = VIMap(
+        sensors=sensors,
+        missions=_missions(bodies, side, sensor_id, rng),
+        baseframes=BaseFrames.filled(missions, id=random_ids(missions, rng), is_known=is_metric),
+        vertices=Vertices.filled(
+            count,
+            id=_restored(random_ids(count, rng), bodies.side_vertex, vertex_id),
+            mission=bodies.mission,
+            T_M_I=T_G_I,
+            timestamp_ns=bodies.time_ns,
+            nframe_id=random_ids(count, rng),
+        ),
+        frames=frames,
+        keypoints=Keypoints.filled(
+            len(keypoints),
+            uv_px=model.images.uv[keypoints] - PIXEL_CENTRE,
+            sigma_px=np.full(len(keypoints), sigma_px),
+            landmark=landmark_of,
+        ),
+        landmarks=landmarks,
+        transformation_edges=_edges(bodies, T_G_I, sensor_id, edge_sigma, rng),
+    )
+    return ImportedModel(vi_map, images, keypoints, unobserved)
+
+
+def side_images(model: ColmapModel, side: SideFile) -> I64:
+    """Return the rows (N,) of the side file's images that the model's images are, -1 = new."""
+    row_of = {name: row for row, name in enumerate(side.image_name.tolist())}
+    return np.array([row_of.get(name, -1) for name in model.images.name], dtype=np.int64)
+
+
+def _sensors(
+    model: ColmapModel,
+    bodies: BodyFrames,
+    side: SideFile | None,
+    scale: float,
+    is_metric: Mask,
+    rng: np.random.Generator,
+) -> tuple[SensorSet, U64]:
+    """Return the sensors, and their ids (M, kinds, 2) by mission."""
+    camera_rows = {camera.id: row for row, camera in enumerate(model.cameras)}
+    camera_id = random_ids(len(model.cameras), rng)
+    rig_id = random_ids(len(model.rigs), rng)
+    if side is not None:
+        rows = _rows_of(side.camera, np.array([camera.id for camera in model.cameras]))
+        camera_id = _restored(camera_id, rows, side.camera_id)
+        rows = _rows_of(side.rig, np.array([rig.id for rig in model.rigs]))
+        rig_id = _restored(rig_id, rows, side.rig_id)
+    sensors: dict[str, CameraRig | OtherSensor] = {}
+    extrinsics: dict[str, Extrinsics] = {}
+    sensor_id = np.zeros((len(bodies.mission_rig), len(MissionSensor), 2), dtype=np.uint64)
+    odometry_ids = random_ids(len(bodies.mission_rig), rng)
+    for mission, row in enumerate(bodies.mission_rig.tolist()):
+        rig, name = model.rigs[row], to_hex(rig_id[row])
+        T_C_R = camera_poses(rig, scale)
+        numbers = [number for kind, number in rig.sensors if kind == SensorType.CAMERA]
+        cameras = tuple(
+            map_camera(model.cameras[camera_rows[number]], to_hex(camera_id[camera_rows[number]]))
+            for number in numbers
+        )
+        T_I_C = se3.compose(bodies.T_I_R[row], se3.inverse(T_C_R))
+        sensors[name] = CameraRig(name, cameras, T_I_C)
+        extrinsics[name] = Extrinsics(name, se3.identity())
+        odometry = to_hex(odometry_ids[mission])
+        keys = {"id": odometry, "sensor_type": "ODOMETRY_6DOF", "topic": "colmap"}
+        marks = {} if is_metric[mission] else {KEY: True}
+        sensors[odometry] = OtherSensor(odometry, "ODOMETRY_6DOF", {**keys, **marks})
+        extrinsics[odometry] = Extrinsics(name, se3.identity())
+        sensor_id[mission, MissionSensor.NCAMERA] = from_hex(name)
+        sensor_id[mission, MissionSensor.ODOMETRY_6DOF] = from_hex(odometry)
+    return SensorSet(sensors, extrinsics), sensor_id
+
+
+def camera_poses(rig: ColmapRig, scale: float) -> F64:
+    """Return T_C_R (n, 7) of a rig's cameras, in metres.
+
+    Raises:
+        MapError: A camera has no pose.
+    """
+    is_camera = np.array([kind == SensorType.CAMERA for kind, _ in rig.sensors], dtype=np.bool_)
+    T_C_R = rig.T_S_R[is_camera].copy()
+    if not np.all(np.isfinite(T_C_R)):
+        raise MapError(
+            f"rig {rig.id}: a camera has no pose on the rig: let COLMAP estimate it (rig_configurator)"
+        )
+    T_C_R[:, 4:] *= scale
+    return T_C_R
+
+
+def _frames(
+    model: ColmapModel,
+    bodies: BodyFrames,
+    times_ns: I64,
+    side: SideFile | None,
+    rng: np.random.Generator,
+) -> tuple[Frames, I64]:
+    """Return the frames, and the rows of their images."""
+    vertex_of = np.full(len(model.frames.id), -1, dtype=np.int64)
+    vertex_of[bodies.frame] = np.arange(len(bodies.frame))
+    image = _rows_of(model.images.id, model.frames.image_id)
+    vertex = vertex_of[model.frames.image_frame]
+    kept = (image >= 0) & (vertex >= 0)
+    image, vertex = image[kept], vertex[kept]
+    index_of = {
+        number: index
+        for rig in model.rigs
+        for index, number in enumerate(n for kind, n in rig.sensors if kind == SensorType.CAMERA)
+    }
+    index = np.array([index_of[camera] for camera in model.images.camera[image].tolist()])
+    order = np.lexsort((index, vertex))
+    image, vertex, index = image[order], vertex[order], index[order]
+    twice = np.flatnonzero((vertex[1:] == vertex[:-1]) & (index[1:] == index[:-1]))
+    if len(twice):
+        name = model.images.name[image[twice[0] + 1]]
+        raise MapError(f"image {name}: its frame has two images of the same camera")
+    count = len(image)
+    ids, stamps = random_ids(count, rng), times_ns[image]
+    if side is not None:
+        rows = side_images(model, side)[image]
+        ids = _restored(ids, rows, side.image_frame_id)
+        stamps = np.where(rows >= 0, side.image_time_ns[rows], stamps)
+    table = Frames.filled(
+        count,
+        id=ids,
+        vertex=vertex,
+        camera_index=index,
+        timestamp_ns=stamps,
+        keypoint_count=model.images.keypoint_count[image],
+        present=np.full(count, int(_PRESENT)),
+        descriptor_blocks=no_blocks(count),
+    )
+    return table, image
+
+
+def _landmarks(
+    model: ColmapModel,
+    side: SideFile | None,
+    frames: Frames,
+    keypoints: I64,
+    p_G: F64,
+    T_G_I: F64,
+    rng: np.random.Generator,
+) -> tuple[Landmarks, I64, int]:
+    """Return landmarks in the order of point ids, rows (K,) of keypoints, and points left out."""
+    point = _rows_of(model.points.id, model.images.point[keypoints])
+    observing = np.flatnonzero(point >= 0)
+    vertex = np.repeat(frames.vertex, frames.keypoint_count)[observing]
+    order = np.argsort(model.points.id, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    seen, first = np.unique(rank[point[observing]], return_index=True)
+    rows = order[seen]
+    store = vertex[first]  # keypoints are in the order of vertices
+    landmark = np.full(len(keypoints), -1, dtype=np.int64)
+    landmark[observing] = np.searchsorted(seen, rank[point[observing]])
+    ids = random_ids(len(rows), rng)
+    quality = np.full(len(rows), int(LandmarkQuality.GOOD))
+    if side is not None:
+        known = _same_points(model, side, model.points.id[rows])
+        ids = _restored(ids, known, side.landmark_id)
+        quality = np.where(known >= 0, side.landmark_quality[known], quality)
+    table = Landmarks.filled(
+        len(rows),
+        id=ids,
+        vertex=store,
+        p_I=se3.transform(se3.inverse(T_G_I[store]), p_G[rows]),
+        quality=quality,
+    )
+    return table, landmark, len(model.points.id) - len(rows)
+
+
+def _same_points(model: ColmapModel, side: SideFile, ids: I64) -> I64:
+    """Return the rows of the side file's points (L,) by id, -1 unless their observation is there."""
+    rows = _rows_of(side.point, ids)
+    image_of_row = np.full(len(side.image_name), -1, dtype=np.int64)
+    named = side_images(model, side)
+    image_of_row[named[named >= 0]] = np.flatnonzero(named >= 0)
+    image = image_of_row[side.point_image]
+    keypoint = side.point_keypoint
+    inside = (image >= 0) & (keypoint >= 0) & (keypoint < model.images.keypoint_count[image])
+    place = np.where(inside, model.images.keypoint_start[image] + keypoint, 0)
+    same = inside & (model.images.point[place] == side.point)
+    return np.where((rows >= 0) & same[rows], rows, -1)
+
+
+def _missions(
+    bodies: BodyFrames, side: SideFile | None, sensor_id: U64, rng: np.random.Generator
+) -> Missions:
+    count = len(bodies.mission_rig)
+    # the rows of a side file's mission that a model has put on two rigs: the first keeps the id
+    rows, first = np.unique(bodies.mission_row, return_index=True)
+    known = np.full(count, -1, dtype=np.int64)
+    known[first[rows >= 0]] = rows[rows >= 0]
+    names = np.full(count, "", dtype=object)
+    if side is not None:
+        names[known >= 0] = side.mission_name[known[known >= 0]].tolist()
+    return Missions.filled(
+        count,
+        id=_restored(random_ids(count, rng), known, None if side is None else side.mission_id),
+        baseframe=np.arange(count),
+        root_vertex=np.searchsorted(bodies.mission, np.arange(count)),
+        backbone=np.full(count, int(Backbone.ODOMETRY)),
+        sensor_id=sensor_id,
+        name=names,
+    )
+
+
+def _edges(
+    bodies: BodyFrames, T_G_I: F64, sensor_id: U64, sigma: F64, rng: np.random.Generator
+) -> TransformationEdges:
+    start = np.flatnonzero(bodies.mission[1:] == bodies.mission[:-1])
+    count = len(start)
+    return TransformationEdges.filled(
+        count,
+        id=random_ids(count, rng),
+        kind=np.full(count, int(TransformationKind.ODOMETRY)),
+        from_vertex=start,
+        to_vertex=start + 1,
+        T_A_B=se3.relative(T_G_I[start], T_G_I[start + 1]),
+        covariance=np.tile(np.diag(sigma**2), (count, 1, 1)),
+        sensor_id=sensor_id[bodies.mission[start], MissionSensor.ODOMETRY_6DOF],
+    )
+
+
+def _restored(ids: U64, rows: I64, known: U64 | None) -> U64:
+    """Return ids (N, 2) with those of known rows (-1 = none), each used once."""
+    if known is None:
+        return ids
+    taken, first = np.unique(rows, return_index=True)
+    once = first[taken >= 0]
+    restored = ids.copy()
+    restored[once] = known[rows[once]]
+    return restored
+
+
+def _rows_of(ids: I64, wanted: I64) -> I64:
+    """Return the rows of wanted ids in a column of unique ids, -1 where they are not."""
+    if not len(ids):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    order = np.argsort(ids, kind="stable")
+    place = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
+    rows = order[place]
+    return np.where(ids[rows] == wanted, rows, -1).astype(np.int64)
+
+
+def _seed(model: ColmapModel, times_ns: I64) -> int:
+    digest = hashlib.blake2b("\n".join(model.images.name).encode(), digest_size=16)
+    for column in (times_ns, model.images.T_C_W, model.images.uv, model.images.point):
+        digest.update(np.ascontiguousarray(column).tobytes())
+    return int.from_bytes(digest.digest(), "little")

@@ -1,0 +1,270 @@
+"""ROS 1 and ROS 2 bags, read with the library rosbags (the extra `bags`).
+
+A bag is in the order in which messages arrived; items are yielded in the order of their
+headers' stamps, as messages of one topic are. So some seconds of messages are kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import heapq
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from maplab_py.array_types import F64
+from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.interop.recordings.images import EncodedImage, RawImage
+from maplab_py.interop.recordings.protocol import (
+    CameraImage,
+    ImageData,
+    ImuBatch,
+    Item,
+    RecordedSensors,
+)
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+IMU_TYPE = "sensor_msgs/msg/Imu"
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_IMU = -1
+_LARGEST_BATCH = 200
+_DELAY_MARGIN_NS = 1_000_000_000
+"""How much the delay between stamp and arrival may vary beyond that of the first messages."""
+_SEEK_MARGIN_NS = 5_000_000_000
+_REMEDY = "copy the bag again, or repair it with `rosbag reindex` or `ros2 bag reindex`"
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a path is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix in (".bag", ".db3", ".mcap")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Stream:
+    """One topic: the IMU's, or that of a camera."""
+
+    topic: str
+    camera: int  # row, or _IMU
+    time_offset_ns: int = 0
+    first_ns: int = 0  # time of the first message
+    delay_ns: int = 0  # from its time to its arrival
+
+
+class BagRecording:
+    """Reads a bag."""
+
+    def __init__(
+        self,
+        path: Path,
+        device: RecordedSensors,
+        *,
+        imu_topic: str = "",
+        camera_topics: Sequence[str] = (),
+    ) -> None:
+        """Open a bag.
+
+        Args:
+            path: ROS 1 bag, or file or folder of a ROS 2 bag.
+            device: Sensors.
+            imu_topic: Topic of the IMU; empty = as the sensor says.
+            camera_topics: Topic of each camera; () = as the cameras say.
+
+        Raises:
+            UserError: The library is missing, or a topic is unknown, of another type, or not given.
+            MapError: The bag is damaged, or a topic has no messages.
+        """
+        self.name, self.device, self._path = str(path), device, path
+        topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
+        if len(topics) != len(device.cameras):
+            raise UserError(
+                f"--camera_topics names {len(topics)} topics, {len(device.cameras)} cameras are read"
+            )
+        streams = [
+            _Stream(topic, row, device.cameras[row].time_offset_ns)
+            for row, topic in enumerate(topics)
+        ]
+        if device.imu is not None:
+            streams.insert(0, _Stream(imu_topic or device.imu.topic, _IMU))
+        elif imu_topic:
+            raise UserError(f"--imu_topic={imu_topic}: the calibration has no IMU")
+        with self._opened() as reader:
+            self.kind = f"ROS {2 if reader.is2 else 1} bag"
+            self._streams = [self._examined(reader, stream) for stream in streams]
+        if len({stream.topic for stream in self._streams}) < len(self._streams):
+            raise UserError(f"{path}: two sensors have the same topic: give --camera_topics")
+        self.notes = () if device.imu_id else ("no IMU is read: the calibration has none",)
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first item."""
+        return min(stream.first_ns for stream in self._streams)
+
+    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+        """Yield images and the IMU samples between them; see `Recording.items`."""
+        times_ns: list[int] = []
+        samples: list[list[float]] = []
+        for time_ns, stream, message in self._in_order(start_ns, end_ns):
+            if stream.camera == _IMU:
+                times_ns.append(time_ns)
+                samples.append(_sample(message))
+            if times_ns and (stream.camera != _IMU or len(times_ns) == _LARGEST_BATCH):
+                yield self._batch(times_ns, samples)
+                times_ns, samples = [], []
+            if stream.camera != _IMU:
+                yield self._image(stream, time_ns, message)
+        if times_ns:
+            yield self._batch(times_ns, samples)
+
+    def _in_order(
+        self, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[tuple[int, _Stream, Any]]:
+        """Yield time, stream and message in the order of time, the IMU's first among equals."""
+        delays_ns = [stream.delay_ns for stream in self._streams]
+        window_ns = max(delays_ns) - min(delays_ns) + _DELAY_MARGIN_NS
+        waiting: list[tuple[int, int, int, _Stream, Any]] = []
+        newest_ns = delivered_ns = -1
+        number = itertools.count()
+        for time_ns, stream, message in self._messages(start_ns, end_ns):
+            if time_ns < delivered_ns:
+                raise MapError(
+                    f"{self._path}: a message of {stream.topic} was recorded more than "
+                    f"{window_ns / 1e9:g} s after others of its time: correct its header stamps"
+                )
+            heapq.heappush(waiting, (time_ns, stream.camera, next(number), stream, message))
+            newest_ns = max(newest_ns, time_ns)
+            while waiting[0][0] < newest_ns - window_ns:
+                delivered_ns, _, _, ready, content = heapq.heappop(waiting)
+                yield delivered_ns, ready, content
+        while waiting:
+            delivered_ns, _, _, ready, content = heapq.heappop(waiting)
+            yield delivered_ns, ready, content
+
+    def _messages(
+        self, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[tuple[int, _Stream, Any]]:
+        """Yield time, stream and message in the order of arrival."""
+        delays_ns = [stream.delay_ns for stream in self._streams]
+        begin = None if start_ns is None else start_ns + min(delays_ns) - _SEEK_MARGIN_NS
+        end = None if end_ns is None else end_ns + max(delays_ns) + _SEEK_MARGIN_NS
+        streams = {stream.topic: stream for stream in self._streams}
+        last_ns = dict.fromkeys(streams, -1)
+        with self._opened() as reader:
+            connections = [c for c in reader.connections if c.topic in streams]
+            for connection, _, data in reader.messages(connections, begin, end):
+                stream = streams[connection.topic]
+                message = reader.deserialize(data, connection.msgtype)
+                time_ns = _stamp_ns(message) + stream.time_offset_ns
+                if time_ns <= last_ns[stream.topic]:
+                    raise MapError(
+                        f"{self._path}: {stream.topic}: the stamp "
+                        f"{time_ns - stream.time_offset_ns} does not come after that of the message "
+                        "before it: correct it, or leave it out with --vio_rosbag_start_s and "
+                        "--vio_rosbag_end_s"
+                    )
+                last_ns[stream.topic] = time_ns
+                if (start_ns is None or time_ns >= start_ns) and (
+                    end_ns is None or time_ns < end_ns
+                ):
+                    yield time_ns, stream, message
+
+    def _examined(self, reader: AnyReader, stream: _Stream) -> _Stream:
+        """Return the stream with the bag's name of its topic and the times of its first message."""
+        sensor = "IMU" if stream.camera == _IMU else f"camera {stream.camera}"
+        flag = "--imu_topic" if stream.camera == _IMU else "--camera_topics"
+        types = {c.topic: c.msgtype for c in reader.connections}
+        present = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())) or "none"
+        if not stream.topic:
+            raise UserError(
+                f"{self._path}: the calibration names no topic of {sensor}: give {flag}; the bag "
+                f"has {present}"
+            )
+        topic = next((t for t in types if t.strip("/") == stream.topic.strip("/")), None)
+        if topic is None:
+            raise UserError(
+                f"{self._path}: there is no topic {stream.topic} ({sensor}): give {flag}; the bag "
+                f"has {present}"
+            )
+        wanted = (IMU_TYPE,) if stream.camera == _IMU else IMAGE_TYPES
+        if types[topic] not in wanted:
+            raise UserError(
+                f"{self._path}: {topic} has messages of type {types[topic]}, {sensor} needs "
+                f"{' or '.join(wanted)}: give {flag}; the bag has {present}"
+            )
+        connections = [c for c in reader.connections if c.topic == topic]
+        for connection, arrival_ns, data in reader.messages(connections):
+            message = reader.deserialize(data, connection.msgtype)
+            first_ns = _stamp_ns(message) + stream.time_offset_ns
+            delay_ns = arrival_ns - first_ns
+            return dataclasses.replace(stream, topic=topic, first_ns=first_ns, delay_ns=delay_ns)
+        raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
+
+    def _batch(self, times_ns: list[int], samples: list[list[float]]) -> ImuBatch:
+        assert self.device.imu is not None  # its topic is read
+        values: F64 = np.array(samples, dtype=np.float64)
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+            raise MapError(
+                f"{self._path}: {self._streams[0].topic}: the sample at {times_ns[row]} is not a "
+                "number: leave it out with --vio_rosbag_start_s and --vio_rosbag_end_s"
+            )
+        return ImuBatch.of(self.device.imu, np.array(times_ns, dtype=np.int64), values)
+
+    def _image(self, stream: _Stream, time_ns: int, message: Any) -> CameraImage:
+        stamp_ns = time_ns - stream.time_offset_ns
+        camera = self.device.cameras[stream.camera]
+        name = f"{self._path}: {stream.topic} at {stamp_ns}"
+        data: ImageData
+        if hasattr(message, "encoding"):
+            data = RawImage(
+                name,
+                camera,
+                message.encoding,
+                int(message.width),
+                int(message.height),
+                int(message.step),
+                bool(message.is_bigendian),
+                message.data,
+            )
+        else:
+            data = EncodedImage(name, camera, message.data.tobytes)
+        return CameraImage(stream.camera, time_ns, stamp_ns, data)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[AnyReader]:
+        """Open the bag; whatever its parser says of damage becomes a MapError."""
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise UserError(
+                f"{self._path}: bags are read with the library rosbags: install it with "
+                "`pip install 'maplab-py[bags]'`"
+            ) from error
+        try:
+            # files of ROS 2 before Iron hold no definitions of their messages
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            with AnyReader([self._path], default_typestore=store) as reader:
+                yield reader
+        except MaplabError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise MapError(f"{self._path}: the bag cannot be read ({reason}): {_REMEDY}") from error
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _sample(message: Any) -> list[float]:
+    a, w = message.linear_acceleration, message.angular_velocity
+    return [a.x, a.y, a.z, w.x, w.y, w.z]

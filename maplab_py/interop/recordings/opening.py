@@ -1,0 +1,72 @@
+"""Finding the reader and the calibration of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from maplab_py.errors import UserError
+from maplab_py.interop.recordings.bags import BagRecording, is_bag
+from maplab_py.interop.recordings.calibration import (
+    HOW_TO_CALIBRATE,
+    read_calibration,
+    read_folder_calibration,
+)
+from maplab_py.interop.recordings.folders import FolderRecording, image_root
+from maplab_py.interop.recordings.models import with_cameras, with_time_offset
+from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.protocol import RecordedSensors, Recording
+
+
+def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
+    """Open an EuRoC or TUM-VI folder, or a ROS bag.
+
+    Raises:
+        UserError: It is none of them, has no calibration, or a topic is unknown.
+        MapError: A file of it is missing or damaged.
+    """
+    options = options or SourceOptions()
+    root = image_root(path)
+    if root is not None:
+        if options.imu_topic or options.camera_topics:
+            raise UserError(
+                f"{path} is a folder: --imu_topic and --camera_topics apply to bags only"
+            )
+        active = options.active_cameras
+        device = _chosen(_calibration(options) or read_folder_calibration(root), options)
+        return FolderRecording(root, device, active)
+    if not path.exists():
+        raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
+    if not is_bag(path):
+        raise UserError(
+            f"{path} is no recording: wants a folder with mav0/cam0, a ROS 1 bag (.bag) or a ROS 2 "
+            "bag (folder with metadata.yaml, .db3, .mcap)"
+        )
+    given = _calibration(options)
+    if given is None:
+        raise UserError(f"{path}: a bag has no calibration: {HOW_TO_CALIBRATE}")
+    return BagRecording(
+        path,
+        _chosen(given, options),
+        imu_topic=options.imu_topic,
+        camera_topics=options.topics_of_cameras,
+    )
+
+
+def _chosen(device: RecordedSensors, options: SourceOptions) -> RecordedSensors:
+    """Return the device with the cameras and the time offset that the options choose."""
+    chosen = with_cameras(device, options.active_cameras)
+    if options.imu_to_camera_time_offset_ns is None:
+        return chosen
+    return with_time_offset(chosen, options.imu_to_camera_time_offset_ns)
+
+
+def _calibration(options: SourceOptions) -> RecordedSensors | None:
+    """Return the calibration that the options name, None if they name none."""
+    if options.sensor_calibration_file is not None:
+        return read_calibration(options.sensor_calibration_file, options.imu_calibration_file)
+    if options.imu_calibration_file is not None:
+        raise UserError(
+            f"--imu_calibration_file={options.imu_calibration_file} needs the camera chain that it "
+            "belongs to: give --sensor_calibration_file=FILE"
+        )
+    return None

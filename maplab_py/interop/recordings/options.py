@@ -1,0 +1,109 @@
+"""Options of readers and of the stream of events, with the names of rovioli's flags."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceOptions:
+    """How a recording is opened."""
+
+    flag_prefix: ClassVar[str] = ""
+
+    sensor_calibration_file: Path | None = option(
+        None, help="Calibration: sensors.yaml or kalibr's camchain; empty = as the recording has it"
+    )
+    imu_calibration_file: Path | None = option(
+        None, help="kalibr's IMU file, which belongs to a camchain"
+    )
+    rovio_active_camera_indices: str = option(
+        "", help="Cameras to read, separated by commas; empty = all of the calibration"
+    )
+    imu_to_camera_time_offset_ns: int | None = option(
+        None,
+        help="Time of the IMU's clock minus that of the cameras' clock; empty = as the calibration "
+        "says",
+        unit="ns",
+    )
+    imu_topic: str = option("", help="IMU topic of a bag; empty = as the calibration says")
+    camera_topics: str = option(
+        "",
+        help="Image topics of a bag, separated by commas, in the order of the cameras of the "
+        "calibration; empty = as it says",
+    )
+
+    @property
+    def active_cameras(self) -> tuple[int, ...]:
+        """Indices of the cameras to read; empty = all.
+
+        Raises:
+            FlagError: They are not distinct whole numbers.
+        """
+        try:
+            indices = tuple(int(word) for word in _words(self.rovio_active_camera_indices))
+        except ValueError:
+            indices = (-1,)
+        if any(index < 0 for index in indices) or len(set(indices)) != len(indices):
+            raise FlagError(
+                f"--rovio_active_camera_indices={self.rovio_active_camera_indices}: wants distinct "
+                "camera indices separated by commas, as in 0,1"
+            )
+        return indices
+
+    @property
+    def topics_of_cameras(self) -> tuple[str, ...]:
+        """Image topics in the order of the cameras; empty = as the calibration says."""
+        return tuple(_words(self.camera_topics))
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamOptions:
+    """Which part of a recording is read, and how images are put together."""
+
+    flag_prefix: ClassVar[str] = "vio_"
+
+    start_s: float = option(
+        0.0, help="Skip this much of the recording", unit="s", flag="vio_rosbag_start_s"
+    )
+    end_s: float = option(
+        0.0,
+        help="Stop this long after the beginning of the recording; 0 = read to its end",
+        unit="s",
+        flag="vio_rosbag_end_s",
+    )
+    nframe_sync_tolerance_ns: int = option(
+        500_000, help="Largest difference between the times of images of one frame set", unit="ns"
+    )
+    imu_gap_s: float = option(
+        0.05, help="Report intervals between IMU samples that are longer than this", unit="s"
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is negative, or the end is not after the start.
+        """
+        for flag, value in (
+            ("vio_rosbag_start_s", self.start_s),
+            ("vio_rosbag_end_s", self.end_s),
+            ("vio_nframe_sync_tolerance_ns", self.nframe_sync_tolerance_ns),
+            ("vio_imu_gap_s", self.imu_gap_s),
+        ):
+            if not 0 <= value < 1e9:
+                raise FlagError(f"--{flag}={value:g}: wants a number from 0 to 1e9")
+        if self.end_s and self.end_s <= self.start_s:
+            raise FlagError(
+                f"--vio_rosbag_end_s={self.end_s:g} is not after "
+                f"--vio_rosbag_start_s={self.start_s:g}"
+            )
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]

@@ -1,0 +1,186 @@
+"""What every reader of recordings delivers.
+
+All times of items and events are nanoseconds of the IMU's clock: the stamp of an image plus
+the time offset of its camera (t_imu = t_camera + offset).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.array_types import F64, I32, I64, U8, Mask
+from maplab_py.sensors import Camera, CameraRig, Imu, SensorSet
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordedSensors:
+    """The calibrated sensors of a recording."""
+
+    sensors: SensorSet
+    rig_id: str
+    imu_id: str = ""  # empty when there is no IMU
+
+    @cached_property
+    def imu(self) -> Imu | None:
+        """The IMU, None when there is none."""
+        return self.sensors.imu(self.imu_id) if self.imu_id else None
+
+    @cached_property
+    def rig(self) -> CameraRig:
+        """The camera rig."""
+        return self.sensors.camera_rig(self.rig_id)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the rig."""
+        return self.rig.cameras
+
+    @property
+    def T_I_C(self) -> F64:
+        """Poses (C, 7) of the cameras on the IMU, on the rig's body when there is no IMU."""
+        return self.sensors.T_I_C(self.imu_id, self.rig_id) if self.imu_id else self.rig.T_B_C
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImuBatch:
+    """Consecutive IMU samples, at least one, in the order of time."""
+
+    times_ns: I64  # (N,)
+    accel_gyro: F64  # (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s, as measured
+    is_saturated: Mask  # (N,) some axis reached the limit of the sensor
+
+    @classmethod
+    def of(cls, imu: Imu, times_ns: I64, accel_gyro: F64) -> ImuBatch:
+        """Make a batch; saturation follows from the limits of the IMU."""
+        limits = np.repeat([imu.saturation_accel_max_mps2, imu.saturation_gyro_max_radps], 3)
+        return cls(times_ns, accel_gyro, np.any(np.abs(accel_gyro) >= limits, axis=1))
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the first sample."""
+        return int(self.times_ns[0])
+
+    def __getitem__(self, rows: slice) -> ImuBatch:
+        return ImuBatch(self.times_ns[rows], self.accel_gyro[rows], self.is_saturated[rows])
+
+
+class ImageData(Protocol):
+    """The content of an image before it is decoded."""
+
+    def check(self) -> None:
+        """Check size and completeness without decoding.
+
+        Raises:
+            MapError: The image is missing, truncated or of another size than its camera's images.
+        """
+
+    def decode(self) -> Pixels:
+        """Return the pixels as recorded: (H, W) grey or (H, W, 3) BGR, 8 or 16 bits.
+
+        Raises:
+            MapError: As `check`, or the image is damaged.
+        """
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraImage:
+    """One image; its pixels are read and decoded each time they are asked for."""
+
+    camera: int  # row of the rig's cameras
+    time_ns: int  # in the clock of the IMU
+    stamp_ns: int  # as recorded, in the clock of the camera
+    data: ImageData
+
+    def decode(self) -> Pixels:
+        """Return the pixels as recorded; see `ImageData.decode`."""
+        return self.data.decode()
+
+    def grey(self) -> U8:
+        """Return 8-bit grey values (H, W); of 16 bits the upper eight, of colours the luminance."""
+        import cv2
+
+        pixels: Any = self.decode()
+        if pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        if pixels.dtype == np.uint16:
+            pixels = (pixels >> 8).astype(np.uint8)
+        return np.asarray(pixels, dtype=np.uint8)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrameSet:
+    """Images of all cameras of the rig, taken at the same time within the tolerance."""
+
+    time_ns: int  # of the first camera's image
+    images: tuple[CameraImage, ...]  # by camera
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """Keypoints of one image with the tracks they belong to."""
+
+    camera: int
+    stamp_ns: int
+    uv_px: F64  # (K, 2) of the distorted image
+    sigma_px: F64  # (K,)
+    scale: F64  # (K,)
+    track_id: I32  # (K,) -1 = on no track
+    descriptor: U8  # (K, width) as wide as the widest
+    descriptor_size: I32  # (K,) bytes of each binary descriptor, 0 where there is none
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TrackedFrameSet:
+    """Tracked keypoints of a rig at one time, in place of images."""
+
+    time_ns: int
+    frames: tuple[TrackedFrame | None, ...]  # by camera, None where the camera has no frame
+
+
+Item = ImuBatch | CameraImage | TrackedFrameSet
+"""What readers yield, in the order of time."""
+
+Event = ImuBatch | FrameSet | TrackedFrameSet
+"""What `EventStream` yields, in the order of time."""
+
+
+class Recording(Protocol):
+    """A reader of one recording; it can be read several times."""
+
+    @property
+    def name(self) -> str:
+        """File or folder, for messages and reports."""
+
+    @property
+    def kind(self) -> str:
+        """What is read, as in "EuRoC folder"."""
+
+    @property
+    def device(self) -> RecordedSensors:
+        """The calibrated sensors."""
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first item."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know: parts of the recording that are not read."""
+
+    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+        """Yield what was recorded at start_ns or later and before end_ns, in the order of time.
+
+        Raises:
+            MapError: Files are missing or damaged, or stamps run backwards.
+        """

@@ -1,0 +1,180 @@
+"""Images of recordings as resources of frames, and resources as an EuRoC folder."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.errors import UserError
+from maplab_py.interop.recordings.folders import FolderRecording, image_root
+from maplab_py.interop.recordings.images import EncodedImage
+from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors
+from maplab_py.interop.resources.matching import (
+    MS_TO_NS,
+    camera_frames,
+    frames_without,
+    matched_files,
+    mission_rig,
+)
+from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
+from maplab_py.options import option
+from maplab_py.output_files import write_bytes, write_text
+from maplab_py.progress import SILENT, Progress
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources import ResourceStore
+from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.resource_queries import resources_of
+
+RAW_GREY, RAW_COLOUR = 0, 4
+"""Numbers of the resource types of images as recorded."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageImportOptions:
+    """Which images of a recording become resources."""
+
+    image_tolerance_ms: float = option(
+        1.0, help="Largest difference between the times of image and frame", unit="ms"
+    )
+    every_nth: int = option(1, help="Attach images to every n-th vertex only")
+    link: bool = option(
+        False,
+        help="Refer to the recording's files by symbolic links instead of copying them: the map then "
+        "needs the recording to stay where it is",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.image_tolerance_ms < 0.0 or self.every_nth < 1:
+            raise ValueError("image_tolerance_ms must be 0 or greater, every_nth 1 or greater")
+
+
+def import_images(
+    vi_map: VIMap,
+    mission: int,
+    folder: Path,
+    options: ImageImportOptions | None = None,
+    *,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, ImportedResources]:
+    """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission (row).
+
+    The k-th camera of the mission gets the images of the folder cam<k>. Frames that have an image
+    keep it. Images of 16 bits are reduced to 8, unless they are linked.
+
+    Raises:
+        UserError: The folder is no recording, or no image belongs to a frame.
+        MapError: An image is missing, damaged, or of another size than the camera.
+    """
+    options = options or ImageImportOptions()
+    root = image_root(folder)
+    if root is None:
+        raise UserError(f"--dataset_folder={folder}: there is no folder mav0/cam0 or cam0")
+    rig = mission_rig(vi_map, mission)
+    recording = FolderRecording(root, RecordedSensors(vi_map.sensors, rig.id))
+    images = [item for item in recording.items() if isinstance(item, CameraImage)]
+    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
+    rows: list[int] = []
+    owners: list[int] = []
+    skipped = without = 0
+    for camera in range(len(rig.cameras)):
+        frames = camera_frames(vi_map, mission, camera, options.every_nth)
+        wanted = frames_without(vi_map, frames, (RAW_GREY, RAW_COLOUR))
+        skipped += len(frames) - len(wanted)
+        of_camera = [image for image in images if image.camera == camera]
+        times = np.array([image.time_ns for image in of_camera], dtype=np.int64)
+        tolerance_ns = round(options.image_tolerance_ms * MS_TO_NS)
+        matches = matched_files(vi_map.frames.timestamp_ns[wanted], times, tolerance_ns)
+        without += int(np.count_nonzero(matches < 0))
+        for done, (frame, match) in enumerate(zip(wanted.tolist(), matches.tolist(), strict=True)):
+            progress.step(done, len(wanted), f"images of camera {camera}")
+            if match >= 0:
+                rows.append(_add_image(new, of_camera[match], link=options.link))
+                owners.append(frame)
+    if not rows and not skipped:
+        raise UserError(
+            f"--dataset_folder={folder}: no image is within --image_tolerance_ms="
+            f"{options.image_tolerance_ms:g} of a frame of the mission"
+        )
+    attached = new.attached(vi_map, rows, owners) if rows else vi_map
+    kinds = sorted({resource_type(new.type_of(row)).name for row in rows})
+    report = ImportedResources(
+        to_hex(vi_map.missions.id[mission]), tuple(kinds), len(images), len(rows), skipped, without
+    )
+    return attached, report
+
+
+def _add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
+    """Add an image of a recording to the new resources; return its row."""
+    pixels = image.decode()
+    kind = RAW_GREY if pixels.ndim == 2 else RAW_COLOUR
+    if link and isinstance(image.data, EncodedImage):
+        return new.add_link(kind, image.data.read(), Path(image.data.name))
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    return new.add_image(np.asarray(pixels, dtype=np.uint8), kind)
+
+
+def export_images(
+    vi_map: VIMap,
+    map_folder: Path,
+    mission: int,
+    kind: int,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> ExportedImages:
+    """Write the images of a mission's frames as the folders cam0, cam1, ... of an EuRoC folder.
+
+    Args:
+        vi_map: Map.
+        map_folder: Folder of the map, where its resources are.
+        mission: Row of the mission.
+        kind: Number of the resource type.
+        folder: Gets mav0.
+        overwrite: Replace files that exist.
+        progress: Is told about every image.
+
+    Raises:
+        UserError: The mission has no such images, or a file cannot be written.
+        MapError: A file is missing or no image.
+    """
+    chosen = resources_of(vi_map, (kind,), np.array([mission]))
+    chosen &= vi_map.resources.owner_kind == ResourceOwner.FRAME
+    resources = np.flatnonzero(chosen)
+    if not len(resources):
+        name = resource_type(kind).name
+        raise UserError(f"the mission has no images of type {name} (see: resource_statistics)")
+    frames = vi_map.resources.owner[resources]
+    cameras = vi_map.frames.camera_index[frames]
+    times_ns = vi_map.frames.timestamp_ns[frames]
+    store = ResourceStore(vi_map, map_folder)
+    done = 0
+    for camera in np.unique(cameras).tolist():
+        rows = np.flatnonzero(cameras == camera)
+        rows = rows[np.argsort(times_ns[rows], kind="stable")]
+        place = folder / "mav0" / f"cam{camera}"
+        lines = ["#timestamp [ns],filename\n"]
+        for row in rows.tolist():
+            progress.step(done, len(resources), "writing images")
+            stamp = int(times_ns[row])
+            image = encoded_png(store.load(int(resources[row])))
+            write_bytes(place / "data" / f"{stamp}.png", [image], overwrite=overwrite)
+            lines.append(f"{stamp},{stamp}.png\n")
+            done += 1
+        write_text(place / "data.csv", lines, overwrite=overwrite)
+    return ExportedImages(folder, done, len(np.unique(cameras)))
+
+
+def encoded_png(image: Any) -> bytes:
+    """Return an image (H, W[, 3] BGR) as the bytes of a PNG file."""
+    import cv2
+
+    _, data = cv2.imencode(".png", image)
+    return bytes(data)

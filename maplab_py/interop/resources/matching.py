@@ -1,0 +1,83 @@
+"""Files with time stamps, matched to the frames of a mission."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.array_types import I64
+from maplab_py.errors import UserError
+from maplab_py.geometry.association import nearest_rows
+from maplab_py.sensors import CameraRig
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
+from maplab_py.vimap.queries import mission_sensor_id
+
+MS_TO_NS = 1_000_000
+
+
+def mission_rig(vi_map: VIMap, mission: int) -> CameraRig:
+    """Return the camera rig of a mission (row).
+
+    Raises:
+        UserError: It has none.
+    """
+    rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+    if not rig_id:
+        raise UserError("the mission has no cameras: choose another one by --map_mission")
+    return vi_map.sensors.camera_rig(rig_id)
+
+
+def camera_frames(vi_map: VIMap, mission: int, camera: int, every_nth: int = 1) -> I64:
+    """Return the frames (N,) of a camera (index) at every n-th vertex of a mission, by time."""
+    vertex = vi_map.frames.vertex
+    start, stop = vi_map.vertex_start[mission : mission + 2]
+    chosen = (vertex >= start) & (vertex < stop) & ((vertex - start) % every_nth == 0)
+    chosen &= (vi_map.frames.camera_index == camera) & vi_map.frames.is_valid
+    rows = np.flatnonzero(chosen)
+    return rows[np.argsort(vi_map.frames.timestamp_ns[rows], kind="stable")]
+
+
+def frames_without(vi_map: VIMap, frames: I64, kinds: tuple[int, ...]) -> I64:
+    """Return the frames (rows) that own no resource of some types."""
+    table = vi_map.resources
+    owned = (table.owner_kind == ResourceOwner.FRAME) & np.isin(table.type, kinds)
+    return frames[~np.isin(frames, table.owner[owned])]
+
+
+def matched_files(frame_times_ns: I64, file_times_ns: I64, tolerance_ns: int) -> I64:
+    """Return the file (row) of each frame (N,), -1 where none is near enough.
+
+    A file and a frame match if each is the nearest of the other.
+
+    Args:
+        frame_times_ns: Times of frames (N,), sorted.
+        file_times_ns: Times of files (M,), sorted.
+        tolerance_ns: Largest difference.
+    """
+    if not len(frame_times_ns) or not len(file_times_ns):
+        return np.full(len(frame_times_ns), -1, dtype=np.int64)
+    files = nearest_rows(file_times_ns, frame_times_ns)
+    back = nearest_rows(frame_times_ns, file_times_ns[files])
+    near = np.abs(file_times_ns[files] - frame_times_ns) <= tolerance_ns
+    return np.where(near & (back == np.arange(len(files))), files, -1)
+
+
+def stamped_files(folder: Path, suffixes: tuple[str, ...], flag: str) -> tuple[I64, list[Path]]:
+    """Return times (N,) [ns] and paths of files whose names are time stamps, by time.
+
+    Raises:
+        UserError: The folder cannot be read, or has no such file, or a name is no stamp.
+    """
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
+    except OSError as error:
+        raise UserError(f"{flag}={folder}: the folder cannot be read ({error.strerror})") from error
+    if not files:
+        raise UserError(f"{flag}={folder}: there are no files <time stamp>{'|'.join(suffixes)}")
+    for path in sorted(files):
+        if not path.stem.isdecimal() or len(path.stem) > 19:
+            raise UserError(f"{path}: the name must be the time stamp in nanoseconds")
+    files.sort(key=lambda path: (int(path.stem), path.name))
+    times = np.array([int(path.stem) for path in files], dtype=np.uint64).astype(np.int64)
+    return times, files

@@ -1,0 +1,131 @@
+"""Point clouds of other programs as resources of a sensor at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
+from maplab_py.interop.pcd import parse_pcd
+from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
+from maplab_py.interop.resources.matching import stamped_files
+from maplab_py.interop.resources.reports import ImportedResources
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors import CameraRig
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
+from maplab_py.vimap.ids import from_hex, to_hex
+from maplab_py.vimap.queries import mission_sensor_id, mission_time_spans_ns
+
+XYZ, XYZRGB, XYZI = 16, 17, 21
+"""Numbers of the resource types of clouds: plain, with colours, with intensities."""
+
+
+def import_point_clouds(
+    vi_map: VIMap,
+    mission: int,
+    folder: Path,
+    sensor_id: str = "",
+    *,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, ImportedResources]:
+    """Attach clouds (PLY or PCD, named by time stamp) to a sensor of a mission (row).
+
+    Points are in the frame of the sensor at the time of the stamp. Clouds of times outside the
+    mission are left out, as are those of times that the sensor has a cloud of.
+
+    Args:
+        vi_map: Map.
+        mission: Row of the mission.
+        folder: Has the files <time stamp in ns>.ply or .pcd.
+        sensor_id: Sensor, or an unambiguous prefix; empty = the mission's lidar.
+        progress: Is told about every file.
+
+    Raises:
+        UserError: There are no files, no such sensor, or no file is of a time of the mission.
+        MapError: A file is damaged or has no points.
+    """
+    sensor = _sensor(vi_map, mission, sensor_id)
+    times, files = stamped_files(folder, (".ply", ".pcd"), "--point_cloud_folder")
+    first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
+    inside = (times >= first_ns) & (times <= last_ns)
+    if not inside.any():
+        raise UserError(
+            f"--point_cloud_folder={folder}: no stamp is within the mission, which goes from "
+            f"{first_ns} to {last_ns} ns"
+        )
+    table = vi_map.resources
+    known = (table.owner_kind == ResourceOwner.SENSOR) & np.isin(table.type, (XYZ, XYZRGB, XYZI))
+    known &= np.all(table.sensor_id == from_hex(sensor), axis=1)
+    chosen = np.flatnonzero(inside & ~np.isin(times, table.timestamp_ns[known]))
+    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
+    for done, row in enumerate(chosen.tolist()):
+        progress.step(done, len(chosen), "point clouds")
+        cloud = read_cloud(files[row])
+        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+    if len(chosen):
+        vi_map = new.attached(
+            vi_map,
+            np.arange(len(chosen)),
+            np.full(len(chosen), mission),
+            ResourceOwner.SENSOR,
+            sensor_id=from_hex(sensor),
+            timestamp_ns=times[chosen],
+        )
+    kinds = sorted({resource_type(new.type_of(row)).name for row in range(len(new))})
+    outside = int(np.count_nonzero(~inside))
+    notes = (f"{outside} files are of times outside the mission",) if outside else ()
+    mission_id = to_hex(vi_map.missions.id[mission])
+    return vi_map, ImportedResources(
+        mission_id,
+        tuple(kinds),
+        len(files),
+        len(chosen),
+        len(files) - outside - len(chosen),
+        notes=notes,
+    )
+
+
+def read_cloud(path: Path) -> PlyCloud:
+    """Read a PLY or PCD file.
+
+    Raises:
+        MapError: It cannot be read, is damaged or has no points.
+    """
+    try:
+        data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="split it", error=MapError)
+    except OSError as error:
+        raise MapError(f"{path}: the cloud cannot be read ({error.strerror})") from error
+    parse = parse_pcd if path.suffix.lower() == ".pcd" else parse_ply
+    cloud = parse(data, str(path))
+    if not len(cloud.p) or not np.isfinite(cloud.p).all():
+        problem = "is not finite" if len(cloud.p) else "is empty"
+        raise MapError(f"{path}: the cloud {problem}: remove the file, or export it again")
+    return cloud
+
+
+def cloud_type(cloud: PlyCloud) -> int:
+    """Return the number of the resource type that holds all of a cloud's columns."""
+    if cloud.colours is not None:
+        return XYZRGB
+    return XYZI if cloud.intensity is not None else XYZ
+
+
+def _sensor(vi_map: VIMap, mission: int, prefix: str) -> str:
+    """Return the id of the sensor that a prefix names; without a prefix of the mission's lidar."""
+    if not prefix:
+        lidar = mission_sensor_id(vi_map, mission, MissionSensor.LIDAR)
+        if not lidar:
+            raise UserError("the mission has no lidar: name the sensor by --sensor_id")
+        return lidar
+    rigs = [s for s in vi_map.sensors.sensors.values() if isinstance(s, CameraRig)]
+    cameras = [camera.id for rig in rigs for camera in rig.cameras]
+    known = [*vi_map.sensors.sensors, *cameras]
+    matches = [key for key in known if key.startswith(prefix.lower())]
+    if len(matches) != 1:
+        kind = "ambiguous" if matches else "unknown"
+        raise UserError(f"--sensor_id={prefix} is {kind}: the map has {', '.join(known)}")
+    return matches[0]

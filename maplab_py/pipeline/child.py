@@ -1,0 +1,140 @@
+"""The fresh process of a task: started with few threads, watched, and ended with its worker."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from maplab_py.memory import resident_bytes
+from maplab_py.pipeline.orders import Order
+
+PARENT_VARIABLE = "MAPLAB_ENDS_WITH_PROCESS"
+"""Process whose end ends this one."""
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+_SECONDS_BETWEEN_LOOKS = 0.1
+STARTS = " starts "
+"""Stands in the first line of an attempt in a log."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChildEnd:
+    """How a child process ended.
+
+    Attributes:
+        status: Exit status; negative for a signal.
+        peak_gb: Largest resident memory that was seen [GB].
+        is_over_memory: It was stopped because it took more than it may.
+        is_cancelled: It was stopped because nobody wants its result.
+    """
+
+    status: int
+    peak_gb: float
+    is_over_memory: bool
+    is_cancelled: bool
+
+
+def end_with_parent() -> None:
+    """End this process soon after the worker that `PARENT_VARIABLE` names; nothing without one."""
+    text = os.environ.pop(PARENT_VARIABLE, "")  # not for shell commands of the script
+    if not text.isdigit():
+        return
+    parent = int(text)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+        os.killpg(0, signal.SIGKILL)
+
+    if os.getpgrp() == os.getpid():  # started by `run_child`: the group is this task alone
+        threading.Thread(target=watch, name="end with parent", daemon=True).start()
+
+
+def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:
+    """Run the commands of an order in a fresh process of the console, and wait for its end.
+
+    It ends with this process, whatever ends that: a killed worker leaves nobody behind who writes.
+
+    Args:
+        order: What to run.
+        is_cancelled: Asked many times a second; the process is killed when it says so.
+    """
+    switches = ["--keep_going"] * order.keep_going + ["--discard"] * order.discard
+    with order.reports.open("wb") as reports, order.log.open("ab") as log:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "maplab_py", "--json", *switches, *order.flags],
+            stdin=subprocess.PIPE,
+            stdout=reports,
+            stderr=log,
+            cwd=order.folder,
+            env=_environment(order),
+            start_new_session=True,
+        )
+        try:
+            _send(child, order.script)
+            return _watched(child, order.memory_gb * 1e9, is_cancelled)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)  # with the shell commands of its script
+            child.wait()
+
+
+def _send(child: subprocess.Popen[bytes], script: str) -> None:
+    assert child.stdin is not None
+    with contextlib.suppress(BrokenPipeError), child.stdin:
+        child.stdin.write(script.encode("utf-8", "surrogateescape"))
+
+
+def _watched(
+    child: subprocess.Popen[bytes], limit_bytes: float, is_cancelled: Callable[[], bool]
+) -> ChildEnd:
+    peak = 0.0
+    while True:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            status = child.wait(timeout=_SECONDS_BETWEEN_LOOKS)
+            return ChildEnd(status, peak / 1e9, is_over_memory=False, is_cancelled=False)
+        peak = max(peak, resident_bytes(child.pid))
+        is_over = 0.0 < limit_bytes < peak
+        if is_over or is_cancelled():
+            child.kill()
+            return ChildEnd(child.wait(), peak / 1e9, is_over, not is_over)
+
+
+def _environment(order: Order) -> dict[str, str]:
+    threads = str(order.threads or max(1, _processors() // max(1, order.tasks_per_host)))
+    return {
+        **os.environ,
+        **dict.fromkeys(_THREAD_VARIABLES, threads),
+        PARENT_VARIABLE: str(os.getpid()),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def _processors() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def first_error(log: Path) -> str:
+    """Return the first error that the last attempt has written to its log, else an empty text."""
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    attempt = text[max(0, text.rfind(STARTS)) :]
+    errors = (line for line in attempt.splitlines() if line.startswith("error: "))
+    return next(errors, "").removeprefix("error: ")

@@ -1,0 +1,39 @@
+"""By which contents a finished task is known."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from maplab_py.errors import UserError
+
+
+def program_version() -> str:
+    """Return the version of maplab-py that is installed."""
+    try:
+        return version("maplab-py")
+    except PackageNotFoundError:  # imported from a checkout that is not installed
+        return "unknown"
+
+
+def folder_hash(folder: Path) -> str:
+    """Return the SHA-256 of the names and contents of all files below a folder, hidden ones apart.
+
+    Raises:
+        UserError: A file cannot be read, or there is no such folder.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is no folder")
+    digest = hashlib.sha256()
+    try:
+        for path in sorted(folder.rglob("*")):
+            inner = path.relative_to(folder)
+            if any(part.startswith(".") for part in inner.parts) or not path.is_file():
+                continue
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "sha256").digest()
+            digest.update(inner.as_posix().encode("utf-8", "surrogateescape") + b"\0" + content)
+    except OSError as error:
+        raise UserError(f"{error.filename or folder}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()

@@ -1,0 +1,67 @@
+"""How a pipeline is run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class PipelineOptions:
+    """Where the tasks of a pipeline run, and what happens to those that fail."""
+
+    scheduler: str = option(
+        "none",
+        help="Where tasks run: none (one after another), local:N (N processes of this machine) or "
+        "tcp://HOST:PORT (a Dask scheduler with its workers).",
+    )
+    retries: int = option(
+        1, help="How often a task is tried again that failed other than by wrong usage."
+    )
+    resume: bool = option(
+        False, help="Keep the tasks that an earlier run finished; run only the others."
+    )
+    redo_changed: bool = option(
+        False, help="With --resume, run tasks again whose commands, flags or version have changed."
+    )
+    restart: bool = option(False, help="Replace the results of an earlier run.")
+    results_folder: Path | None = option(
+        None, help="Folder of results, logs and reports; empty = the file's name with _results."
+    )
+    task_memory_gb: float = option(
+        0.0,
+        help="A task that takes more is stopped and run once more alone; 0 = its share of the memory.",
+        unit="GB",
+    )
+    task_threads: int = option(0, help="Threads of a task; 0 = its share of the processors.")
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of range, or two contradict each other.
+        """
+        self.local_workers()
+        for name in ("retries", "task_memory_gb", "task_threads"):
+            if getattr(self, name) < 0:
+                raise FlagError(f"--{name}={getattr(self, name):g} is negative")
+        if self.resume and self.restart:
+            raise FlagError("--resume and --restart contradict each other: give one of them")
+        if self.redo_changed and not self.resume:
+            raise FlagError("--redo_changed needs --resume")
+
+    def local_workers(self) -> int:
+        """Return N of `local:N`, 0 for other schedulers.
+
+        Raises:
+            FlagError: The scheduler is none of the three kinds.
+        """
+        kind, _, rest = self.scheduler.partition(":")
+        if self.scheduler == "none" or (kind in ("tcp", "tls") and len(rest) > 2):
+            return 0
+        if kind == "local" and rest.isdigit() and int(rest) > 0:
+            return int(rest)
+        raise FlagError(f"--scheduler={self.scheduler}: wants none, local:N or tcp://HOST:PORT")

@@ -1,0 +1,135 @@
+"""Records of finished tasks: what a later run needs to know that it need not run them again."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from maplab_py.atomic import write_file
+from maplab_py.errors import UserError
+from maplab_py.pipeline.tasks import Task
+
+FOLDER = "tasks"
+"""Folder of records, logs and reports in the folder of results."""
+_FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """A finished task.
+
+    Attributes:
+        format: Version of the record.
+        stage: Name of its stage.
+        name: Name of the task.
+        commands: Commands of its stage, before folders are put in.
+        flags: Lasting flags by name.
+        version: Version of maplab-py.
+        inputs: Map folders that it read, in their order, each with its SHA-256.
+        result: SHA-256 of the result.
+        seconds: Run time [s].
+        peak_gb: Largest resident memory [GB].
+        attempts: How often it was started.
+        worker: Who finished it.
+    """
+
+    format: int
+    stage: str
+    name: str
+    commands: tuple[str, ...]
+    flags: dict[str, str]
+    version: str
+    inputs: tuple[tuple[str, str], ...]
+    result: str
+    seconds: float
+    peak_gb: float
+    attempts: int
+    worker: str
+
+
+def record_of(task: Task, flags: dict[str, str], version: str) -> Record:
+    """Return the record of a task that is not finished: what a finished one must agree with."""
+    return Record(
+        _FORMAT, task.stage, task.name, task.commands, flags, version, (), "", 0.0, 0.0, 0, ""
+    )
+
+
+class Records:
+    """The records in a folder of results."""
+
+    def __init__(self, results: Path) -> None:
+        """Use a folder, which need not exist."""
+        self.folder = results / FOLDER
+
+    def path(self, task: Task, suffix: str) -> Path:
+        """Return the path of one of a task's files: `.json`, `.jsonl` or `.log`."""
+        return self.folder / task.stage / f"{task.name}{suffix}"
+
+    def exist(self) -> bool:
+        """Tell whether an earlier run has finished tasks."""
+        return next(self.folder.glob("*/*.json"), None) is not None
+
+    def read(self, task: Task) -> Record | None:
+        """Return the record of a task, None where it is not finished.
+
+        Raises:
+            UserError: The record is damaged.
+        """
+        path = self.path(task, ".json")
+        try:
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            commands = tuple(map(str, content["commands"]))
+            inputs = tuple((str(folder), str(digest)) for folder, digest in content["inputs"])
+            record = Record(**{**content, "commands": commands, "inputs": inputs})
+            is_sound = record.format == _FORMAT and isinstance(record.flags, dict)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError):
+            is_sound = False
+        if not is_sound:
+            raise UserError(f"{path}: is damaged; delete it to run {task.title} again")
+        return record
+
+    def write(self, task: Task, record: Record) -> None:
+        """Write the record of a finished task, completely or not at all."""
+        text = json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True) + "\n"
+        write_file(self.path(task, ".json"), [text.encode()])
+
+    def forget(self, task: Task) -> None:
+        """Delete the record of a task that runs again."""
+        self.path(task, ".json").unlink(missing_ok=True)
+
+
+def change(old: Record, new: Record) -> str:
+    """Return in words what differs in commands, flags and version; empty where nothing does.
+
+    Differing inputs are no change of the request: their tasks simply run again.
+    """
+    if old.version != new.version:
+        return f"maplab-py was {old.version} and is {new.version} now"
+    for name in sorted(old.flags.keys() | new.flags.keys()):
+        before, now = old.flags.get(name), new.flags.get(name)
+        if before != now:
+            return f"--{name} was {_given(before)} and is {_given(now)} now"
+    if old.commands == new.commands:
+        return ""
+    pairs = itertools.zip_longest(old.commands, new.commands)
+    before, now = next(pair for pair in pairs if pair[0] != pair[1])
+    return f"'{before or 'nothing'}' is '{now or 'nothing'}' now"
+
+
+def has_inputs(record: Record, inputs: Sequence[tuple[str, str]]) -> bool:
+    """Tell whether a task was made from these contents; the folders may have moved as a whole."""
+
+    def known(pairs: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
+        return [(Path(folder).name, digest) for folder, digest in pairs]
+
+    return known(record.inputs) == known(inputs)
+
+
+def _given(text: str | None) -> str:
+    return "not given" if text is None else text

@@ -1,0 +1,186 @@
+"""Consistency checks of a map while it is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.errors import MapError
+from maplab_py.report import counted
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.extension_fields import (
+    LOOP_RECORD,
+    RECORD_SHARE,
+    packed_size,
+    read_extension,
+)
+from maplab_py.storage.map_files import COPY_AGAIN, METADATA, RESOURCE_INFO, SENSORS, FileKind
+from maplab_py.storage.message_ids import ids_of, unknown_bytes
+from maplab_py.storage.tables_from_messages import Content
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import Violation, check_loaded
+from maplab_py.vimap.ids import IdIndex, to_hex
+
+_FIELDS = {
+    FileKind.MISSIONS: ("missions", "mission_ids", "baseframes", "baseframe_ids"),
+    FileKind.VERTICES: ("vertices", "vertex_ids"),
+    FileKind.EDGES: ("edges", "edge_ids"),
+    FileKind.LANDMARK_INDEX: ("landmark_index", "legacy_landmark_ids"),
+}
+_PAIRS = (
+    ("vertices", "vertex_ids"),
+    ("edges", "edge_ids"),
+    ("missions", "mission_ids"),
+    ("baseframes", "baseframe_ids"),
+)
+_NAMED = 3
+"""Ids that a note names."""
+
+
+def check_files(files: Sequence[tuple[FileKind, Path]], messages: Sequence[pb.VIMap]) -> None:
+    """Check that every file holds the kind that it is listed with, with one id per entity.
+
+    An empty file is valid only as the single file of its kind.
+
+    Raises:
+        MapError: The check fails; names the file and the field.
+    """
+    kinds = [kind for kind, _ in files]
+    has_roots = any(any(m.root_vertex_id.words) for message in messages for m in message.missions)
+    has_vertices = any(message.vertices for message in messages)
+    needed = {FileKind.MISSIONS: has_vertices, FileKind.VERTICES: has_roots}
+    for (kind, path), message in zip(files, messages, strict=True):
+        held = {field.name for field, _ in message.ListFields()}
+        foreign = sorted(held - set(_FIELDS[kind]))
+        if foreign:
+            raise MapError(
+                f"{path}: is listed as {kind.name.lower()} (file_type {kind:d}) but holds "
+                f"{', '.join(foreign)}"
+            )
+        for name, ids in _PAIRS:
+            entities, there = len(getattr(message, name)), len(getattr(message, ids))
+            if entities != there:
+                raise MapError(f"{path}: holds {entities} {name} but {there} {ids}")
+        if not held and (kinds.count(kind) > 1 or needed.get(kind, False)):
+            raise MapError(f"{path}: is empty: it holds no {_FIELDS[kind][0]}; {COPY_AGAIN}")
+
+
+def edge_kinds(content: Content) -> list[str]:
+    """Return the measurement kind of every edge, which is the name of its only field.
+
+    Raises:
+        MapError: An edge has none or several; names file and id.
+    """
+    kinds = []
+    for row, edge in enumerate(content.edges):
+        names = [field.name for field, _ in edge.ListFields()]
+        if len(names) != 1:
+            said = " and ".join(names) if names else "no known kind of measurement"
+            raise MapError(f"{content.name('edges', row)}: holds {said} instead of one")
+        kinds.append(names[0])
+    return kinds
+
+
+def check_listed_edges(
+    content: Content, kinds: Sequence[str], vertex_index: IdIndex, *, repair: bool
+) -> list[str]:
+    """Compare the edges that vertices list with the edges that start and end there.
+
+    Args:
+        content: Entities of all files.
+        kinds: Kind of every edge.
+        vertex_index: Rows of vertices in file order.
+        repair: Use the edges instead of raising an error.
+
+    Returns:
+        Notes.
+
+    Raises:
+        MapError: A vertex lists an edge that is not in the map or not at this vertex.
+    """
+    edge_index = IdIndex(content.edge_ids)
+    wrong = unlisted = 0
+    for field, end in (("outgoing_edges", "from_vertex_id"), ("incoming_edges", "to_vertex_id")):
+        lists = [getattr(vertex, field) for vertex in content.vertices]
+        owner = np.repeat(np.arange(len(lists)), [len(ids) for ids in lists])
+        listed = ids_of((i for ids in lists for i in ids), f"{field} of a vertex")
+        edges = edge_index.rows(listed)
+        ends = [getattr(getattr(e, k), end) for e, k in zip(content.edges, kinds, strict=True)]
+        vertex = vertex_index.rows(ids_of(ends, f"{end} of an edge"))
+        is_there = edges >= 0
+        is_right = is_there & (np.append(vertex, -1)[edges] == owner)
+        bad = np.flatnonzero(~is_right)
+        if len(bad) and not repair:
+            first = int(bad[0])
+            what = "is not at this vertex" if is_there[first] else "is not in the map"
+            raise MapError(
+                f"{content.name('vertices', int(owner[first]))}: edge {to_hex(listed[first])} of "
+                f"its {field} {what}; load with --repair to use the edges"
+            )
+        wrong += len(bad)
+        unlisted += len(ends) - len(np.unique(edges[is_right]))
+    notes = []
+    if wrong:
+        notes.append(f"{wrong} listed ends of edges repaired")
+    if unlisted:
+        notes.append(f"{unlisted} ends of edges are not listed by their vertices; saving adds them")
+    return notes
+
+
+def check_records(content: Content, max_bytes: int) -> None:
+    """Check that the loop-closure records of missions fit into memory.
+
+    Raises:
+        MapError: A record is too large; names file and mission. Damaged records are not reported here.
+    """
+    left = max_bytes // RECORD_SHARE
+    for row, mission in enumerate(content.missions):
+        record = read_extension(unknown_bytes(mission), LOOP_RECORD)
+        if record is None:
+            continue
+        left -= packed_size(record, left)
+        if left < 0:
+            raise MapError(
+                f"{content.name('missions', row)}: its record of loop closures unpacks to more "
+                f"than {max_bytes / RECORD_SHARE / 1e6:g} MB (a quarter of "
+                "--proto_max_size_megabytes; raise it if the record is really that large)"
+            )
+
+
+def absent_parts(folder: Path, vi_map: VIMap) -> list[str]:
+    """Return a note for each optional part that the folder lacks."""
+    notes = [f"{name} is not there" for name in (METADATA,) if not (folder / name).is_file()]
+    if len(vi_map.resources) and not (folder / RESOURCE_INFO).is_file():
+        notes.append(f"{RESOURCE_INFO} is not there: resources are looked up in the map's folder")
+    without = vi_map.sensors.without_extrinsics()
+    if without:
+        notes.append(
+            f"{SENSORS}: {counted(len(without), 'sensor')} without extrinsics, taken to be at the "
+            f"base sensor: {_some(without)}"
+        )
+    return notes
+
+
+def consistency_notes(vi_map: VIMap) -> list[str]:
+    """Return the violations of `check_map_consistency` that do not prevent loading.
+
+    Raises:
+        MapError: The map violates a rule that every command requires; names the rule and an id.
+    """
+    refused, tolerated = check_loaded(vi_map)
+    if refused:
+        raise MapError(f"{_said(refused[0])}; check_map_consistency lists such rules")
+    return [_said(violation) for violation in tolerated]
+
+
+def _said(violation: Violation) -> str:
+    where = f": {_some(violation.where)}" if violation.where else ""
+    return f"{violation.rule} ({violation.count}){where}"
+
+
+def _some(names: Sequence[Any]) -> str:
+    more = ", ..." if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

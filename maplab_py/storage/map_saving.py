@@ -1,0 +1,204 @@
+"""Save a map folder: lossless, as C++ maplab writes it, and atomically."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from google.protobuf import text_format
+from google.protobuf.message import Message
+
+from maplab_py.atomic import recover, replaced_folder
+from maplab_py.cancellation import check_cancelled
+from maplab_py.errors import UserError
+from maplab_py.progress import SILENT, Progress
+from maplab_py.report import Report
+from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.storage import checksums, mission_names, tables_to_messages
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.descriptor_layout import LayoutChoice, with_layout
+from maplab_py.storage.map_files import (
+    METADATA,
+    RESOURCE_INFO,
+    SENSORS,
+    VI_MAP_FOLDER,
+    VI_MAP_METADATA,
+    is_map_folder,
+)
+from maplab_py.storage.new_resources import copied_files, with_staged_in_place
+from maplab_py.vimap import VIMap
+
+RESOURCES = "resources"
+_GZIP_LEVEL = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class SaveReport(Report):
+    """What was saved."""
+
+    folder: str
+    files: int
+    megabytes: float  # on disk, resources left out
+    fingerprint: str  # of the files; equal maps have equal ones
+    seconds: float
+
+
+def save_map(
+    vi_map: VIMap,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    known: str = "",
+    force: bool = False,
+    compress: bool = True,
+    descriptor_layout: LayoutChoice = "as_loaded",
+    resource_files: Sequence[tuple[Path, Path]] = (),
+    progress: Progress = SILENT,
+) -> SaveReport:
+    """Save a map atomically: the folder always holds the complete old or the complete new map.
+
+    Other files in the folder, such as resources, are kept. Staged resources are copied to the
+    folder that the map uses for new resources.
+
+    Args:
+        vi_map: Map.
+        folder: Map folder; made with its parents when it does not exist.
+        overwrite: Replace a map that is there.
+        known: Fingerprint of the map that is there as the caller knows it (see
+            `checksums.fingerprint`): that one is replaced without `overwrite`, and another one
+            only by `force`.
+        force: Replace any existing map.
+        compress: Write gzip files, as maplab does.
+        descriptor_layout: Layout of the descriptors; "as_loaded" writes every frame in the layout
+            that it was loaded with and new frames in that of maplab 2.2.
+        resource_files: Files that come into the map's own resource folder, with their paths in it.
+        progress: Shown while writing.
+
+    Raises:
+        UserError: The folder holds a map that must not be replaced, or something else than a map,
+            or it cannot be written; or the layout cannot hold the descriptors.
+    """
+    began = time.perf_counter()
+    resources = with_staged_in_place(with_layout(vi_map, descriptor_layout))
+    folder = Path(folder).absolute()
+    recover(folder)
+    check_target(folder, overwrite=overwrite, known=known, force=force)
+    with copied_files(resources.to_external), replaced_folder(folder) as temporary:
+        check_target(folder, overwrite=overwrite, known=known, force=force)
+        files, fingerprint = _write(resources.vi_map, temporary, compress, progress)
+        size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
+        _keep(folder, temporary)
+        _add_resources((*resource_files, *resources.into_map), temporary)
+    return SaveReport(str(folder), files, size / 1e6, fingerprint, time.perf_counter() - began)
+
+
+def check_target(
+    folder: Path, *, overwrite: bool = False, known: str = "", force: bool = False
+) -> None:
+    """Check that a map may be saved to a folder; see `save_map`.
+
+    Raises:
+        UserError: It holds a map that must not be replaced, or something else than a map.
+    """
+    try:
+        if not folder.exists():
+            return
+        if not folder.is_dir():
+            raise UserError(f"{folder} is not a folder; give a folder")
+        if not is_map_folder(folder):
+            if any(folder.iterdir()):
+                raise UserError(f"{folder} is not empty and not a map; choose another folder")
+        elif force:
+            return
+        elif known and checksums.fingerprint(folder) != known:
+            raise UserError(
+                f"{folder} has been changed by another program since this map was loaded or saved; "
+                "save to another --map_folder, or give --force to replace it"
+            )
+        elif not known and not overwrite:
+            raise UserError(f"{folder} holds a map already; use --overwrite to replace it")
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
+
+
+def _write(vi_map: VIMap, folder: Path, compress: bool, progress: Progress) -> tuple[int, str]:
+    inner = folder / VI_MAP_FOLDER
+    inner.mkdir()
+    listing = pb.VIMapMetadata()
+    for kind, name, message in tables_to_messages.messages(vi_map):
+        check_cancelled()
+        progress.step(len(listing.files), len(vi_map.vertices) // 50 + 4, "write files")
+        _write_message(inner / name, message, compress)
+        listing.files.add(file_type=kind, path=name)
+    _write_text(inner / VI_MAP_METADATA, text_format.MessageToString(listing))
+    _write_text(inner / SENSORS, write_sensors(vi_map.sensors))
+    _write_message(folder / RESOURCE_INFO, tables_to_messages.resource_info(vi_map), compress)
+    metadata = pb.MetaData(
+        map_folder=vi_map.metadata.map_folder or ".",
+        map_description=vi_map.metadata.description,
+        resource_folder_in_use=vi_map.metadata.resource_folder_in_use,
+        map_resource_folder=vi_map.metadata.map_resource_folder,
+        external_resource_folders=vi_map.metadata.external_resource_folders,
+    )
+    _write_text(folder / METADATA, text_format.MessageToString(metadata))
+    names = mission_names.text_of_names(vi_map)
+    if names:
+        _write_text(folder / mission_names.FILE_NAME, names)
+    return len(listing.files), checksums.write(folder)
+
+
+def _write_message(path: Path, message: Message, compress: bool) -> None:
+    data = message.SerializeToString(deterministic=True)
+    path.write_bytes(gzip.compress(data, _GZIP_LEVEL, mtime=0) if compress else data)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _keep(old: Path, new: Path) -> None:
+    """Link the files of the old folder that do not belong to its map into the new one."""
+    if not old.is_dir():
+        return
+    for entry in os.scandir(old):
+        belongs = entry.name in (checksums.FILE_NAME, mission_names.FILE_NAME)
+        if not belongs and not (new / entry.name).exists():
+            _bring(entry, new / entry.name)
+
+
+def _bring(entry: os.DirEntry[str], target: Path) -> None:
+    """Link a file or folder (copy it where links do not work); symbolic links stay what they are."""
+    if entry.is_symlink():
+        target.symlink_to(os.readlink(entry.path))
+    elif entry.is_dir():
+        target.mkdir()
+        shutil.copystat(entry.path, target)
+        for inner in os.scandir(entry.path):
+            _bring(inner, target / inner.name)
+    else:
+        _link_or_copy(entry.path, str(target))
+
+
+def _add_resources(files: Sequence[tuple[Path, Path]], new: Path) -> None:
+    for source, relative in files:
+        target = new / RESOURCES / relative
+        if target.exists() or target.is_symlink():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_symlink():
+            target.symlink_to(os.readlink(source))
+        else:
+            _link_or_copy(str(source), str(target))
+
+
+def _link_or_copy(source: str, target: str) -> str:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+    return target

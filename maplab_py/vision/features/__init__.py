@@ -1,0 +1,1 @@
+"""Keypoints of images: preparation of images, detection on a grid, binary descriptors."""

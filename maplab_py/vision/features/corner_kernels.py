@@ -1,0 +1,114 @@
+"""Compiled kernels: strength of corners, and the choice of strong corners that are far apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.compilation import compiled
+
+WINDOW_HALF_PX = 3
+"""Half the side of the window in which a corner's gradients count."""
+
+
+class Selection(NamedTuple):
+    """What a choice of corners has to keep to; changed by `select_corners`."""
+
+    free: U8  # (H, W) not zero where a corner may be
+    cell_count: I64  # (rows, columns) keypoints of each cell
+    cell_limit: int
+    limit: int  # most new corners
+    radius_px: float
+
+
+@compiled()
+def corner_strengths(image, uv, strength):  # type: ignore[no-untyped-def]
+    """Fill in the smaller eigenvalue of the mean outer product of gradients about each corner.
+
+    Source: J. Shi, C. Tomasi, Good Features to Track, CVPR 1994. Corners too near to the border
+    get 0.
+
+    Args:
+        image: Grey values (H, W).
+        uv: Whole pixels (N, 2).
+        strength: Filled in (N,), [grey^2 / px^2].
+    """
+    height, width = image.shape
+    reach = WINDOW_HALF_PX + 1
+    samples = (2 * WINDOW_HALF_PX + 1) ** 2
+    for n in range(len(uv)):
+        u, v = uv[n, 0], uv[n, 1]
+        strength[n] = 0.0
+        if u < reach or v < reach or u >= width - reach or v >= height - reach:
+            continue
+        xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
+        for row in range(v - WINDOW_HALF_PX, v + WINDOW_HALF_PX + 1):
+            for column in range(u - WINDOW_HALF_PX, u + WINDOW_HALF_PX + 1):
+                dx = np.int64(image[row, column + 1]) - np.int64(image[row, column - 1])
+                dy = np.int64(image[row + 1, column]) - np.int64(image[row - 1, column])
+                xx += dx * dx
+                xy += dx * dy
+                yy += dy * dy
+        mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        # central differences span two pixels
+        strength[n] = (mean - np.sqrt(half * half + float(xy) * xy)) / (4.0 * samples)
+
+
+@compiled()
+def occupy(free, u, v, radius_px):  # type: ignore[no-untyped-def]
+    """Set the disc about a pixel to zero."""
+    height, width = free.shape
+    reach = int(radius_px)
+    for row in range(max(v - reach, 0), min(v + reach + 1, height)):
+        for column in range(max(u - reach, 0), min(u + reach + 1, width)):
+            if (row - v) ** 2 + (column - u) ** 2 <= radius_px * radius_px:
+                free[row, column] = 0
+
+
+@compiled()
+def occupy_all(selection, uv):  # type: ignore[no-untyped-def]
+    """Count keypoints uv (K, 2), whole pixels, that exist already; others keep away from them."""
+    height, width = selection.free.shape
+    rows, columns = selection.cell_count.shape
+    for k in range(len(uv)):
+        u, v = uv[k, 0], uv[k, 1]
+        occupy(selection.free, u, v, selection.radius_px)
+        if 0 <= u < width and 0 <= v < height:
+            selection.cell_count[v * rows // height, u * columns // width] += 1
+
+
+@compiled()
+def select_corners(selection, uv, order, is_selected):  # type: ignore[no-untyped-def]
+    """Mark corners, in the given order, that lie in free places of cells that have room."""
+    height, width = selection.free.shape
+    rows, columns = selection.cell_count.shape
+    count = 0
+    for n in order:
+        if count >= selection.limit:
+            break
+        u, v = uv[n, 0], uv[n, 1]
+        row, column = v * rows // height, u * columns // width
+        if selection.free[v, u] == 0 or selection.cell_count[row, column] >= selection.cell_limit:
+            continue
+        is_selected[n] = True
+        selection.cell_count[row, column] += 1
+        occupy(selection.free, u, v, selection.radius_px)
+        count += 1
+    return count
+
+
+def make_selection(
+    free: U8, cells: tuple[int, int], cell_limit: int, radius_px: float
+) -> Selection:
+    """Return an empty choice in a copy of the free places."""
+    count: I64 = np.zeros(cells, dtype=np.int64)
+    return Selection(free.copy(), count, cell_limit, 0, radius_px)
+
+
+def strengths(image: U8, uv: I64) -> F64:
+    """Return the strengths (N,) of corners at whole pixels (N, 2); see `corner_strengths`."""
+    strength = np.empty(len(uv))
+    corner_strengths(image, uv, strength)
+    return strength

@@ -1,0 +1,51 @@
+"""The descriptor indices that can be chosen by name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.vision.descriptors import pack_words
+from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule
+from maplab_py.vision.projection import learn_projection
+
+INDEX_ENGINES = ("imi", "kd", "hamming")
+
+
+def make_index(
+    engine: str, database: DescriptorSet, *, seed: int, words_per_query: int
+) -> DescriptorIndex:
+    """Build an index.
+
+    Args:
+        engine: One of INDEX_ENGINES: "imi" (inverted multi-index over projected descriptors),
+            "kd" (KD-tree, exact in the projected space) or "hamming" (exhaustive, exact).
+        database: What to search in.
+        seed: Seed of the vocabulary.
+        words_per_query: Cells of the multi-index that are searched per query.
+    """
+    if engine == "hamming":
+        from maplab_py.vision.hamming_index import HammingIndex
+
+        return HammingIndex(database)
+    if engine == "kd":
+        from maplab_py.vision.tree_index import TreeIndex
+
+        return TreeIndex(database)
+    from maplab_py.vision.multi_index import InvertedMultiIndex
+
+    return InvertedMultiIndex(database, seed=seed, cells_per_query=words_per_query)
+
+
+def compile_kernels() -> None:
+    """Compile the projection and the search of every index on random tracks."""
+    label = np.repeat(np.arange(60), 5)
+    descriptors = np.random.default_rng(0).integers(0, 256, (60, 8), dtype=np.uint8)[label]
+    database = DescriptorSet(
+        projected=learn_projection(descriptors, label, dimensions=4).project(descriptors),
+        words=pack_words(descriptors),
+        label=label,
+        session=np.zeros(len(label), dtype=np.int32),
+        time_ns=np.zeros(len(label), dtype=np.int64),
+    )
+    for engine in INDEX_ENGINES:
+        make_index(engine, database, seed=0, words_per_query=4).nearest(database, 2, MatchRule())

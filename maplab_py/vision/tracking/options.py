@@ -1,0 +1,75 @@
+"""Options of tracking, with maplab's flag names where it has them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+from maplab_py.vision.features.options import FeatureOptions, check_range
+
+_HALF_A_DEGREE = 1.0 - math.cos(math.radians(0.5))
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackingOptions(FeatureOptions):
+    """How keypoints are detected, followed from image to image, and found again in other cameras."""
+
+    flag_prefix: ClassVar[str] = "feature_tracking_"
+
+    keypoint_sigma_px: float = option(
+        0.8, help="Standard deviation of a tracked keypoint", unit="px"
+    )
+    patch_size_px: int = option(15, help="Side of the patches that are compared", unit="px")
+    pyramid_levels: int = option(3, help="Levels of half resolution above the image")
+    forward_backward_px: float = option(
+        0.5, help="Largest error of a keypoint that is tracked forwards and back again", unit="px"
+    )
+    two_pt_ransac_threshold: float = option(
+        _HALF_A_DEGREE,
+        help="Two-point RANSAC: largest error of an inlier, as 1 - cos(angle)",
+        flag="feature_tracker_two_pt_ransac_threshold",
+    )
+    two_pt_ransac_max_iterations: int = option(
+        200,
+        help="Two-point RANSAC: largest number of iterations",
+        flag="feature_tracker_two_pt_ransac_max_iterations",
+    )
+    epipolar_gate_px: float = option(
+        2.0,
+        help="Largest distance of a keypoint to its epipolar line after the refinement of turn and "
+        "direction, and between the cameras of a rig",
+        unit="px",
+    )
+    stereo_distance_m: float = option(
+        5.0, help="Distance at which other cameras look for a point of unknown distance", unit="m"
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of its range, or the descriptor is not available.
+        """
+        super().check()
+        prefix = self.flag_prefix
+        for flag, value, low, high in (
+            (prefix + "keypoint_sigma_px", self.keypoint_sigma_px, 1e-3, 100),
+            (prefix + "patch_size_px", self.patch_size_px, 3, 101),
+            (prefix + "pyramid_levels", self.pyramid_levels, 0, 10),
+            (prefix + "forward_backward_px", self.forward_backward_px, 1e-3, 100),
+            ("feature_tracker_two_pt_ransac_threshold", self.two_pt_ransac_threshold, 1e-9, 0.5),
+            (
+                "feature_tracker_two_pt_ransac_max_iterations",
+                self.two_pt_ransac_max_iterations,
+                1,
+                100_000,
+            ),
+            (prefix + "epipolar_gate_px", self.epipolar_gate_px, 1e-3, 1000),
+            (prefix + "stereo_distance_m", self.stereo_distance_m, 1e-2, 1e6),
+        ):
+            check_range(flag, value, low, high)
+        if self.patch_size_px % 2 == 0:
+            raise FlagError(f"--{prefix}patch_size_px={self.patch_size_px}: wants an odd number")

@@ -1,0 +1,211 @@
+"""maplab's dense reconstruction plugin: depth of stereo images, fusion, meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT, FusionOptions
+from maplab_py.algorithms.dense.stereo.options import BmOptions, SgbmOptions, StereoOptions
+from maplab_py.plugin import (
+    ALL_MISSIONS,
+    CommandContext,
+    MissionChoice,
+    check_writable,
+    command,
+)
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.dense.clouds import ConvertedDepthMaps
+    from maplab_py.algorithms.dense.fusion.fusion import FusionReport
+    from maplab_py.algorithms.dense.fusion.meshing import MeshReport
+    from maplab_py.algorithms.dense.stereo.reconstruction import StereoReport
+
+_STEREO, _SGBM, _BM = StereoOptions(), SgbmOptions(), BmOptions()
+_FUSION = FusionOptions()
+
+
+@command(
+    "stereo_dense_reconstruction",
+    "stereo_dense",
+    "sdr",
+    example="stereo_dense_reconstruction --dense_stereo_multi_view=false",
+    see_also=("import_images", "convert_all_depth_maps_to_point_clouds"),
+)
+def stereo_dense_reconstruction(
+    context: CommandContext,
+    *,
+    missions: MissionChoice = ALL_MISSIONS,
+    dense_depth_resource_output_type: int = 8,
+    overwrite: bool = False,
+    stereo: StereoOptions = _STEREO,
+    sgbm: SgbmOptions = _SGBM,
+    bm: BmOptions = _BM,
+) -> StereoReport:
+    """Compute depth from the stereo images of every vertex, by OpenCV's block matching.
+
+    Images of every camera model are rectified. Pixels that the right image, or the depth of
+    neighbouring vertices, does not confirm are removed. Depth is at the pixels of the left camera's
+    distorted image. The files are written into the map when it is saved.
+
+    Args:
+        dense_depth_resource_output_type: 8 = raw depth maps, 17 = clouds with colours.
+        overwrite: Replace what frames have of this type.
+    """
+    from maplab_py.algorithms.dense.stereo.reconstruction import StereoSettings, reconstruct_stereo
+
+    vi_map, report = reconstruct_stereo(
+        context.vi_map,
+        context.map_folder or Path(),
+        missions.rows(context.vi_map),
+        StereoSettings(stereo, sgbm, bm),
+        output_type=dense_depth_resource_output_type,
+        overwrite=overwrite,
+        progress=context.progress,
+    )
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "convert_all_depth_maps_to_point_clouds",
+    example="convert_all_depth_maps_to_point_clouds",
+    see_also=("stereo_dense_reconstruction", "visualize_xyzrgbn_pointclouds"),
+)
+def convert_all_depth_maps_to_point_clouds(context: CommandContext) -> ConvertedDepthMaps:
+    """Make a point cloud of every depth map, with colours where its frame has an image.
+
+    Frames that have a cloud keep it. The files are written into the map when it is saved.
+    """
+    from maplab_py.algorithms.dense.clouds import convert_depth_maps
+
+    vi_map, report = convert_depth_maps(
+        context.vi_map, context.map_folder or Path(), progress=context.progress
+    )
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "create_tsdf_from_depth_resource",
+    "tsdf",
+    "depth_fusion",
+    example="tsdf --dense_tsdf_voxel_size_m=0.1 --dense_result_mesh_output_file=room.ply",
+    writes_files=True,
+    see_also=("stereo_dense_reconstruction", "create_mesh_from_tsdf_grid"),
+)
+def create_tsdf_from_depth_resource(
+    context: CommandContext,
+    *,
+    missions: MissionChoice = ALL_MISSIONS,
+    dense_depth_resource_input_type: str = "",
+    options: FusionOptions = _FUSION,
+    update: bool = False,
+    dense_update_threshold_m: float = 0.01,
+    dense_max_memory_gb: float = 0.0,
+    dense_result_mesh_output_file: Path | None = None,
+    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    overwrite: bool = False,
+) -> FusionReport:
+    """Fuse the depth of cameras into a grid of truncated signed distances.
+
+    Missions with known base frames share a grid; each other one has its own. The grid is a resource of
+    its first mission and is written into the map when it is saved.
+
+    Args:
+        dense_depth_resource_input_type: Number or name of the resource type to fuse: depth maps (8, 9) or
+            clouds of cameras (16, 17, 21); empty = the first of 9, 8, 17, 16, 21 that there is.
+        update: Do not fuse again: take the depth maps whose poses have changed out of the grid and add
+            them at their present poses.
+        dense_update_threshold_m: Depth maps that moved by less stay as they are.
+        dense_max_memory_gb: Memory that the grid may take; 0 = most of what is available.
+        dense_result_mesh_output_file: Also write the mesh: .ply, .obj, .stl or .glb.
+        dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
+        overwrite: Replace grids that the missions have, and the file of the mesh.
+    """
+    from maplab_py.algorithms.dense.fusion.fusion import fuse_depth, update_grids
+    from maplab_py.memory import memory_limited
+    from maplab_py.storage.resource_types import resource_type_of
+
+    if dense_result_mesh_output_file is not None:
+        _check_mesh(dense_result_mesh_output_file, overwrite=overwrite)
+    rows = missions.rows(context.vi_map)
+    folder = context.map_folder or Path()
+    with memory_limited(dense_max_memory_gb, "--dense_max_memory_gb"):
+        if update:
+            vi_map, report = update_grids(
+                context.vi_map,
+                folder,
+                rows,
+                threshold_m=dense_update_threshold_m,
+                progress=context.progress,
+            )
+        else:
+            given = dense_depth_resource_input_type
+            flag = "--dense_depth_resource_input_type"
+            vi_map, report = fuse_depth(
+                context.vi_map,
+                folder,
+                rows,
+                options,
+                input_type=resource_type_of(given, flag).number if given else None,
+                overwrite=overwrite,
+                progress=context.progress,
+            )
+    if dense_result_mesh_output_file is not None:
+        from maplab_py.algorithms.dense.fusion.meshing import write_map_mesh
+
+        file = dense_result_mesh_output_file
+        write_map_mesh(vi_map, folder, file, rows, dense_tsdf_mesh_min_weight, overwrite=overwrite)
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "create_mesh_from_tsdf_grid",
+    "export_tsdf",
+    example="create_mesh_from_tsdf_grid --dense_result_mesh_output_file=room.glb",
+    writes_files=True,
+    see_also=("create_tsdf_from_depth_resource",),
+)
+def create_mesh_from_tsdf_grid(
+    context: CommandContext,
+    *,
+    dense_result_mesh_output_file: Path,
+    missions: MissionChoice = ALL_MISSIONS,
+    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    dense_result_mesh_colours: bool = False,
+    overwrite: bool = False,
+) -> MeshReport:
+    """Write the surface of the grids as a triangle mesh, in the global frame.
+
+    The surface passes only through cells all of whose eight voxels have been observed.
+
+    Args:
+        dense_result_mesh_output_file: File to write: .ply, .obj, .stl or .glb.
+        dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
+        dense_result_mesh_colours: Give the vertices the colours of the images in which they are seen; needs
+            images and depth maps.
+        overwrite: Replace a file that exists.
+    """
+    from maplab_py.algorithms.dense.fusion.meshing import write_map_mesh
+
+    _check_mesh(dense_result_mesh_output_file, overwrite=overwrite)
+    return write_map_mesh(
+        context.vi_map,
+        context.map_folder or Path(),
+        dense_result_mesh_output_file,
+        missions.rows(context.vi_map),
+        dense_tsdf_mesh_min_weight,
+        with_colours=dense_result_mesh_colours,
+        overwrite=overwrite,
+        progress=context.progress,
+    )
+
+
+def _check_mesh(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file of a mesh before any work is done."""
+    from maplab_py.interop.mesh_files import check_mesh_path
+
+    check_mesh_path(path)
+    check_writable(path, overwrite=overwrite)

@@ -1,0 +1,276 @@
+"""Commands that read calibrations, trajectories and positions of other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from maplab_py.algorithms.external_poses.options import GpsOptions, TrajectoryOptions
+from maplab_py.plugin import (
+    ALL_MISSIONS,
+    CommandContext,
+    MissionChoice,
+    Report,
+    command,
+    write_text,
+)
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.external_poses.reports import GpsImport, TrajectoryImport
+    from maplab_py.algorithms.self_calibration.reports import ComparedParameter
+    from maplab_py.interop.calibration_import import CalibrationFile
+    from maplab_py.interop.trajectories import Trajectory
+
+_TRAJECTORY, _GPS = TrajectoryOptions(), GpsOptions()
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadCamera:
+    """A camera of a calibration file."""
+
+    projection: str
+    distortion: str
+    width_px: int
+    height_px: int
+    time_shift_s: float  # t_imu - t_camera
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationImport(Report):
+    """What a calibration file has, and what became of it."""
+
+    file: Path
+    format: str
+    cameras: tuple[ReadCamera, ...]
+    has_imu: bool
+    has_imu_intrinsics: bool
+    sensors_file: Path | None = None  # that was written
+    changes: tuple[ComparedParameter, ...] = ()  # of the map's device
+
+    @property
+    def advice(self) -> str:
+        """Say what can be done with a file that was only looked at."""
+        if self.sensors_file is not None or self.changes:
+            return ""
+        return "--sensors_file=sensors.yaml writes it for maplab, --apply gives it to the map"
+
+
+@command(
+    "import_calibration",
+    example="import_calibration kalibr/camchain-imucam.yaml --imu_calibration_file=kalibr/imu.yaml --apply",
+    see_also=("export_calibration", "apply_calibration", "recording_info"),
+    needs_map=False,
+    writes_files=True,
+)
+def import_calibration(
+    context: CommandContext,
+    calibration_file: Path,
+    *,
+    imu_calibration_file: Path | None = None,
+    sensors_file: Path | None = None,
+    apply: bool = False,
+    apply_imu_noise: bool = True,
+    chosen: MissionChoice = ALL_MISSIONS,
+    overwrite: bool = False,
+) -> CalibrationImport:
+    """Read a calibration of kalibr, EuRoC, OpenVINS or Basalt, for sensors.yaml or for the map.
+
+    The format follows from the content. In a map poses and stamps are unchanged: a time shift that differs
+    from that of the recording becomes an image delay.
+
+    Args:
+        calibration_file: kalibr's camera chain or IMU file, OpenVINS' estimator_config.yaml, a sensor.yaml
+            of EuRoC or the folder with all of them, Basalt's json, or sensors.yaml.
+        imu_calibration_file: IMU file that belongs to a camera chain, or to the sensor.yaml of a camera.
+        sensors_file: Write sensors.yaml for maplab here.
+        apply: Give the calibration to the device of the map.
+        apply_imu_noise: With --apply, take over the noise densities of the IMU, too.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.interop.calibration_import import import_calibration as read
+    from maplab_py.sensors.sensors_yaml import write_sensors
+
+    calibration = read(calibration_file, imu_calibration_file)
+    changes: tuple[ComparedParameter, ...] = ()
+    if apply:
+        changes = _apply(context, calibration, chosen, imu_noise=apply_imu_noise)
+    if sensors_file is not None:
+        write_text(sensors_file, [write_sensors(calibration.sensors)], overwrite=overwrite)
+    return _described(calibration, sensors_file, changes)
+
+
+def _apply(
+    context: CommandContext, calibration: CalibrationFile, chosen: MissionChoice, *, imu_noise: bool
+) -> tuple[ComparedParameter, ...]:
+    from maplab_py.algorithms.self_calibration.comparison import compare
+    from maplab_py.algorithms.self_calibration.device import device_of
+    from maplab_py.algorithms.self_calibration.imported import with_calibration_file
+
+    before = context.vi_map
+    missions = chosen.rows(before)
+    after = with_calibration_file(before, calibration, missions=missions, imu_noise=imu_noise)
+    device = device_of(before, missions)
+    context.commit(after)
+    return compare(before.sensors, device, after.sensors, device).parameters
+
+
+def _described(
+    calibration: CalibrationFile, written: Path | None, changes: tuple[ComparedParameter, ...]
+) -> CalibrationImport:
+    sensors = calibration.sensors
+    cameras = sensors.camera_rig(calibration.rig_id).cameras if calibration.rig_id else ()
+    imu = sensors.imu(calibration.imu_id) if calibration.imu_id else None
+    return CalibrationImport(
+        file=calibration.source,
+        format=calibration.format,
+        cameras=tuple(
+            ReadCamera(
+                camera.projection.value,
+                camera.distortion.value,
+                camera.width_px,
+                camera.height_px,
+                camera.time_offset_ns * 1e-9 + camera.image_delay_s,
+            )
+            for camera in cameras
+        ),
+        has_imu=imu is not None,
+        has_imu_intrinsics=imu is not None and imu.intrinsics is not None,
+        sensors_file=written,
+        changes=changes,
+    )
+
+
+@command(
+    "import_trajectory",
+    example="import_trajectory poses.csv --as=absolute --map_mission=59f0",
+    see_also=("export_trajectory_to_csv", "evaluate_trajectory", "optimize_visual_inertial"),
+    needs_map=False,
+)
+def import_trajectory(
+    context: CommandContext,
+    trajectory_file: Path,
+    *,
+    options: TrajectoryOptions = _TRAJECTORY,
+    map_mission: str = "",
+    map_key: str = "",
+) -> TrajectoryImport:
+    """Read a trajectory as absolute poses or odometry edges of a mission, or as a new mission.
+
+    TUM, EuRoC and CSV with named columns are told apart by their content; KITTI needs --times_file.
+    Positions are in metres, and z of the trajectory's frame points upwards.
+
+    Args:
+        trajectory_file: File with the trajectory.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        map_key: With --as=mission: name of a new map; empty = add the mission to the selected map, or to a
+            new map of the file's name if there is none.
+    """
+    from maplab_py.algorithms.external_poses.trajectories import shifted
+    from maplab_py.interop.trajectories import read_kitti, read_trajectory
+
+    options.check()
+    if options.times_file is None:
+        trajectory = read_trajectory(trajectory_file)
+    else:
+        trajectory = read_kitti(trajectory_file, options.times_file)
+    trajectory = shifted(trajectory, options.time_offset_s)
+    if options.kind == "mission":
+        return _new_mission(context, trajectory, options, map_key)
+    return _measurements(context, trajectory, options, context.mission_row(map_mission))
+
+
+def _measurements(
+    context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, mission: int
+) -> TrajectoryImport:
+    from maplab_py.algorithms.external_poses.reports import TrajectoryImport
+    from maplab_py.algorithms.external_poses.trajectories import as_absolute_poses, as_odometry
+    from maplab_py.vimap.queries import mission_labels
+
+    before = context.vi_map
+    moved_m, turned_deg = 0.0, 0.0
+    count = int(before.vertex_start[mission + 1] - before.vertex_start[mission])
+    if options.kind == "absolute":
+        after, missing, movement = as_absolute_poses(before, mission, trajectory, options)
+        moved_m, turned_deg = movement
+        added = count - missing
+    else:
+        after, missing = as_odometry(before, mission, trajectory, options)
+        added = count - 1 - missing
+    context.commit(after)
+    return TrajectoryImport(
+        file=Path(trajectory.source),
+        kind=options.kind,
+        mission=mission_labels(before)[mission],
+        poses_in_file=len(trajectory),
+        added=added,
+        without_pose=missing,
+        moved_m=moved_m,
+        turned_deg=turned_deg,
+    )
+
+
+def _new_mission(
+    context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, map_key: str
+) -> TrajectoryImport:
+    from maplab_py.algorithms.external_poses.reports import TrajectoryImport
+    from maplab_py.algorithms.external_poses.trajectories import as_mission
+    from maplab_py.vimap.ids import to_hex
+    from maplab_py.vimap.merge import merge_maps
+
+    vi_map = as_mission(trajectory, options)
+    if map_key or not context.maps.selected_key:
+        context.maps.add(map_key or Path(trajectory.source).stem, vi_map)
+    else:
+        context.commit(merge_maps(context.vi_map, vi_map)[0])
+    return TrajectoryImport(
+        file=Path(trajectory.source),
+        kind="mission",
+        mission=to_hex(vi_map.missions.id[0])[:8],
+        poses_in_file=len(trajectory),
+        added=len(vi_map.vertices),
+    )
+
+
+@command(
+    "import_gps",
+    example="import_gps track.csv --map_mission=59f0 --gps_lever_arm_m=0.1,0,0.3",
+    see_also=("import_trajectory", "optimize_visual_inertial"),
+)
+def import_gps(
+    context: CommandContext,
+    gps_file: Path,
+    *,
+    map_mission: str = "",
+    options: GpsOptions = _GPS,
+) -> GpsImport:
+    """Attach positions of a satellite receiver to the vertices of a mission.
+
+    Positions become east, north and up of an origin, which the map keeps, and G becomes that frame: the
+    mission's base frame moves by yaw and position. optvi then observes yaw and position.
+
+    Args:
+        gps_file: CSV with time, latitude, longitude [deg] and ellipsoidal altitude [m], or NMEA.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+    """
+    from maplab_py.algorithms.external_poses.gps import attach_fixes
+    from maplab_py.algorithms.external_poses.reports import GpsImport
+    from maplab_py.interop.gps import read_gps
+    from maplab_py.vimap.queries import mission_labels
+
+    options.check()
+    mission = context.mission_row(map_mission)
+    track = read_gps(gps_file, options.date)
+    result = attach_fixes(context.vi_map, mission, track, options)
+    context.commit(result.vi_map)
+    return GpsImport(
+        gps_file,
+        mission_labels(result.vi_map)[mission],
+        len(track),
+        result.added,
+        track.without_fix,
+        track.damaged,
+        *result.origin,
+        *result.movement,
+        result.median_error_m,
+    )

@@ -1,0 +1,159 @@
+"""Commands that turn images, depth maps and point clouds into resources of a map, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from maplab_py.interop.resources.depth_maps import DepthImportOptions
+from maplab_py.interop.resources.images import ImageImportOptions
+from maplab_py.plugin import CommandContext, command
+
+if TYPE_CHECKING:
+    from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
+
+_IMAGES = ImageImportOptions()
+_DEPTH = DepthImportOptions()
+
+
+@command(
+    "import_images",
+    example="import_images images_of_v1_01 --map_mission=59f0",
+    see_also=("export_images", "resource_statistics"),
+)
+def import_images(
+    context: CommandContext,
+    dataset_folder: Path,
+    *,
+    map_mission: str = "",
+    options: ImageImportOptions = _IMAGES,
+) -> ImportedResources:
+    """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission.
+
+    The k-th camera of the mission gets the images of cam<k>. Image and frame belong together if each is
+    the nearest of the other in time. Frames that have an image keep it. The files are written into the
+    map when it is saved.
+
+    Args:
+        dataset_folder: Folder with mav0/cam0 or cam0; its calibration is not read.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+    """
+    from maplab_py.interop.resources.images import import_images as attach
+
+    vi_map, report = attach(
+        context.vi_map,
+        context.mission_row(map_mission),
+        dataset_folder,
+        options,
+        progress=context.progress,
+    )
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "export_images",
+    "export_timestamped_images",
+    example="export_images exported_images",
+    writes_files=True,
+    see_also=("import_images",),
+)
+def export_images(
+    context: CommandContext,
+    dataset_folder: Path,
+    *,
+    map_mission: str = "",
+    resource_type: str = "raw_images",
+    overwrite: bool = False,
+) -> ExportedImages:
+    """Write the images of a mission as an EuRoC folder: mav0/cam0/data/<stamp>.png and data.csv.
+
+    Args:
+        dataset_folder: Folder that gets mav0.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        resource_type: Number or name of the type of image or depth map.
+        overwrite: Replace files that exist.
+    """
+    from maplab_py.interop.resources.images import export_images as write
+    from maplab_py.storage.resource_types import resource_type_of
+
+    return write(
+        context.vi_map,
+        context.map_folder or Path(),
+        context.mission_row(map_mission),
+        resource_type_of(resource_type).number,
+        dataset_folder,
+        overwrite=overwrite,
+        progress=context.progress,
+    )
+
+
+@command(
+    "import_depth_maps",
+    example="import_depth_maps depth_of_v1_01 --map_mission=59f0",
+    see_also=("import_images", "resource_statistics"),
+)
+def import_depth_maps(
+    context: CommandContext,
+    depth_folder: Path,
+    *,
+    map_mission: str = "",
+    camera: int = 0,
+    options: DepthImportOptions = _DEPTH,
+) -> ImportedResources:
+    """Attach depth images of another program to the frames of a camera, as raw depth maps.
+
+    The files are 16-bit PNG images named <time stamp in ns>.png, of the size of the camera's images:
+    depth along the optical axis at the pixels of the distorted image, 0 = unknown.
+
+    Args:
+        depth_folder: Folder with the files.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        camera: Index of the camera in its rig.
+    """
+    from maplab_py.interop.resources.depth_maps import import_depth_maps as attach
+
+    vi_map, report = attach(
+        context.vi_map,
+        context.mission_row(map_mission),
+        camera,
+        depth_folder,
+        options,
+        progress=context.progress,
+    )
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "import_point_clouds",
+    example="import_point_clouds clouds_of_v1_01 --map_mission=59f0 --sensor_id=5c1a",
+    see_also=("visualize_xyz_pointclouds", "resource_statistics"),
+)
+def import_point_clouds(
+    context: CommandContext,
+    point_cloud_folder: Path,
+    *,
+    map_mission: str = "",
+    sensor_id: str = "",
+) -> ImportedResources:
+    """Attach point clouds of another program to a sensor of a mission, each at its time.
+
+    The files are PLY or PCD, named <time stamp in ns>.ply or .pcd, with points in the sensor's frame.
+
+    Args:
+        point_cloud_folder: Folder with the files.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+        sensor_id: Id or unambiguous prefix of the sensor; empty = the mission's lidar.
+    """
+    from maplab_py.interop.resources.point_clouds import import_point_clouds as attach
+
+    vi_map, report = attach(
+        context.vi_map,
+        context.mission_row(map_mission),
+        point_cloud_folder,
+        sensor_id,
+        progress=context.progress,
+    )
+    context.commit(vi_map)
+    return report

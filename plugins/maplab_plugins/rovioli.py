@@ -1,0 +1,159 @@
+"""The command that makes a map of a recording: odometry and map building, frame by frame."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from maplab_py.cancellation import ending_early
+from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
+from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.plugin import (
+    CommandContext,
+    EstimationError,
+    check_writable,
+    command,
+    key_of_folder,
+)
+
+if TYPE_CHECKING:
+    from maplab_py.frontend.finishing import FinishedRun
+    from maplab_py.frontend.mapping import Mapping, Observer
+    from maplab_py.frontend.odometry_update import OdometryUpdate
+    from maplab_py.frontend.reports import MappingReport
+    from maplab_py.viewer.display.viewer import Viewer
+
+_DATA = DataSourceOptions()
+_SOURCE = SourceOptions()
+_RUN = RunOptions()
+_DEFAULT_KEY = "rovioli"
+
+
+@command(
+    "rovioli",
+    example="rovioli walk --save_map_folder=walk_map",
+    needs_map=False,
+    acts_outside=True,
+    guards_effects=True,
+    see_also=(
+        "recording_info",
+        "optimize_visual_inertial",
+        "loopclosure_all_missions",
+        "visualize",
+        "evaluate_localization",
+    ),
+)
+def rovioli(
+    context: CommandContext,
+    datasource_folder: Path | None = None,
+    *,
+    data: DataSourceOptions = _DATA,
+    source: SourceOptions = _SOURCE,
+    run: RunOptions = _RUN,
+    map_key: str = "",
+    rovioli_visualize_map: bool = False,
+    map_publish_interval_s: float = 2.0,
+) -> MappingReport:
+    """Make a map from a recording: camera images and IMU samples in, a map with landmarks out.
+
+    The estimator follows keypoints and smooths a window of frames with the IMU samples. It starts by
+    itself, at rest or in motion, and starts again, with a new mission, if the estimate diverges. With
+    --vio_localization_map_folder it tells where it is in that map. The new map stays in memory and is
+    saved to --save_map_folder. Ctrl-C ends the recording: the map so far is finished, kept in memory,
+    and saved likewise. A second Ctrl-C cancels the command.
+
+    Args:
+        datasource_folder: EuRoC or TUM-VI folder, ROS bag, or map folder.
+        map_key: Key of the map in memory; empty = the name of --save_map_folder, or rovioli.
+        rovioli_visualize_map: Show the map, its landmarks and the image in the viewer as they grow.
+        map_publish_interval_s: Time between two pictures in the viewer.
+    """
+    from maplab_py.frontend.data_source import open_source
+    from maplab_py.frontend.finishing import finish
+    from maplab_py.frontend.mapping import Mapping
+    from maplab_py.storage.native import check_target
+
+    run.check()
+    output = run.output
+    folder = output.save_map_folder
+    if folder is not None:
+        check_target(folder, overwrite=output.overwrite_existing_map)
+    for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
+        if file is not None:
+            check_writable(file, overwrite=output.overwrite_existing_map)
+    key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
+    context.maps.check_new_key(key)
+    recording = open_source(datasource_folder, data, source)
+    observer = None
+    if rovioli_visualize_map:
+        observer = _observer(context, key, map_publish_interval_s)
+    mapping = Mapping(recording, run, observer=observer)
+    with ending_early() as is_to_end:
+        mapping.run(context.progress, is_to_end=is_to_end)
+        finished = finish(
+            mapping, recording.name, map_key=key, progress=context.progress, is_to_end=is_to_end
+        )
+    if mapping.is_ended_early:
+        _tell_end(context, finished)
+    if finished.vi_map is not None:
+        context.maps.add(
+            key,
+            finished.vi_map,
+            folder=folder if finished.disk_copy is not None else None,
+            is_saved=finished.disk_copy is not None,
+            disk_copy=finished.disk_copy,
+        )
+    return finished.report
+
+
+class _Pictures:
+    """Shows a run in the viewer: path, landmarks, image with keypoints."""
+
+    def __init__(self, viewer: Viewer, title: str, interval_s: float) -> None:
+        """Show at most once in an interval."""
+        from maplab_py.frontend.live_map import LiveLandmarks
+
+        self._viewer, self._title, self._interval_s = viewer, title, interval_s
+        self._landmarks = LiveLandmarks()
+        self._mission, self._next_s = -1, 0.0
+
+    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Take the landmarks of a frame, and show everything when it is time."""
+        from maplab_py.frontend.live_map import live_map, picture_of_tracks
+        from maplab_py.viewer.building import Subject
+
+        if update.mission != self._mission:
+            self._mission = update.mission
+            self._landmarks.clear()
+        if update.window is not None and update.window.is_keyframe:
+            self._landmarks.update(*mapping.odometry.landmarks())
+        now_s = time.perf_counter()
+        if now_s < self._next_s or not self._viewer.pages or self._viewer.is_stopped:
+            return
+        self._next_s = now_s + self._interval_s
+        self._viewer.show_image(picture_of_tracks(update))
+        if mapping.builder is not None:
+            with contextlib.suppress(EstimationError):  # there are too few vertices yet
+                vi_map = live_map(mapping.builder, self._landmarks)
+                self._viewer.follow(Subject(vi_map, self._title))
+
+
+def _observer(context: CommandContext, title: str, interval_s: float) -> Observer:
+    from maplab_plugins.visualization.following import ViewerOptions, ensure_viewer
+
+    viewer = ensure_viewer(context, ViewerOptions())
+    context.terminal.note(f"viewer: {viewer.url}")
+    return _Pictures(viewer, title, interval_s)
+
+
+def _tell_end(context: CommandContext, finished: FinishedRun) -> None:
+    """Say what has become of a recording that the user has ended."""
+    report = finished.report
+    text = f"ended at {report.duration_s:.1f} s of the recording"
+    if finished.vi_map is not None:
+        text += f": the map of {report.vertices} vertices is in memory as '{report.map_key}'"
+    if report.map_folder is not None:
+        text += f", and saved to {report.map_folder}"
+    context.terminal.note(text)

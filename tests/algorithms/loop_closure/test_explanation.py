@@ -1,0 +1,166 @@
+"""Every refused closure has a failed gate, and moving its flags accepts it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.explanation import (
+    explain_closure,
+    explain_mission,
+    explain_pair,
+)
+from maplab_py.algorithms.loop_closure.gate_values import GateValues, gate_values, shortfalls
+from maplab_py.algorithms.loop_closure.listing import accepted_by_mission, list_closures
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.reports import Verdict
+from maplab_py.algorithms.loop_closure.workflow import close_loops
+from maplab_py.errors import UserError
+from maplab_py.storage.native import load_map
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import IdIndex
+from tests.algorithms.loop_closure.rooms import Walk, make_map
+from tests.support.data import shared_data
+
+OPTIONS = LoopClosureOptions()
+DRIFT = (0.2, -0.1, 0.05, 0.01)
+ACCEPTED = VERDICTS.index(Verdict.ACCEPTED)
+
+
+def closed(walks: list[Walk], **options: float) -> VIMap:
+    return close_loops(make_map(walks)[0], dataclasses.replace(OPTIONS, **options))[0]
+
+
+@pytest.fixture(scope="module")
+def strict() -> VIMap:
+    """Return a map whose closures were refused by a gate that is far too strict."""
+    walks = [Walk(room=1), Walk(room=1, mission=1, start_s=60.0, drift=DRIFT)]
+    return closed(walks, min_inlier_count=1000)
+
+
+def test_a_refused_closure_names_its_gates_with_their_flags(strict: VIMap) -> None:
+    options = dataclasses.replace(OPTIONS, min_inlier_count=1000)
+    report = explain_closure(strict, 0, options)
+    (failed,) = [line for line in report.gates if line.result == "failed"]
+    assert failed.flag == "--lc_min_inlier_count"
+    assert failed.wanted == "at least 1000"
+    assert float(failed.value) == read_record(strict).closures.inliers[0]
+    assert "change --lc_min_inlier_count" in report.summary
+    with_defaults = explain_closure(strict, 0, OPTIONS)
+    assert with_defaults.gates[-1].result == "failed"
+
+
+def test_pairs_and_missions(strict: VIMap) -> None:
+    options = dataclasses.replace(OPTIONS, min_inlier_count=1000)
+    unknown = np.zeros(len(strict.baseframes), dtype=np.bool_)
+    free = strict.replace(baseframes=strict.baseframes.replace(is_known=unknown))
+    pair = explain_pair(free, 0, 1, options, 4)
+    assert pair.accepted == 0
+    assert pair.gates[0].flag == "--lc_min_inlier_count"
+    assert pair.gates[0].failed == pair.closures
+    assert pair.gates[-1].flag == "--anchor_transform_min_inlier_count"
+    assert [miss.gates_failed for miss in pair.nearest] == sorted(
+        miss.gates_failed for miss in pair.nearest
+    )
+    mission = explain_mission(strict, 0)
+    assert mission.pairs[0].refused == pair.closures
+    assert mission.pairs[0].most_refused_for == Verdict.FEW_INLIERS.value
+
+
+def test_missions_without_a_record_are_searched_and_stay_as_they_are() -> None:
+    vi_map = make_map([Walk(room=1), Walk(room=1, mission=1, start_s=60.0, drift=DRIFT)])[0]
+    vi_map = close_loops(vi_map, dataclasses.replace(OPTIONS, min_inlier_count=1000))[0]
+    from maplab_py.algorithms.loop_closure.closure_record import drop_record
+
+    dropped = drop_record(vi_map)
+    pair = explain_pair(dropped, 0, 1, OPTIONS, 4)
+    assert pair.closures > 0
+    assert "changed nothing" in pair.summary
+    assert len(read_record(dropped).closures) == 0
+
+
+def test_missions_that_see_nothing_in_common() -> None:
+    vi_map = make_map([Walk(room=1), Walk(room=2, mission=1, start_s=60.0)])[0]
+    vi_map = close_loops(vi_map)[0]
+    pair = explain_pair(vi_map, 0, 1, OPTIONS, 4)
+    assert pair.accepted == 0
+    assert pair.gates
+    assert pair.gates[0].flag.startswith("--lc_")
+
+
+def test_near_misses_and_reasons_select_and_sort(strict: VIMap) -> None:
+    few = list_closures(strict, which="refused", reason="inliers", sort_by="near_miss")
+    assert few.closures
+    assert {line.verdict for line in few.closures} == {Verdict.FEW_INLIERS.value}
+    inliers = [line.inliers for line in list_closures(
+        strict, which="refused", sort_by="inliers", descending=True
+    ).closures]  # fmt: skip
+    assert inliers == sorted(inliers, reverse=True)
+    with pytest.raises(UserError, match="no verdict contains this text"):
+        list_closures(strict, reason="weather")
+    assert accepted_by_mission(strict).tolist() == [0, 0]
+
+
+def reference(vi_map: VIMap) -> tuple[list[GateValues], np.ndarray]:
+    closures = read_record(vi_map).closures
+    gates = gate_values(vi_map, closures, OPTIONS)
+    return gates, closures.verdict
+
+
+def loosened(gates: list[GateValues], row: int) -> LoopClosureOptions:
+    """Return options whose thresholds lie just beyond the values of one closure."""
+    changes = {}
+    for gate in gates:
+        if gate.failed[row]:
+            name = gate.flag.removeprefix("--lc_")
+            value = float(gate.value[row])
+            changes[name] = value * (0.999 if gate.is_minimum else 1.001)
+            if isinstance(getattr(OPTIONS, name), int):
+                changes[name] = int(np.floor(value))
+    return dataclasses.replace(OPTIONS, **changes)
+
+
+@pytest.mark.slow
+def test_moving_the_named_flags_accepts_closures_of_a_real_map() -> None:
+    vi_map = euroc()
+    searched = close_loops(vi_map)[0]
+    gates, verdict = reference(searched)
+    refused = verdict != ACCEPTED
+    failed = np.any([gate.failed for gate in gates], axis=0)
+    assert failed[refused].all()
+    assert not failed[~refused].any()
+    no_flag = np.any([gate.failed for gate in gates if not gate.flag], axis=0)
+    drifts = np.any([g.failed for g in gates if g.flag == "--lc_max_drift_ratio"], axis=0)
+    rows = np.flatnonzero(refused & ~no_flag & ~drifts)
+    rows = rows[np.argsort(shortfalls(gates)[rows], kind="stable")][:10]
+    assert len(rows) == 10
+    ids = read_record(searched).closures.id
+    accepted = 0
+    for row in rows.tolist():
+        again = close_loops(vi_map, loosened(gates, row))[0]
+        closures = read_record(again).closures
+        after = closures.verdict[IdIndex(closures.id).rows(ids[[row]])[0]]
+        own = {gate.verdict for gate in gates if gate.failed[row]}
+        assert VERDICTS[after] not in own, (row, VERDICTS[after])
+        accepted += after == ACCEPTED
+    assert accepted >= 8  # neighbours contradict the others once their geometry is let pass
+
+
+def euroc() -> VIMap:
+    from maplab_py.console.session.session import Session
+
+    session = Session()
+    session.run("load_merge_all_submaps", maps_folder=shared_data("maplab_maps/euroc_v1_01"))
+    return session.vi_map
+
+
+@pytest.mark.slow
+def test_every_refused_closure_of_the_tango_map_has_a_failed_gate() -> None:
+    vi_map = close_loops(load_map(shared_data("maplab_maps/tango_handheld"))[0])[0]
+    gates, verdict = reference(vi_map)
+    failed = np.any([gate.failed for gate in gates], axis=0)
+    assert np.array_equal(failed, verdict != ACCEPTED)

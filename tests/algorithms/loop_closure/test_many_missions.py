@@ -1,0 +1,72 @@
+"""Loop closure over more missions of one place than a query is compared with."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.loop_closure.features import map_features
+from maplab_py.algorithms.loop_closure.matching import match_features
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.geometry import yaw
+from maplab_py.vision.index import MatchRule
+from tests.algorithms.anchoring.test_anchoring import scrambled
+from tests.algorithms.loop_closure.rooms import Walk, make_map
+
+LIMITED = LoopClosureOptions(max_missions_per_query=2)
+WALKS = [Walk(room=1, mission=m, vertices=6) for m in range(6)]
+RULE = MatchRule(10 * 10**9)
+
+
+@pytest.fixture(scope="module")
+def room():
+    vi_map = make_map(WALKS)[0]
+    return vi_map, map_features(vi_map, np.arange(6))[0]
+
+
+def missions_per_query(features, matches):
+    session = features.descriptors.session
+    key = np.stack([features.vertex[matches.query], session[matches.database]], axis=1)
+    other = session[matches.query] != session[matches.database]
+    vertex = np.unique(key[other], axis=0)[:, 0]
+    return np.unique(vertex, return_counts=True)[1]
+
+
+def test_a_query_is_compared_with_few_missions(room):
+    _, features = room
+    matches, landmarks = match_features(features, LIMITED, RULE, apart=True)
+    assert missions_per_query(features, matches).max() == 2
+    everywhere, same = match_features(features, LoopClosureOptions(), RULE, apart=True)
+    assert missions_per_query(features, everywhere).max() == 5
+    assert landmarks == same
+    assert np.all(np.diff(matches.query) >= 0)
+
+
+def test_few_missions_get_more_matches_each(room):
+    _, features = room
+    counts = []
+    for options in (LIMITED, LoopClosureOptions()):
+        matches, _ = match_features(features, options, RULE, apart=True)
+        pairs = np.count_nonzero(
+            features.descriptors.session[matches.query]
+            != features.descriptors.session[matches.database]
+        )
+        counts.append(pairs / missions_per_query(features, matches).sum())
+    assert counts[0] > 1.3 * counts[1]
+
+
+def test_a_search_is_repeatable(room):
+    _, features = room
+    one, other = (match_features(features, LIMITED, RULE, apart=False)[0] for _ in range(2))
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_all_missions_are_anchored_although_each_query_sees_two():
+    anchored, report = anchor_missions(scrambled(WALKS, known=[3], seed=1), loop_options=LIMITED)
+    assert report.failure == ""
+    assert len(report.anchored) == 5
+    assert np.abs(yaw.from_pose(anchored.T_G_M)).max() < 0.05

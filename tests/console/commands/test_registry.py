@@ -1,0 +1,158 @@
+"""Plugins: found, broken, clashing, restricted."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import threading
+import time
+import types
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from maplab_py.console.commands import schema
+from maplab_py.console.commands.command import describe
+from maplab_py.console.commands.registry import (
+    ENTRY_POINT_GROUP,
+    PLUGINS_VARIABLE,
+    Plugin,
+    Registry,
+    load_registry,
+)
+from maplab_py.errors import UserError
+from maplab_py.plugin import CommandContext, Message, command
+
+SOURCE = '''
+from maplab_py.plugin import CommandContext, Message, command
+
+@command("{name}", "{alias}", needs_map=False)
+def run(context: CommandContext) -> Message:
+    """Say {name}."""
+    return Message("{name}")
+'''
+
+
+def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, source: str) -> EntryPoint:
+    module = f"maplab_test_{name}"
+    (tmp_path / f"{module}.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    return EntryPoint(name, module, ENTRY_POINT_GROUP)
+
+
+def test_commands_come_from_entry_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = entry(tmp_path, monkeypatch, "one", SOURCE.format(name="first", alias="f"))
+    registry = load_registry([one])
+    assert registry.names == ["f", "first"]
+    assert registry.owner(registry.find("f")) == "one"
+    assert registry.problems == []
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import no_such_library", "No module named 'no_such_library'"),
+        ("raise SystemExit(3)", "SystemExit"),
+        ("def broken(:", "SyntaxError"),
+        (SOURCE.format(name="x", alias="y").replace('"""Say x."""', ""), "no docstring"),
+    ],
+)
+def test_a_broken_plugin_is_listed_and_harms_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, reason: str
+) -> None:
+    good = entry(tmp_path, monkeypatch, "good", SOURCE.format(name="first", alias="f"))
+    bad = entry(tmp_path, monkeypatch, "bad", source)
+    registry = load_registry([good, bad])
+    assert registry.names == ["f", "first"]
+    assert "bad" in registry.problems[0]
+    assert reason in registry.problems[0]
+    with pytest.raises(UserError, match="plugins not available: bad"):
+        registry.find("zzz")
+
+
+def test_a_duplicate_command_stays_with_the_first_and_names_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = entry(tmp_path, monkeypatch, "aaa", SOURCE.format(name="same", alias="s"))
+    second = entry(tmp_path, monkeypatch, "bbb", SOURCE.format(name="same", alias="t"))
+    third = entry(tmp_path, monkeypatch, "ccc", SOURCE.format(name="other", alias="s"))
+    registry = load_registry([third, second, first])
+    assert registry.owner(registry.find("same")) == "aaa"
+    assert registry.find("s").name == "same"
+    assert registry.problems == [
+        "command 'same' of plugin bbb is taken by plugin aaa, which keeps it",
+        "command 's' of plugin ccc is taken by plugin aaa, which keeps it",
+    ]
+
+
+def test_the_environment_restricts_what_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = [
+        entry(tmp_path, monkeypatch, name, SOURCE.format(name=name, alias=name[0]))
+        for name in ("console", "apple", "berry")
+    ]
+    monkeypatch.setenv(PLUGINS_VARIABLE, "berry")
+    assert [plugin.name for plugin in load_registry(entries).plugins] == ["console", "berry"]
+    monkeypatch.setenv(PLUGINS_VARIABLE, "berry;cherry")
+    with pytest.raises(UserError, match="not installed: cherry"):
+        load_registry(entries)
+
+
+def test_imported_commands_stay_with_the_module_that_defines_them() -> None:
+    @command("elsewhere")
+    def elsewhere(context: CommandContext) -> Message:
+        """Belong to another module."""
+        return Message("")
+
+    module = types.ModuleType("somebody")
+    module.elsewhere = elsewhere  # type: ignore[attr-defined]
+    registry = Registry()
+    registry.add_module(module, Plugin("somebody"))
+    assert registry.commands == []
+
+
+def test_dashes_in_command_names_equal_underscores() -> None:
+    def run(context: CommandContext) -> None:
+        """Do it."""
+
+    registry = Registry()
+    registry.add(describe(run, "map_stats", ("ms",)), Plugin("p"))
+    assert registry.find("map-stats").name == "map_stats"
+
+
+def test_the_installed_plugins_load() -> None:
+    registry = load_registry()
+    names = {plugin.name for plugin in registry.plugins if not plugin.error}
+    assert {"console", "vi_map_basic", "missions"} <= names
+
+
+def test_schemas_can_be_made_by_two_threads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An abandoned `schema` may still run: two syntax trees at once are a SystemError in Python 3.11."""
+    registry = load_registry()
+    inside, overlaps = threading.Semaphore(1), []
+    parse = ast.parse
+
+    def watched(*arguments: Any, **keywords: Any) -> ast.AST:
+        if not inside.acquire(blocking=False):
+            overlaps.append(1)
+            return parse(*arguments, **keywords)
+        try:
+            time.sleep(1e-3)
+            return parse(*arguments, **keywords)
+        finally:
+            inside.release()
+
+    monkeypatch.setattr(ast, "parse", watched)
+    schema._imported_names.cache_clear()
+    threads = [
+        threading.Thread(target=schema.line_schema, args=(registry.commands,)) for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert overlaps == []

@@ -1,0 +1,270 @@
+"""What a line can be besides a command: variables, aliases, the shell, pipes, dry runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from maplab_py.console.commands.lines import typed_commands, variable_lookup
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.prompt.loop import toolbar_text
+from maplab_py.console.scripts.aliases import read_aliases
+from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.session.paths import user_aliases
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status
+from maplab_py.console.terminal import pager
+from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.errors import FlagError
+from maplab_py.report import Message
+from tests.console.sample_plugin import make_registry, make_session, map_of
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def runner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runner:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.chdir(tmp_path)
+    terminal = ConsoleTerminal()
+    return Runner(Session(make_registry(), terminal), terminal)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("echo $A", [["echo", "x y"]]),
+        ("echo ${A}b", [["echo", "x yb"]]),
+        ("echo \"$A\" '$A' \\$A", [["echo", "x y", "$A", "$A"]]),
+        ("echo $ $$ $1.5", [["echo", "$", "$$", "one.5"]]),
+    ],
+)
+def test_variables(text: str, words: list[list[str]]) -> None:
+    lookup = variable_lookup({"A": "x y", "1": "one"})
+    assert [command.words for command in typed_commands(text, lookup)] == words
+
+
+def test_a_nul_character_is_refused(runner: Runner, capsys: Capture) -> None:
+    assert runner.run_text("echo a; solve --folder=b\0c") == Status.USER_ERROR
+    out, err = capsys.readouterr()
+    assert (out, len(err.splitlines())) == ("", 1)
+    assert "the character NUL" in err
+
+
+def test_an_unset_variable_is_an_error() -> None:
+    with pytest.raises(FlagError, match=r"\$NO_SUCH_THING is not set"):
+        typed_commands("echo $NO_SUCH_THING", variable_lookup({}))
+    assert typed_commands("echo $NO_SUCH_THING")[0].words == ["echo", "$NO_SUCH_THING"]
+
+
+@pytest.mark.parametrize(
+    ("text", "shells", "background"),
+    [
+        ("!ls; a", ["ls", ""], [False, False]),
+        ("!sh -c 'ls; pwd'; a", ["sh -c 'ls; pwd'", ""], [False, False]),
+        ('!ls a\\;b "c;\\";"; a', ['ls a\\;b "c;\\";"', ""], [False, False]),
+        ("a | grep b; c", ["grep b", ""], [False, False]),
+        ("a | grep 'x;y'\nb", ["grep 'x;y'", ""], [False, False]),
+        ("a &; b", ["", ""], [True, False]),
+        ("a & b", ["", ""], [True, False]),
+        ("a 'b & c | d' &", [""], [True]),
+        ("a --x=1|2 b&c !d", [""], [False]),
+    ],
+)
+def test_operators(text: str, shells: list[str], background: list[bool]) -> None:
+    commands = typed_commands(text)
+    assert [command.shell for command in commands] == shells
+    assert [command.in_background for command in commands] == background
+
+
+@pytest.mark.parametrize("text", ["& a", "| a", "; | a"])
+def test_an_operator_needs_a_command(text: str, runner: Runner) -> None:
+    assert runner.run_text(text) == Status.USER_ERROR
+
+
+def test_assignments_hold_for_the_following_commands(runner: Runner, capsys: Capture) -> None:
+    assert runner.run_text("out='a b'; sub=$out/c; echo $sub; out=d\necho $out") == Status.OK
+    assert capsys.readouterr().out == "a b/c\nd\n"
+    assert runner.run_text("echo $nosuch_variable; echo b") == Status.USER_ERROR
+
+
+def test_the_shell(runner: Runner, tmp_path: Path) -> None:
+    assert runner.run_text(f"!echo hello > {tmp_path}/x; !echo more >> {tmp_path}/x") == Status.OK
+    assert (tmp_path / "x").read_text() == "hello\nmore\n"
+    assert runner.run_text("!exit 3") == Status.FAILED
+    assert runner.run_text("!") == Status.USER_ERROR
+
+
+def test_pipes(runner: Runner, tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "found"
+    assert runner.run_text(f"help | grep -c destroy > {target}") == Status.OK
+    assert target.read_text() == "1\n"
+    assert capsys.readouterr().out == ""
+    assert runner.run_text("help | true") == Status.OK
+    assert runner.run_text("nosuch | cat") == Status.USER_ERROR
+    assert runner.run_text("echo on standard output again") == Status.OK
+    assert "again" in capsys.readouterr().out
+
+
+def test_aliases(runner: Runner, capsys: Capture) -> None:
+    assert runner.run_text("alias greet='echo hello'; greet you; alias") == Status.OK
+    out = capsys.readouterr().out
+    assert "hello you\n" in out
+    assert re.search(r"greet +echo hello", out)
+    assert runner.run_text("alias both='greet a; echo'; both b") == Status.OK
+    assert capsys.readouterr().out.endswith("hello a\nb\n")
+    assert runner.run_text("unalias greet; greet") == Status.USER_ERROR
+    assert runner.run_text("unalias greet") == Status.USER_ERROR
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["alias echo=list", "alias quit=list", "alias 'a b=list'", "alias x", "alias x=", "alias =y"],
+)
+def test_wrong_aliases(runner: Runner, line: str) -> None:
+    assert runner.run_text(line) == Status.USER_ERROR
+    assert runner.session.aliases == {}
+
+
+@pytest.mark.parametrize("lines", ["alias a=b; alias b=a; a", "alias a='echo x; a'; a"])
+def test_aliases_in_a_circle_end(runner: Runner, lines: str, capsys: Capture) -> None:
+    assert runner.run_text(lines) == Status.USER_ERROR
+    assert re.search("alias '[ab]' (refers to|contains) itself", capsys.readouterr().err)
+
+
+def test_kept_aliases_outlive_the_session(runner: Runner) -> None:
+    assert runner.run_text("alias t='echo x' --keep; alias u=echo") == Status.OK
+    assert read_aliases(user_aliases()) == {"t": "echo x"}
+    assert runner.run_text("unalias t") == Status.OK
+    assert read_aliases(user_aliases()) == {}
+
+
+def test_a_dry_run_leaves_the_map(runner: Runner, capsys: Capture) -> None:
+    runner.session.maps.add("a", map_of(1))
+    state = runner.session.maps.state
+    assert runner.run_text("add_mission --dry_run") == Status.OK
+    out, err = capsys.readouterr()
+    assert "2 missions" in out
+    assert "dry run: nothing has changed" in err
+    assert runner.session.maps.state is state
+    assert runner.session.run("add_mission", dry_run=True) == Message("2 missions")
+    assert runner.session.maps.state is state
+    assert runner.run_text("destroy --dry_run") == Status.OK
+    assert runner.run_text("transcript x --dry_run") == Status.USER_ERROR
+    assert not Path("x").exists()
+
+
+def test_a_dry_run_tells_of_files_and_writes_none(runner: Runner, capsys: Capture) -> None:
+    assert runner.run_text("keep_words w.txt ab cd --dry_run") == Status.OK
+    out, err = capsys.readouterr()
+    assert out == "kept\n"
+    assert "would write w.txt (4 bytes)" in err
+    assert not Path("w.txt").exists()
+    assert runner.run_text("keep_words w.txt ab") == Status.OK
+    assert Path("w.txt").read_text() == "ab"
+    assert runner.run_text("keep_words w.txt x --dry_run") == Status.USER_ERROR
+    assert "w.txt exists already" in capsys.readouterr().err
+    assert runner.run_text("keep_words w.txt x --dry_run --overwrite & ; join") == Status.OK
+    assert "would replace w.txt (1 bytes)" in capsys.readouterr().err
+    assert Path("w.txt").read_text() == "ab"
+
+
+def test_errors_are_objects_with_json(capsys: Capture) -> None:
+    terminal = ConsoleTerminal(as_json=True)
+    runner = Runner(Session(make_registry(), terminal), terminal)
+    runner.run_text("nosuch; echo a; find_nothing", keep_going=True)
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(line["schema"], line["status"]) for line in lines] == [(1, 2), (1, 0), (1, 1)]
+    assert lines[0]["report"] is None
+    assert "unknown command" in lines[0]["error"]
+    assert lines[2]["error"] == "nothing was found"
+    assert lines[1]["seconds"] >= 0.0
+
+
+def test_the_toolbar_tells_what_is_selected(runner: Runner) -> None:
+    session = runner.session
+    assert toolbar_text(session) == ""
+    session.maps.add("a", map_of(2))
+    session.maps.add("b", map_of(1), select=False)
+    session.marks["viewer"] = "http://localhost:8080"
+    assert toolbar_text(session) == (
+        "map a · 2 missions · 0 vertices · 0 landmarks · unsaved · 1 other map · "
+        "viewer http://localhost:8080"
+    )
+
+
+def test_the_pager_gets_what_is_longer_than_the_screen(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Screen:
+        def isatty(self) -> bool:
+            return True
+
+        def flush(self) -> None:
+            pass
+
+    assert not pager.page("x\n" * 1000)
+    monkeypatch.setattr("sys.stdin", Screen())
+    monkeypatch.setattr("sys.stdout", Screen())
+    monkeypatch.setenv("MAPLAB_PAGER", f"cat > {tmp_path}/paged")
+    assert not pager.page("x\n" * 3)
+    assert pager.page("x\n" * 1000)
+    assert (tmp_path / "paged").read_text() == "x\n" * 1000
+    monkeypatch.setenv("MAPLAB_PAGER", "cat")
+    assert not pager.page("x\n" * 1000)
+    monkeypatch.delenv("MAPLAB_PAGER")
+    assert pager.pager_command() in ("less -FRXK", "")
+
+
+def test_a_report_goes_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runner = Runner(make_session(), ConsoleTerminal())
+    file = tmp_path / "out.txt"
+    assert runner.run_text(f"echo a > {file}; echo b >> {file}; echo c >>{file}") == Status.OK
+    text = file.read_text()
+    assert [line.strip() for line in text.splitlines() if line.strip()] == ["a", "b", "c"]
+    assert runner.run_text(f"echo d > {file}") == Status.OK
+    assert "a" not in file.read_text()
+    before = file.read_text()
+    assert runner.run_text(f"nosuch > {file}") == Status.USER_ERROR
+    assert file.read_text() == before
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("echo a >", "no file is named after '>'"),
+        ("> out", "no command before '>'"),
+        ("echo a > x > y", "one file only"),
+        ("echo a > x &", "takes neither"),
+        ("echo a > x | cat", "takes neither"),
+        ("echo a > /no/such/folder/x", "name a file in a folder that exists"),
+        ("echo a > /", "name a file"),
+    ],
+)
+def test_wrong_redirections(
+    line: str,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert Runner(make_session(), ConsoleTerminal()).run_text(line) == Status.USER_ERROR
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_only_required_flag_may_be_given_by_position() -> None:
+    session = Session(load_registry())
+    call = session.parse(["rename_map", "office"])
+    assert call.values["map_key"] == "office"
+    assert session.parse(["evaluate_trajectory", "t.tum"]).values["ground_truth"] == Path("t.tum")
+    assert session.parse(["localize", "query"]).values["localization_map"] == "query"
+    for command in session.registry.commands:
+        required = [flag.name for flag in command.flags.values() if flag.is_required]
+        if len(required) == 1 and not command.variadic:
+            assert command.positional[:1] == (required[0],), command.name

@@ -1,0 +1,302 @@
+"""Ctrl-C while a command runs, questions from it, and commands that do not stop."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from maplab_py.cancellation import check_cancelled, current_token, ending_early, lasting_effect
+from maplab_py.console.commands.command import describe
+from maplab_py.console.commands.registry import Plugin
+from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status
+from maplab_py.console.terminal.foreground import (
+    SECONDS_OF_GRACE,
+    in_waiting_thread,
+    run_in_foreground,
+)
+from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.errors import Cancelled, UserError
+from maplab_py.plugin import CommandContext, Message, write_text
+from tests.console.sample_plugin import make_registry, map_of
+from tests.support.machine import slowness
+from tests.support.waiting import wait_until
+
+END = threading.Event()
+LONG_S = 2.0 * SECONDS_OF_GRACE
+"""Longer than the console waits for a command that does not stop."""
+
+
+def press_ctrl_c() -> None:
+    """Press it, and wait until the console has heard it."""
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)  # nothing tells that a second press was heard
+    if in_command():
+        wait_until(lambda: current_token().cancelled, 5.0)
+
+
+def in_command() -> bool:
+    return threading.current_thread() is not threading.main_thread()
+
+
+def stubborn(context: CommandContext, *, commits: bool = True) -> Message:
+    """Never look whether to stop."""
+    if commits:
+        context.commit(map_of(9))
+    press_ctrl_c()
+    return Message("finished")
+
+
+def patient(context: CommandContext) -> Message:
+    """Look whether to stop after two interrupts."""
+    context.commit(map_of(9))
+    press_ctrl_c()
+    press_ctrl_c()
+    context.progress.check()
+    return Message("never reached")
+
+
+def swallowing(context: CommandContext) -> Message:
+    """Catch KeyboardInterrupt as native code does; the wish to stop survives it."""
+    try:
+        press_ctrl_c()
+    except KeyboardInterrupt:
+        return Message("the handler raised")
+    context.progress.step(1, 2, "half")
+    return Message("never reached")
+
+
+def endless(context: CommandContext) -> Message:
+    """Work on long after Ctrl-C, as one call of native code does, and commit at last."""
+    press_ctrl_c()
+    END.wait(20)
+    context.commit(map_of(9))
+    context.maps.add("late", map_of(1))
+    return Message("finished too late")
+
+
+def writing(context: CommandContext) -> Message:
+    """Write files for longer than the console waits for other commands."""
+    press_ctrl_c()
+    time.sleep(LONG_S)
+    return Message("written")
+
+
+def exporting(context: CommandContext, *, first: bool = False) -> Message:
+    """Write two files, long after Ctrl-C or one of them before."""
+    if first:
+        write_text(Path("new/first"), ["1"])
+    press_ctrl_c()
+    END.wait(20)
+    write_text(Path("new/second"), ["2"])
+    return Message("finished too late")
+
+
+def removing(context: CommandContext) -> Message:
+    """Act outside in a guarded way, long after Ctrl-C."""
+    press_ctrl_c()
+    END.wait(20)
+    with lasting_effect():
+        Path("old").unlink()
+    return Message("finished too late")
+
+
+def replacing(context: CommandContext) -> Message:
+    """Be inside an effect for longer than the console waits for other commands."""
+    with lasting_effect():
+        press_ctrl_c()
+        time.sleep(LONG_S)
+    return Message("written")
+
+
+def recording(context: CommandContext, *, presses: int = 1) -> Message:
+    """Read an endless recording until the user ends it."""
+    context.commit(map_of(9))
+    with ending_early() as is_to_end:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert wait_until(is_to_end, 5.0)
+        context.progress.check()
+        if presses > 1:
+            press_ctrl_c()
+            context.progress.check()
+    return Message("finished with what there is")
+
+
+def failing_late(context: CommandContext) -> Message:
+    """Write a file, then fail."""
+    write_text(Path("new/first"), ["1"])
+    raise UserError("as was asked")
+
+
+@pytest.fixture
+def runner() -> Runner:
+    registry = make_registry()
+    for function in (exporting, failing_late):
+        command = describe(function, function.__name__, (), writes_files=True)
+        registry.add(command, Plugin("exporting"))
+    for function in (removing, replacing):
+        command = describe(function, function.__name__, (), acts_outside=True, guards_effects=True)
+        registry.add(command, Plugin("guarding"))
+    for function in (stubborn, patient, swallowing, endless, recording, writing):
+        command = describe(function, function.__name__, (), acts_outside=function is writing)
+        registry.add(command, Plugin("interrupting"))
+    terminal = ConsoleTerminal()
+    runner = Runner(Session(registry, terminal), terminal)
+    runner.session.maps.add("a", map_of(1))
+    END.clear()
+    return runner
+
+
+@pytest.mark.parametrize("command", ["stubborn", "patient", "swallowing"])
+def test_a_cancelled_command_leaves_the_map_and_stops_the_script(
+    runner: Runner, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = runner.session.maps.state
+    handler = signal.getsignal(signal.SIGINT)
+    assert runner.run_text(f"{command}; echo next", keep_going=True) == Status.CANCELLED
+    out, err = capsys.readouterr()
+    assert runner.session.maps.state is before
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert "next" not in out
+    assert "cancelled; the maps are as before" in err
+    assert ("is still running" in err) == (command == "patient")
+
+
+def test_ctrl_c_cancels_also_what_changes_nothing_and_stops_the_script(runner: Runner) -> None:
+    assert runner.run_text("stubborn --nocommits; echo next") == Status.CANCELLED
+    assert runner.run_text("echo the next command is not cancelled") == Status.OK
+
+
+def test_a_command_that_does_not_stop_is_left_behind_and_reaches_nobody(runner: Runner) -> None:
+    before = runner.session.maps.state
+    start = time.monotonic()
+    assert runner.run_text("endless") == Status.CANCELLED
+    assert time.monotonic() - start < 1.0 * slowness()
+    assert runner.run_text("echo the session goes on") == Status.OK
+    END.set()
+    (thread,) = [t for t in threading.enumerate() if t.name == "command endless"]
+    thread.join(10)
+    assert runner.session.maps.state is before
+
+
+def test_the_first_ctrl_c_ends_a_recording_and_its_result_counts(
+    runner: Runner, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert runner.run_text("recording; echo next") == Status.OK
+    out, err = capsys.readouterr()
+    assert "finished with what there is" in out
+    assert "next" in out
+    assert "Ctrl-C again cancels it" in err
+    assert len(runner.session.vi_map.missions) == 9
+
+
+def test_the_second_ctrl_c_cancels_a_recording(
+    runner: Runner, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = runner.session.maps.state
+    assert runner.run_text("recording --presses=2; echo next") == Status.CANCELLED
+    out, err = capsys.readouterr()
+    assert "next" not in out
+    assert "cancelled; the maps are as before" in err
+    assert runner.session.maps.state is before
+
+
+@pytest.mark.parametrize("command", ["writing", "replacing"])
+def test_an_effect_that_has_begun_is_waited_for(
+    runner: Runner, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    assert runner.run_text(f"{command}; echo next") == Status.CANCELLED
+    out, err = capsys.readouterr()
+    assert "written" in out
+    assert "next" not in out
+    assert f"error: {command}: finished before Ctrl-C" in err
+
+
+@pytest.mark.parametrize("command", ["exporting", "exporting --first", "removing"])
+def test_a_command_that_was_left_behind_writes_nothing(
+    runner: Runner, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("old").write_text("old")
+    start = time.monotonic()
+    assert runner.run_text(command) == Status.CANCELLED
+    assert time.monotonic() - start < 1.0 * slowness()
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+    END.set()
+    for thread in threading.enumerate():
+        if thread.name == f"command {command.split(maxsplit=1)[0]}":
+            thread.join(10)
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_command_that_fails_writes_none_of_its_files(
+    runner: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert runner.run_text("failing_late") == Status.USER_ERROR
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cancelled_command_names_what_remains(
+    runner: Runner, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def halfway(context: CommandContext) -> Message:
+        """Write a file, then hear Ctrl-C."""
+        write_text(tmp_path / "a", ["written"])
+        press_ctrl_c()
+        context.progress.check()
+        return Message("never reached")
+
+    command = describe(halfway, "halfway", (), acts_outside=True, guards_effects=True)
+    runner.session.registry.add(command, Plugin("half"))
+    assert runner.run_text("halfway") == Status.CANCELLED
+    assert "what it had done outside them remains" in capsys.readouterr().err
+
+
+def test_questions_are_asked_in_the_waiting_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked_in = []
+
+    def ask() -> str:
+        asked_in.append(threading.current_thread())
+        return "yes"
+
+    assert run_in_foreground("asking", lambda: in_waiting_thread(ask)) == "yes"
+    assert asked_in == [threading.main_thread()]
+    assert in_waiting_thread(ask) == "yes"
+
+
+def test_ctrl_c_at_a_question_cancels(runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Keyboard(io.StringIO):
+        def readline(self, *arguments: int) -> str:
+            press_ctrl_c()
+            return "y"
+
+    monkeypatch.setattr(ConsoleTerminal, "is_interactive", property(lambda self: True))
+    monkeypatch.setattr("sys.stdin", Keyboard())
+    assert runner.run_text("destroy") == Status.CANCELLED
+    assert runner.run_text("echo on") == Status.OK
+
+
+def test_errors_reach_the_caller() -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("as it was")
+
+    with pytest.raises(ZeroDivisionError, match="as it was"):
+        run_in_foreground("failing", fail)
+
+
+def test_inside_a_command_another_runs_under_the_same_token() -> None:
+    def outer() -> None:
+        press_ctrl_c()
+        run_in_foreground("inner", check_cancelled)
+
+    with pytest.raises(Cancelled):
+        run_in_foreground("outer", outer)
+    check_cancelled()

@@ -1,0 +1,47 @@
+"""Ctrl-C at several moments of commands of every kind: the prompt is back, nothing has changed.
+
+All commands: `python -m tests.benchmarks.interruptions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.data import shared_data
+from tests.support.interruptions import Interrupter, Workspace
+from tests.support.machine import slowness
+
+pytestmark = pytest.mark.slow
+
+PROMPT_S = 1.0
+NAMES = (
+    "csv_export",  # several files
+    "generate_summary_map_and_save_to_disk",
+    "load",
+    "optimize_visual_inertial",
+    "plot_trajectory",  # imports a heavy library
+    "save",
+    "schema",
+    "simulate",
+    "train_projection_matrix",
+    "visualize",
+)
+
+
+@pytest.fixture(scope="module")
+def interrupter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupter]:
+    tango = shared_data("maplab_maps/tango_handheld")
+    console = Interrupter(Workspace(tmp_path_factory.mktemp("interruptions"), tango))
+    yield console
+    console.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_prompt_is_back_and_nothing_has_changed(interrupter: Interrupter, name: str) -> None:
+    presses = interrupter.interrupt(name, at_most_s=4.0)
+    assert [press for press in presses if press.harm] == []
+    assert {press.outcome for press in presses} <= {"cancelled", "done"}
+    # other work on the machine may hold one of them up: the second slowest counts
+    assert sorted(press.prompt_s for press in presses)[-2] <= PROMPT_S * slowness(), presses

@@ -1,0 +1,180 @@
+"""Elimination orders: permutations, the same every time, and of little fill."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import FlagError
+from maplab_py.estimation.linear import nested_dissection, ordering
+from maplab_py.estimation.linear.minimum_degree import minimum_degree, minimum_degree_of_groups
+from maplab_py.estimation.linear.nested_dissection import dissect_by_position, has_metis
+from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
+from maplab_py.estimation.linear.pattern import BlockPattern
+from maplab_py.estimation.linear.quotient_graph import QuotientGraph
+from maplab_py.estimation.linear.symbolic import analyse
+from tests.estimation.linear.systems import STRUCTURES, system
+from tests.support.data import REPOSITORY
+
+needs_metis = pytest.mark.skipif(not has_metis(), reason="pymetis is not installed")
+
+
+def _pattern(name: str) -> BlockPattern:
+    rows, cols, n, _, _ = system(name, 1, seed=3)
+    return BlockPattern.checked(rows, cols, n, 3)
+
+
+def _sessions_on_a_loop(sessions: int, keyframes: int) -> tuple[BlockPattern, np.ndarray]:
+    """Sessions walk the same circle of 200 m; keyframes within 3 m share two nodes each.
+
+    Returns the pattern of five nodes a keyframe and the position of every node.
+    """
+    rng = np.random.default_rng(0)
+    along_m = np.concatenate(
+        [np.arange(keyframes) * 0.75 + rng.uniform(0, 200) for _ in range(sessions)]
+    )
+    apart_m = np.abs(along_m[:, None] - along_m) % 200.0
+    high, low = np.nonzero(np.tril(np.minimum(apart_m, 200.0 - apart_m) < 3.0, -1))
+    after = np.flatnonzero(np.arange(1, len(along_m)) % keyframes != 0) + 1
+    every = np.arange(len(along_m))
+    pairs = [(5 * high + i, 5 * low + j) for i in range(2) for j in range(2)]
+    pairs += [(5 * after + i, 5 * (after - 1) + j) for i in range(5) for j in range(5)]
+    pairs += [(5 * every + i, 5 * every + j) for i in range(5) for j in range(i + 1)]
+    rows, cols = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    angle = along_m * 2.0 * np.pi / 200.0
+    circle = np.column_stack([32 * np.cos(angle), 32 * np.sin(angle), np.zeros(len(angle))])
+    return BlockPattern.checked(rows, cols, 5 * len(along_m), 3), np.repeat(circle, 5, axis=0)
+
+
+def _dense_columns(pattern: BlockPattern, order: np.ndarray) -> np.ndarray:
+    """Return the nodes below the diagonal of each factor column, by dense elimination."""
+    n = pattern.num_nodes
+    full = np.zeros((n, n), dtype=bool)
+    full[pattern.rows, pattern.cols] = full[pattern.cols, pattern.rows] = True
+    full = full[np.ix_(order, order)]
+    below = np.zeros(n)
+    for k in range(n):
+        rows = np.flatnonzero(full[k + 1 :, k]) + k + 1
+        full[np.ix_(rows, rows)] = True
+        below[k] = len(rows)
+    return below
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize("kind", OrderingKind)
+def test_orders_are_permutations(
+    name: str, kind: OrderingKind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ordering, "_WORTH_ANOTHER", 0.0)
+    pattern = _pattern(name)
+    position_m = np.random.default_rng(1).normal(size=(pattern.num_nodes, 3))
+    for has_few_steps in (False, True):
+        order = Ordering(kind, position_m, has_few_steps)(pattern)
+        np.testing.assert_array_equal(np.sort(order), np.arange(pattern.num_nodes))
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_predicted_work_is_that_of_a_dense_elimination(name: str) -> None:
+    pattern = _pattern(name)
+    graph = QuotientGraph.without_groups(pattern)
+    order = np.random.default_rng(5).permutation(pattern.num_nodes)
+    below = 3.0 * _dense_columns(pattern, order)
+    assert graph.work(order, 3) == pytest.approx(np.sum(9.0 + 9.0 * below + 3.0 * below**2))
+
+
+def test_work_of_groups_is_that_of_their_nodes() -> None:
+    pattern, _ = _sessions_on_a_loop(2, 40)
+    graph, single = QuotientGraph.of(pattern), QuotientGraph.without_groups(pattern)
+    assert len(graph) < len(single)
+    order = minimum_degree_of_groups(graph)
+    # a group's triangle: its columns one by one have the same entries
+    by_nodes = single.work(graph.order_of_nodes(order), 1)
+    assert graph.work(order, 1) == pytest.approx(by_nodes, rel=0.05)
+
+
+def test_the_adjacency_has_no_diagonal_and_no_duplicates() -> None:
+    graph = QuotientGraph.of(_pattern("random"))
+    start, neighbours = graph.adjacency()
+    edges = {
+        (row, int(col))
+        for row in range(len(graph))
+        for col in neighbours[start[row] : start[row + 1]]
+    }
+    assert len(edges) == len(neighbours) == 2 * len(graph.rows)
+    assert all(a != b and (b, a) in edges for a, b in edges)
+
+
+@needs_metis
+def test_overlapping_sessions_take_a_fraction_of_the_work() -> None:
+    pattern, _ = _sessions_on_a_loop(10, 300)
+    least = analyse(pattern, Ordering()).statistics
+    dissected = analyse(pattern, Ordering(OrderingKind.NESTED_DISSECTION)).statistics
+    degree = analyse(pattern, Ordering(OrderingKind.MINIMUM_DEGREE)).statistics
+    assert least == dissected
+    assert least.flops < 0.1 * degree.flops
+    assert least.nonzeros < 0.4 * degree.nonzeros
+
+
+def test_cuts_by_position_replace_metis(monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern, position_m = _sessions_on_a_loop(10, 300)
+    monkeypatch.setattr(ordering, "has_metis", lambda: False)
+    least = analyse(pattern, Ordering(position_m=position_m)).statistics
+    degree = analyse(pattern, minimum_degree).statistics
+    assert least.nonzeros < 0.4 * degree.nonzeros
+    assert analyse(pattern, Ordering()).statistics == degree
+    with pytest.raises(FlagError, match="pip install pymetis"):
+        Ordering(OrderingKind.NESTED_DISSECTION)(pattern)
+
+
+def test_cuts_separate_and_nodes_without_position_come_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(nested_dissection, "_LEAF", 4)
+    pattern = _pattern("chain")
+    graph = QuotientGraph.without_groups(pattern)
+    position_m = np.random.default_rng(2).normal(size=(40, 3))
+    position_m[[7, 20]] = np.nan
+    order = dissect_by_position(graph, position_m)
+    assert set(order[-2:]) == {7, 20}
+    parts = dissect_by_position(QuotientGraph.without_groups(_pattern("singletons")), np.eye(7, 3))
+    assert sorted(parts) == list(range(7))
+
+
+def test_small_systems_ask_for_a_single_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(graph: QuotientGraph) -> None:
+        raise AssertionError("a second order costs more than it saves")
+
+    monkeypatch.setattr(ordering, "dissect_by_metis", refuse)
+    pattern, _ = _sessions_on_a_loop(4, 100)
+    np.testing.assert_array_equal(Ordering()(pattern), minimum_degree(pattern))
+
+
+@needs_metis
+def test_orders_are_the_same_in_every_process() -> None:
+    program = (
+        "import sys; sys.path.append(sys.argv[1])\n"
+        "from tests.estimation.linear.test_ordering import _sessions_on_a_loop, Ordering, OrderingKind\n"
+        "import hashlib\n"
+        "order = Ordering(OrderingKind.NESTED_DISSECTION)(_sessions_on_a_loop(4, 100)[0])\n"
+        "print(hashlib.sha256(order.tobytes()).hexdigest())"
+    )
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", program, str(REPOSITORY)],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for _ in range(2)
+    }
+    assert len(digests) == 1
+
+
+def test_metis_is_imported_only_when_it_is_used() -> None:
+    program = (
+        "import sys, maplab_py.estimation.linear.block_cholesky\nsys.exit('pymetis' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

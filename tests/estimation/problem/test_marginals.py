@@ -1,0 +1,119 @@
+"""Covariances against dense inverses, and against the errors they announce."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from maplab_py.algorithms.vi_optimization.map_problem import build
+from maplab_py.algorithms.vi_optimization.optimization import solver_options
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.problem.marginals import Marginals
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.problem.solver import optimize_states
+from maplab_py.estimation.states import pose_nodes
+from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS
+from maplab_py.geometry import se3, so3
+from maplab_py.progress import SILENT
+from tests.estimation.dense import system_matrix
+from tests.support.scene import Scene
+
+EXACT = VIOptimizationOptions(
+    loss="none",
+    use_visual_outlier_rejection_solver=False,
+    gate_reprojection_error_px=1e9,
+    function_tolerance=1e-10,
+)
+CALIBRATING = VIOptimizationOptions(
+    loss="none",
+    fix_ncamera_intrinsics=False,
+    fix_ncamera_extrinsics_rotation=False,
+    fix_ncamera_extrinsics_translation=False,
+    function_tolerance=1e-10,
+)
+
+
+def test_blocks_are_those_of_the_dense_inverse() -> None:
+    posed = build(Scene(vertices=5, landmarks=60, noise=1.0).make(), EXACT)
+    linear = posed.problem.linearize(posed.states, 1e-12)
+    H = system_matrix(posed.problem, linear, 0.0)
+    marginals = Marginals(posed.problem, posed.states)
+    P = np.zeros_like(H)
+    for node, projector in enumerate(posed.problem.projectors):
+        P[3 * node : 3 * node + 3, 3 * node : 3 * node + 3] = projector
+    scale = np.sqrt(np.diag(H))
+    wanted = P @ (np.linalg.pinv((P @ H @ P) / np.outer(scale, scale)) / np.outer(scale, scale)) @ P
+    nodes = pose_nodes(np.array([3, 1])).reshape(-1)
+    rows = (3 * nodes[:, None] + np.arange(3)).reshape(-1)
+    found = marginals.nodes(nodes)
+    np.testing.assert_allclose(found, wanted[np.ix_(rows, rows)], atol=1e-5 * found.max())
+    np.testing.assert_allclose(marginals.poses([3, 1])[1], found[6:, 6:], rtol=1e-12)
+
+
+def test_what_is_held_is_certain() -> None:
+    posed = build(Scene(vertices=5, landmarks=60, noise=1.0).make(), EXACT)
+    covariance = Marginals(posed.problem, posed.states).poses([0])[0]
+    assert np.abs(covariance[:3]).max() == 0.0
+    up_I = so3.rotate(so3.inverse(posed.states.T_G_I[0, :4]), np.array([0.0, 0.0, 1.0]))
+    assert abs(up_I @ covariance[3:, 3:] @ up_I) < 1e-15
+    assert covariance[3:, 3:].max() > 0.0
+
+
+def test_relative_poses_do_not_depend_on_the_gauge() -> None:
+    posed = build(Scene(vertices=6, landmarks=80, noise=1.0).make(), EXACT)
+    first = Marginals(posed.problem, posed.states).relative_pose(2, 4)
+    other = Problem(posed.states, posed.problem.visual, posed.problem.factors)
+    other.fix(pose_nodes(np.array([5]))[:, 0])
+    up_I = so3.rotate(so3.inverse(posed.states.T_G_I[5, :4]), np.array([0.0, 0.0, 1.0]))
+    other.restrict(pose_nodes(np.array([5]))[:, 1], (np.eye(3) - np.outer(up_I, up_I))[None])
+    second = Marginals(other, posed.states).relative_pose(2, 4)
+    np.testing.assert_allclose(first, second, atol=1e-5 * np.abs(first).max())
+
+
+def test_undetermined_states_are_named() -> None:
+    posed = build(Scene(vertices=4, landmarks=40).make(), EXACT)
+    free = Problem(posed.states, posed.problem.visual, ())
+    with pytest.raises(EstimationError, match=r"do not determine the \w+( bias)? of vertex \d"):
+        Marginals(free, posed.states)
+
+
+@pytest.mark.slow
+def test_errors_of_poses_are_as_large_as_announced() -> None:
+    """NEES of all free poses over 50 runs lies within the 95 % band of chi-square."""
+    total = freedom = 0.0
+    for seed in range(50):
+        scene = Scene(vertices=8, interval_s=0.25, landmarks=120, noise=1.0, seed=100 + seed)
+        truth = scene.make()
+        posed = build(truth, EXACT)
+        final, _ = optimize_states(posed.problem, posed.states, solver_options(EXACT), SILENT)
+        marginals = Marginals(posed.problem, final)
+        errors = []
+        for vertex in range(1, 8):
+            true = se3.relative(truth.T_G_I[0], truth.T_G_I[vertex])
+            found = se3.relative(final.T_G_I[0], final.T_G_I[vertex])
+            turned = so3.log(so3.multiply(so3.inverse(true[:4]), found[:4]))
+            error = np.concatenate([found[4:] - true[4:], turned])
+            covariance = marginals.relative_pose(0, vertex)
+            errors.append(error @ np.linalg.solve(covariance, error))
+        total += float(errors[-1])  # errors of neighbours are correlated: one pose a run
+        freedom += 6
+    low, high = chi2.ppf([0.025, 0.975], freedom)
+    assert low <= total <= high, total / freedom
+
+
+@pytest.mark.slow
+def test_errors_of_calibrations_are_as_large_as_announced() -> None:
+    total = freedom = 0.0
+    for seed in range(20):
+        scene = Scene(vertices=12, interval_s=0.25, landmarks=200, noise=1.0, seed=300 + seed)
+        posed = build(scene.make(), CALIBRATING)
+        final, _ = optimize_states(posed.problem, posed.states, solver_options(CALIBRATING), SILENT)
+        marginals = Marginals(posed.problem, final)
+        for name in (INTRINSICS, EXTRINSICS):
+            error = final.blocks[name].difference(posed.states.blocks[name].values).reshape(-1)
+            total += float(error @ np.linalg.solve(marginals.block(name), error))
+            freedom += len(error)
+    low, high = chi2.ppf([0.025, 0.975], freedom)
+    assert low <= total <= high, total / freedom

@@ -1,0 +1,142 @@
+"""Cameras as states: the border, the elimination and the step against dense algebra."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from maplab_py.estimation.codegen.kernels import visual_kernels
+from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.problem.problem import Problem
+from maplab_py.estimation.states import States
+from maplab_py.estimation.terms.cameras import Cameras, camera_blocks
+from maplab_py.estimation.terms.visual import Observations, VisualTerms
+from maplab_py.geometry import se3, so3
+from maplab_py.sensors import Distortion, Projection
+from tests.estimation.dense import numeric_jacobian, numeric_point_jacobian, system_matrix
+
+F64 = NDArray[np.float64]
+
+MODELS = ((Projection.PINHOLE, Distortion.FOV), (Projection.PINHOLE, Distortion.RADTAN))
+VERTICES, LANDMARKS, INVERSE_SIGMA, SCALE2 = 4, 12, 1.3, 9.0
+
+
+@dataclasses.dataclass
+class Scene:
+    visual: VisualTerms
+    states: States
+    problem: Problem
+
+    def residual(self, states: States) -> F64:
+        """Signed residuals [sigmas] from the errors for three shifted measurements."""
+        measured = self.visual.observations
+        squared = []
+        for shift in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]):
+            self.visual.use(dataclasses.replace(measured, uv_px=measured.uv_px - shift))
+            squared.append(self.visual.errors(states)[0] ** 2)
+        self.visual.use(measured)
+        x, y = (0.5 * (squared[k] - squared[0] - 1.0) for k in (1, 2))
+        return INVERSE_SIGMA * np.stack([x, y], axis=1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(0)
+    T_G_I = se3.make(so3.exp(rng.normal(0, 0.05, (VERTICES, 3))), rng.normal(0, 0.2, (VERTICES, 3)))
+    T_I_C = se3.make(so3.exp(rng.normal(0, 0.1, (2, 3))), rng.normal(0, 0.05, (2, 3)))
+    parameters = np.zeros((2, 9))
+    parameters[0, :6] = [0, 250, 251, 320, 240, 0.9]
+    parameters[1] = [1, 300, 301, 320, 240, -0.2, 0.05, 1e-3, -1e-3]
+    cameras = Cameras(T_I_C, parameters)
+    count = LANDMARKS * VERTICES * 2
+    observations = Observations(
+        start=np.arange(LANDMARKS + 1) * VERTICES * 2,
+        vertex=np.tile(np.repeat(np.arange(VERTICES), 2), LANDMARKS).astype(np.int32),
+        camera=np.tile([0, 1], LANDMARKS * VERTICES).astype(np.int32),
+        uv_px=rng.uniform(200, 400, (count, 2)),
+        inverse_sigma=np.full(count, INVERSE_SIGMA),
+        loss_scale=np.full(count, np.sqrt(SCALE2)),
+    )
+    kernels = visual_kernels(MODELS, calibrating=True)
+    visual = VisualTerms(kernels, observations, cameras, VERTICES, loss=Loss.CAUCHY)
+    points = rng.uniform([-1, -1, 3], [1, 1, 5], (LANDMARKS, 3))
+    zero = np.zeros((VERTICES, 3))
+    states = States(T_G_I, rng.normal(0, 1, (VERTICES, 3)), zero, zero, points)
+    states = states.with_blocks(*camera_blocks(cameras, np.array([0.01, -0.02])))
+    visual.follow_motion(rng.normal(0, 1, (VERTICES, 3)))
+    visual.refresh(states)
+    return Scene(visual, states, Problem(states, visual, ()))
+
+
+@pytest.fixture(scope="module")
+def dense(scene: Scene) -> tuple[F64, F64]:
+    """Weighted residuals and Jacobian by nodes, then landmarks."""
+    residual = scene.residual(scene.states)
+    weight = np.sqrt(1.0 / (1.0 + (residual**2).sum(axis=1) / SCALE2))
+    by_node = numeric_jacobian(scene.residual, scene.states, 1e-5)
+    by_point = numeric_point_jacobian(scene.residual, scene.states, 1e-5)
+    jacobian = np.concatenate([by_node, by_point], axis=1)
+    return (residual * weight[:, None]).reshape(-1), jacobian * np.repeat(weight, 2)[:, None]
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_the_reduced_system_is_the_schur_complement(
+    scene: Scene, dense: tuple[F64, F64], damping: float
+) -> None:
+    r, J = dense
+    nodes = 3 * scene.states.num_nodes
+    H = J.T @ J
+    H += damping * np.diag(np.clip(np.diag(H), 1e-6, 1e32))
+    landmark_part = H[:nodes, nodes:] @ np.linalg.inv(H[nodes:, nodes:])
+    wanted = H[:nodes, :nodes] - landmark_part @ H[nodes:, :nodes]
+    g = J.T @ r
+    linear = scene.problem.linearize(scene.states, damping)
+    found = system_matrix(scene.problem, linear, damping)
+    np.testing.assert_allclose(found, wanted, atol=1e-7 * np.abs(wanted).max())
+    reduced = g[:nodes] - landmark_part @ g[nodes:]
+    np.testing.assert_allclose(
+        linear.gradient.reshape(-1), reduced, atol=1e-7 * np.abs(reduced).max()
+    )
+
+
+def test_a_step_moves_landmarks_as_dense_algebra_does(scene: Scene, dense: tuple[F64, F64]) -> None:
+    r, J = dense
+    damping, nodes = 1e-3, 3 * scene.states.num_nodes
+    H = J.T @ J
+    damped = H + damping * np.diag(np.clip(np.diag(H), 1e-6, 1e32))
+    wanted = np.linalg.solve(damped, -J.T @ r)
+    step = scene.problem.solve(scene.problem.linearize(scene.states, damping), damping)
+    moved = scene.states.moved(step, scene.states.p_G)
+    p_G, cost, promised = scene.visual.take_step(scene.states, step, moved, damping)
+    np.testing.assert_allclose(step.reshape(-1), wanted[:nodes], atol=1e-4 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        (p_G - scene.states.p_G).reshape(-1), wanted[nodes:], atol=1e-4 * np.abs(wanted).max()
+    )
+    assert promised == pytest.approx(-(wanted @ J.T @ r + 0.5 * wanted @ H @ wanted), rel=1e-5)
+    error_px = scene.visual.errors(dataclasses.replace(moved, p_G=p_G))[0]
+    rho = SCALE2 * np.log1p((INVERSE_SIGMA * error_px) ** 2 / SCALE2)
+    assert cost == pytest.approx(0.5 * rho.sum(), rel=1e-12)
+
+
+def test_padding_of_narrow_cameras_has_no_effect(scene: Scene) -> None:
+    linear = scene.problem.linearize(scene.states, 0.0)
+    intrinsics = scene.states.nodes("camera intrinsics")
+    unused = linear.diagonal[intrinsics].reshape(2, -1)[0, 5:]
+    assert not unused.any()
+    offset = scene.states.nodes("camera time offset").reshape(-1)
+    assert not linear.diagonal[offset, 1:].any()
+
+
+def test_without_velocities_time_offsets_change_nothing(scene: Scene) -> None:
+    still = dataclasses.replace(scene.states, v_G=np.zeros((VERTICES, 3)))
+    before = scene.visual.errors(scene.states)[0]
+    scene.visual.follow_motion(np.zeros((VERTICES, 3)))
+    scene.visual.refresh(still)
+    assert not np.array_equal(scene.visual.errors(still)[0], before)
+    linear = scene.problem.linearize(still, 0.0)
+    assert not linear.diagonal[still.nodes("camera time offset")].any()
+    scene.visual.follow_motion(np.random.default_rng(1).normal(0, 1, (VERTICES, 3)))
+    scene.visual.refresh(scene.states)

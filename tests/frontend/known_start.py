@@ -1,0 +1,44 @@
+"""A start from a trajectory that is known, so that tests of odometry do not depend on initialisation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.estimation.window.frame import StartState, WindowFrame
+from maplab_py.geometry.association import nearest_rows
+from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.interop.trajectories import Trajectory
+
+SIGMA = np.repeat([1e-4, 5e-3, 0.05, 0.05, 0.3], 3)
+"""Standard deviations of the start: position, attitude, velocity, biases of gyroscope and accelerometer."""
+
+
+@dataclasses.dataclass
+class KnownStart:
+    """Starts at the first frame within a trajectory, with biases of zero unless it has them."""
+
+    truth: Trajectory
+    with_biases: bool = False
+    reason: str = "the trajectory has not begun"
+
+    def __call__(self, device: RecordedSensors) -> KnownStart:
+        return self
+
+    def push(self, frame: WindowFrame) -> StartState | None:
+        time_ns = np.array([frame.time_ns])
+        T_M_I, is_known = interpolate_poses(
+            self.truth.times_ns, self.truth.T_R_B, time_ns, max_gap_ns=10**9
+        )
+        if not is_known[0]:
+            return None
+        row = int(nearest_rows(self.truth.times_ns, time_ns)[0])
+        assert self.truth.v_R is not None
+        gyro_bias = accel_bias = np.zeros(3)
+        if self.with_biases:
+            assert self.truth.gyro_bias is not None
+            assert self.truth.accel_bias is not None
+            gyro_bias, accel_bias = self.truth.gyro_bias[row], self.truth.accel_bias[row]
+        return StartState(T_M_I[0], self.truth.v_R[row], gyro_bias, accel_bias, SIGMA)

@@ -1,0 +1,114 @@
+"""When T_G_M is set and set again, and what happens to late answers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from maplab_py.array_types import F64
+from maplab_py.frontend.localization.agreement import AgreementFilter, Verdict
+from maplab_py.frontend.localization.matcher import Answer, Source
+from maplab_py.frontend.localization.online import OnlineLocalization
+from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry import Odometry
+from maplab_py.geometry import se3
+from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
+from maplab_py.interop.recordings.stream import EventStream
+from tests.frontend.localization.places import place, searched
+
+P_G = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [6.0, -1.0, 1.0]])
+AWAY = se3.make([0.0, 0.0, 0.0, 1.0], [3.0, 0.0, 0.0])
+HERE = se3.identity()
+
+
+def answer(time_ns: int, T_G_I: F64) -> Answer:
+    """Return an answer whose rays are exact at a pose."""
+    p_I = se3.transform(se3.inverse(T_G_I), P_G)
+    ray = p_I / np.linalg.norm(p_I, axis=1, keepdims=True)
+    rows = np.arange(len(P_G))
+    return Answer(
+        time_ns, Source.INDEX, rows, np.zeros(len(P_G), dtype=np.int32), rows,
+        np.zeros((len(P_G), 3)), ray, np.full(len(P_G), 1e-3), T_G_I, 1e-4 * np.eye(6),
+    )  # fmt: skip
+
+
+def test_two_answers_that_agree_start() -> None:
+    rule = AgreementFilter(2, 20.0)
+    assert rule.judge(answer(0, HERE), HERE, None, P_G) is Verdict.WAIT
+    assert rule.judge(answer(10**9, HERE), HERE, None, P_G) is Verdict.START
+    assert [a.time_ns for a in rule.take()] == [0, 10**9]
+    assert rule.take() == []
+
+
+def test_answers_that_contradict_each_other_do_not() -> None:
+    rule = AgreementFilter(2, 20.0)
+    for time_ns, T_G_I in enumerate([HERE, AWAY, HERE, AWAY]):
+        assert rule.judge(answer(time_ns, T_G_I), HERE, None, P_G) is Verdict.WAIT
+    late = answer(60 * 10**9, AWAY)
+    assert rule.judge(late, HERE, None, P_G) is Verdict.WAIT  # agrees, but with something old
+
+
+def test_a_single_contradiction_never_resets() -> None:
+    rule = AgreementFilter(2, 20.0)
+    assert rule.judge(answer(0, HERE), HERE, HERE, P_G) is Verdict.USE
+    assert rule.judge(answer(1, AWAY), HERE, HERE, P_G) is Verdict.WAIT
+    assert rule.judge(answer(2, HERE), HERE, HERE, P_G) is Verdict.USE
+    assert rule.judge(answer(3, AWAY), HERE, HERE, P_G) is Verdict.WAIT
+    assert rule.judge(answer(4, AWAY), HERE, HERE, P_G) is Verdict.START
+
+
+def test_matches_without_a_pose_are_used_but_start_nothing() -> None:
+    rule = AgreementFilter(1, 20.0)
+    few = dataclasses.replace(answer(0, HERE), T_G_I=None, covariance=None)
+    assert rule.judge(few, HERE, None, P_G) is Verdict.WAIT
+    assert rule.judge(few, HERE, HERE, P_G) is Verdict.USE
+    assert rule.judge(few, HERE, AWAY, P_G) is Verdict.WAIT
+
+
+@pytest.fixture(scope="module")
+def halfway() -> tuple[OnlineLocalization, Odometry, list[Answer]]:
+    """Return a localisation in the middle of a run, and the answers it has got so far."""
+    where, options = place(), OnlineLocalizationOptions()
+    recording = where.recording()
+    odometry = Odometry(recording.device, make_starter=where.start, map_rule=options.rule)
+    localization = OnlineLocalization(searched(), recording.device, options)
+    answers, frames = [], 0
+    for event in EventStream(recording):
+        if isinstance(event, ImuBatch):
+            updates = odometry.push_imu(event)
+        else:
+            assert isinstance(event, TrackedFrameSet)
+            updates = odometry.push_tracks(event)
+        for update in updates:
+            frame = localization.after_frame(update, odometry.smoother)
+            frames += 1
+            if frame.answer is not None:
+                answers.append(frame.answer)
+        if frames >= 20:
+            break
+    return localization, odometry, answers
+
+
+def test_a_late_answer_joins_its_frame(
+    halfway: tuple[OnlineLocalization, Odometry, list[Answer]],
+) -> None:
+    localization, odometry, answers = halfway
+    assert odometry.smoother is not None
+    before = localization.counts.late
+    assert localization.take(answers[-1], odometry.smoother)
+    assert localization.counts.late == before
+
+
+def test_a_lost_answer_is_dropped_and_counted(
+    halfway: tuple[OnlineLocalization, Odometry, list[Answer]],
+) -> None:
+    localization, odometry, answers = halfway
+    assert odometry.smoother is not None
+    before = localization.counts.late
+    unknown = dataclasses.replace(answers[-1], time_ns=answers[-1].time_ns + 1)
+    assert not localization.take(unknown, odometry.smoother)
+    ended = dataclasses.replace(answers[-1], track_id=answers[-1].track_id + 10**9)
+    assert not localization.take(ended, odometry.smoother)
+    assert localization.counts.late == before + 2

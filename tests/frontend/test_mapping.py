@@ -1,0 +1,323 @@
+"""Runs over recordings: what is made of them, also when they end early."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
+from maplab_py.frontend import finishing
+from maplab_py.frontend.finishing import finish
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.run_options import OutputOptions, RunOptions
+from maplab_py.interop.recordings.map_replay import MapRecording
+from maplab_py.interop.recordings.options import StreamOptions
+from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
+from maplab_py.interop.trajectories import read_trajectory
+from maplab_py.progress import SilentProgress
+from maplab_py.storage.native import load_map
+from maplab_py.vimap.comparison import is_same
+from maplab_py.vimap.consistency import check_consistency
+from tests.frontend.known_start import KnownStart
+from tests.frontend.simulated import EditedRecording, position_errors, replayed
+
+
+def recording_of(cameras: int = 2) -> tuple[EditedRecording, KnownStart]:
+    vi_map, truth = replayed(cameras=cameras)
+    plain = MapRecording(vi_map, 0)
+    return EditedRecording(plain, tuple(plain.items())), KnownStart(truth, with_biases=True)
+
+
+def options_of(**output: object) -> RunOptions:
+    return RunOptions(output=dataclasses.replace(OutputOptions(), **output))  # type: ignore[arg-type]
+
+
+class Interrupting(SilentProgress):
+    """Ctrl-C at the n-th check."""
+
+    def __init__(self, checks: int) -> None:
+        self.left = checks
+        self.lines: list[str] = []
+        self.steps: list[str] = []
+
+    def check(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Cancelled("cancelled")
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        self.steps.append(what)
+
+
+def test_a_run_makes_a_map_with_landmarks(tmp_path: Path) -> None:
+    recording, start = recording_of()
+    folder, poses = tmp_path / "map", tmp_path / "poses.csv"
+    options = options_of(save_map_folder=folder, export_estimated_poses_to_csv=poses)
+    mapping = Mapping(recording, options, make_starter=start)
+    mapping.run()
+    finished = finish(mapping, recording.name, map_key="walk")
+    report = finished.report
+    assert report.failure == ""
+    sets = [item for item in recording.items_of if isinstance(item, TrackedFrameSet)]
+    assert report.frames == report.estimated_frames == report.vertices == len(sets)
+    assert report.missions == 1
+    assert 100 < report.good_landmarks <= report.landmarks
+    assert [entry.reason for entry in report.starts] == ["beginning of the recording"]
+    assert {stage.stage for stage in report.frame_times} > {"window", "all stages"}
+    vi_map, _ = load_map(folder)
+    assert check_consistency(vi_map).failure == ""
+    assert check_consistency(vi_map).warnings == ()
+    v = vi_map.vertices
+    assert position_errors(start.truth, v.timestamp_ns, v.T_M_I).max() < 0.1
+    written = read_trajectory(poses)
+    np.testing.assert_array_equal(written.times_ns, v.timestamp_ns)
+    assert position_errors(start.truth, written.times_ns, written.T_R_B).max() < 0.1
+    assert report.distance_m == pytest.approx(
+        np.linalg.norm(np.diff(written.T_R_B[:, 4:], axis=0), axis=1).sum()
+    )
+
+
+def test_equal_runs_give_equal_maps() -> None:
+    maps = []
+    for _ in range(2):
+        recording, start = recording_of(cameras=1)
+        mapping = Mapping(recording, make_starter=start)
+        mapping.run()
+        maps.append(finish(mapping, recording.name).vi_map)
+    assert is_same(*maps)
+
+
+def test_an_error_in_the_recording_keeps_what_came_before(tmp_path: Path) -> None:
+    recording, start = recording_of()
+    half = recording.items_of[: len(recording.items_of) // 2]
+    broken = MapError("cam0/1.png: the image is truncated; copy it again")
+    damaged = dataclasses.replace(recording, items_of=(*half, broken))
+    mapping = Mapping(damaged, options_of(save_map_folder=tmp_path / "map"), make_starter=start)
+    mapping.run()
+    finished = finish(mapping, damaged.name)
+    assert finished.report.failure == str(broken)
+    vi_map, _ = load_map(tmp_path / "map")
+    assert len(vi_map.vertices) == sum(isinstance(item, TrackedFrameSet) for item in half)
+    assert check_consistency(vi_map).failure == ""
+
+
+def test_an_error_before_anything_was_estimated_is_raised() -> None:
+    recording, start = recording_of()
+    damaged = dataclasses.replace(recording, items_of=(MapError("the table is missing"),))
+    with pytest.raises(MapError, match="the table is missing"):
+        Mapping(damaged, make_starter=start).run()
+    with pytest.raises(Cancelled):
+        Mapping(recording, make_starter=start).run(Interrupting(1))
+
+
+def test_a_run_that_is_ended_keeps_what_is_there(tmp_path: Path) -> None:
+    recording, start = recording_of()
+    options = options_of(save_map_folder=tmp_path / "map", optimize_map_to_localization_map=True)
+    mapping = Mapping(recording, options, make_starter=start)
+    mapping.run(is_to_end=lambda: mapping.statistics.frames == 30)
+    assert mapping.is_ended_early
+    finished = finish(mapping, recording.name, is_to_end=lambda: True)
+    assert finished.report.failure == ""
+    assert finished.report.notes[-1].startswith("ended early: the map is not optimised")
+    vi_map, _ = load_map(tmp_path / "map")
+    assert len(vi_map.vertices) == finished.report.vertices == 30
+    assert check_consistency(vi_map).failure == ""
+
+
+def test_a_run_that_is_ended_before_its_first_state_is_cancelled() -> None:
+    recording, start = recording_of()
+    with pytest.raises(Cancelled):
+        Mapping(recording, make_starter=start).run(is_to_end=lambda: True)
+
+
+def test_a_run_that_is_cancelled_saves_nothing(tmp_path: Path) -> None:
+    recording, start = recording_of()
+    options = options_of(save_map_folder=tmp_path / "map")
+    with pytest.raises(Cancelled):
+        Mapping(recording, options, make_starter=start).run(Interrupting(60))
+    mapping = Mapping(recording, options, make_starter=start)
+    mapping.run()
+    with pytest.raises(Cancelled):
+        finish(mapping, recording.name, progress=Interrupting(1))
+    assert not (tmp_path / "map").exists()
+
+
+def test_memory_does_not_grow_with_the_recording() -> None:
+    """Without a map builder a frame leaves 150 bytes; its tracks and samples have many times more."""
+    recording, start = recording_of(cameras=1)
+    sizes: dict[int, int] = {}
+
+    class Watch:
+        def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+            del update
+            if mapping.statistics.frames in (45, 75):
+                gc.collect()
+                sizes[mapping.statistics.frames] = tracemalloc.get_traced_memory()[0]
+
+    options = options_of(run_map_builder=False)
+    mapping = Mapping(recording, options, make_starter=start, observer=Watch())
+    tracemalloc.start()
+    try:
+        mapping.run()
+    finally:
+        tracemalloc.stop()
+    assert sizes[75] - sizes[45] < 30 * 3000
+
+
+def test_a_slow_playback_is_ended_without_waiting_for_the_next_frame() -> None:
+    recording, start = recording_of(cameras=1)
+    options = dataclasses.replace(RunOptions(), realtime_playback_rate=1e-4)
+    mapping = Mapping(recording, options, make_starter=start)
+    began_s = time.monotonic()
+    mapping.run(is_to_end=lambda: mapping.statistics.frames == 1)
+    assert mapping.is_ended_early
+    assert time.monotonic() - began_s < 60.0  # the second frame is due after 1000 s
+
+
+def test_a_full_disk_leaves_the_map_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording, start = recording_of(cameras=1)
+
+    def full(*_: object, **__: object) -> None:
+        raise UserError("map: cannot be saved (No space left on device)")
+
+    monkeypatch.setattr(finishing, "save_map", full)
+    mapping = Mapping(recording, options_of(save_map_folder=tmp_path / "map"), make_starter=start)
+    mapping.run()
+    finished = finish(mapping, recording.name, map_key="walk")
+    assert finished.vi_map is not None
+    assert finished.disk_copy is None
+    assert finished.report.map_folder is None
+    assert "No space left on device" in finished.report.failure
+    assert "in memory as 'walk'" in finished.report.failure
+
+
+def test_divergence_makes_a_second_mission_and_drops_doubtful_vertices() -> None:
+    recording, start = recording_of()
+    sets = [item for item in recording.items_of if isinstance(item, TrackedFrameSet)]
+    dark = {item.time_ns for item in sets[25:50]}
+    items = tuple(
+        dataclasses.replace(item, frames=(None, None))
+        if isinstance(item, TrackedFrameSet) and item.time_ns in dark
+        else item
+        for item in recording.items_of
+    )
+    progress = Interrupting(-1)
+    mapping = Mapping(dataclasses.replace(recording, items_of=items), make_starter=start)
+    mapping.run(progress)
+    report = finish(mapping, recording.name).report
+    assert report.missions >= 2
+    assert report.failure == ""
+    assert any("started again" in note for note in report.notes)
+    assert any("started again" in line for line in progress.lines)
+    assert mapping.builder is not None
+    vi_map = mapping.builder.make_map()
+    assert check_consistency(vi_map).failure == ""
+    first = vi_map.vertices.mission == 0
+    assert vi_map.vertices.timestamp_ns[first].max() <= sets[25].time_ns
+    assert (
+        position_errors(start.truth, vi_map.vertices.timestamp_ns, vi_map.vertices.T_M_I).max()
+        < 0.2
+    )
+
+
+def test_a_run_that_never_starts_says_why() -> None:
+    recording, _ = recording_of(cameras=1)
+    short = dataclasses.replace(recording, items_of=recording.items_of[:20])
+    with pytest.raises(EstimationError, match=r"has not started: 0\.\d of 1\.5 s of images"):
+        Mapping(short).run()
+
+
+def test_recordings_without_frames_or_samples() -> None:
+    recording, start = recording_of()
+    samples = tuple(item for item in recording.items_of if isinstance(item, ImuBatch))
+    with pytest.raises(EstimationError, match="there are no frames"):
+        Mapping(dataclasses.replace(recording, items_of=samples), make_starter=start).run()
+    frames = tuple(i for i in recording.items_of if isinstance(i, TrackedFrameSet))
+    early = dataclasses.replace(recording, items_of=(*frames, samples[-1]))
+    with pytest.raises(EstimationError, match="before the first IMU sample"):
+        Mapping(early, make_starter=start).run()
+    empty = dataclasses.replace(recording, items_of=())
+    with pytest.raises(MapError, match="the recording is empty"):
+        Mapping(empty, make_starter=start).run()
+
+
+def test_gaps_saturation_and_early_frames_are_reported() -> None:
+    recording, start = recording_of(cameras=1)
+    items = list(recording.items_of)
+    batches = [row for row, item in enumerate(items) if isinstance(item, ImuBatch)]
+    for row in batches[20:21]:
+        batch = items[row]
+        assert isinstance(batch, ImuBatch)
+        items[row] = ImuBatch(
+            batch.times_ns[-1:], batch.accel_gyro[-1:], np.ones(1, dtype=np.bool_)
+        )
+    mapping = Mapping(dataclasses.replace(recording, items_of=tuple(items)), make_starter=start)
+    mapping.run()
+    notes = finish(mapping, recording.name).report.notes
+    assert any("intervals between IMU samples are longer" in note for note in notes)
+    assert any("1 IMU samples are saturated" in note for note in notes)
+
+
+def test_without_map_builder_only_poses_are_estimated(tmp_path: Path) -> None:
+    recording, start = recording_of(cameras=1)
+    poses = tmp_path / "poses.csv"
+    options = options_of(run_map_builder=False, export_estimated_poses_to_csv=poses)
+    mapping = Mapping(recording, options, make_starter=start)
+    mapping.run()
+    finished = finish(mapping, recording.name)
+    assert finished.vi_map is None
+    assert finished.report.vertices == 0
+    assert len(read_trajectory(poses)) == finished.report.frames
+
+
+def test_the_status_line_and_health() -> None:
+    recording, start = recording_of()
+    progress = Interrupting(-1)
+    options = dataclasses.replace(RunOptions(), enable_health_checking=True)
+    Mapping(recording, options, make_starter=start).run(progress)
+    assert "tracks" in progress.steps[-1]
+    assert "landmarks" in progress.steps[-1]
+    assert " ms (" in progress.steps[-1]
+    assert 5 <= len(progress.lines) <= 10
+    assert all("speed" in line and "tilt" in line for line in progress.lines)
+    waiting = Interrupting(10)
+    with pytest.raises(Cancelled):
+        Mapping(recording).run(waiting)
+    assert "not started: 0." in waiting.steps[-1]
+
+
+def test_real_time_playback() -> None:
+    recording, start = recording_of(cameras=1)
+    options = dataclasses.replace(RunOptions(), realtime_playback_rate=20.0, stream=StreamOptions())
+    mapping = Mapping(recording, options, make_starter=start)
+    mapping.run()
+    assert mapping.statistics.real_time_factor() <= 20.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (options_of(localization_map_keep_landmark_fraction=1.5), "wants 0 to 1"),
+        (options_of(localization_map_keep_landmark_fraction=0.5), "needs --optimize_map"),
+        (options_of(run_map_builder=False, save_map_folder=Path("x")), "needs a map"),
+        (options_of(run_map_builder=False, optimize_map_to_localization_map=True), "needs a map"),
+        (dataclasses.replace(RunOptions(), realtime_playback_rate=-1.0), "wants 0 or more"),
+        (RunOptions(stream=StreamOptions(start_s=-1.0)), "vio_rosbag_start_s"),
+    ],
+)
+def test_wrong_options(options: RunOptions, message: str) -> None:
+    recording, _ = recording_of()
+    with pytest.raises(FlagError, match=message):
+        Mapping(recording, options)

@@ -1,0 +1,258 @@
+"""Calibrations: kalibr's files of the real data sets, what we export, sensors.yaml, and wrong files."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.geometry import se3, so3
+from maplab_py.interop.calibration_export import exported
+from maplab_py.interop.recordings.calibration import read_calibration, read_folder_calibration
+from maplab_py.interop.recordings.kalibr import upper_triangular_and_rotation
+from maplab_py.interop.recordings.models import make_device
+from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.sensors import Camera, Distortion, Imu, ImuIntrinsics, Projection
+from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
+from tests.interop.recordings.written import make_content, write_calibration, write_folder
+from tests.support.data import shared_data
+
+
+def test_kalibr_of_euroc() -> None:
+    device = read_calibration(
+        shared_data("euroc_imu/kalibr_imucam_chain.yaml"),
+        shared_data("euroc_imu/kalibr_imu_chain.yaml"),
+    )
+    first, second = device.cameras
+    assert (first.projection, first.distortion) == (Projection.PINHOLE, Distortion.RADTAN)
+    assert (first.width_px, first.height_px, first.topic) == (752, 480, "/cam0/image_raw")
+    assert first.intrinsics.tolist() == [458.654, 457.296, 367.215, 248.375]
+    assert second.distortion_parameters.tolist() == [
+        -0.28368365,
+        0.07451284,
+        -1.0473e-4,
+        -3.555907e-05,
+    ]
+    p_I_C = [[-0.0216401454975, -0.064676986768, 0.00981073058949]]
+    np.testing.assert_allclose(device.T_I_C[:1, 4:], p_I_C, atol=1e-12)
+    # straight ahead of the camera is z of C: third column of T_imu_cam
+    ahead = se3.transform(device.T_I_C[1], [0.0, 0.0, 1.0]) - device.T_I_C[1, 4:]
+    np.testing.assert_allclose(ahead, [0.0182237714554, 0.0251588363115, 0.999517347078], atol=1e-9)
+    imu = device.imu
+    assert imu is not None
+    assert (imu.acc_noise_density, imu.acc_bias_random_walk_noise_density) == (2e-3, 3e-3)
+    assert (imu.gyro_noise_density, imu.gyro_bias_random_walk_noise_density) == (
+        1.6968e-4,
+        1.9393e-5,
+    )
+    assert (imu.topic, imu.intrinsics) == ("/imu0", None)
+    folder = read_folder_calibration(shared_data("euroc_mh01_10s/mav0"))
+    np.testing.assert_allclose(folder.T_I_C, device.T_I_C, atol=1e-12)
+
+
+def test_kalibr_of_tum_vi() -> None:
+    device = read_calibration(
+        shared_data("tumvi_imu/kalibr_imucam_chain.yaml"),
+        shared_data("tumvi_imu/kalibr_imu_chain.yaml"),
+    )
+    first = device.cameras[0]
+    assert (first.distortion, first.width_px, first.height_px) == (Distortion.EQUIDISTANT, 512, 512)
+    assert first.distortion_parameters[0] == 0.0034823894022493434
+    T_C_I = se3.inverse(device.T_I_C)
+    p_C_I = [0.04727988224914392, -0.047443232143367084, -0.0681999605066297]
+    np.testing.assert_allclose(T_C_I[0, 4:], p_C_I, atol=1e-12)
+    imu = device.imu
+    assert imu is not None
+    assert (imu.acc_noise_density, imu.gyro_bias_random_walk_noise_density) == (0.0028, 2.2e-5)
+    result = shared_data("tumvi_imu/kalibr_result_512")
+    again = read_calibration(result / "camchain-imucam-imucalib.yaml", result / "imu-imucalib.yaml")
+    np.testing.assert_array_equal(again.T_I_C, device.T_I_C)
+
+
+def test_a_chain_of_relative_poses_is_followed(tmp_path: Path) -> None:
+    source = shared_data("tumvi_imu/kalibr_result_512/camchain-imucam-imucalib.yaml")
+    imu = shared_data("tumvi_imu/kalibr_result_512/imu-imucalib.yaml")
+    lines = source.read_text().splitlines()
+    second = max(row for row, line in enumerate(lines) if "T_cam_imu" in line)
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text("\n".join(lines[:second] + lines[second + 5 :]))
+    assert chain.read_text().count("T_cam_imu") == 1
+    # kalibr prints both poses, which agree to its rounding
+    T_I_C = read_calibration(chain, imu).T_I_C
+    np.testing.assert_allclose(T_I_C, read_calibration(source, imu).T_I_C, atol=1e-6)
+
+
+def _device(*, intrinsics: bool) -> RecordedSensors:
+    rng = np.random.default_rng(2)
+    cameras = [
+        Camera(
+            "",
+            Projection.PINHOLE,
+            Distortion.EQUIDISTANT,
+            np.array([300.0, 301.0, 320.0, 240.0 + row]),
+            rng.normal(size=4) * 0.01,
+            640,
+            480,
+            topic=f"/cam{row}",
+            time_offset_ns=1_500_000,
+        )
+        for row in range(2)
+    ]
+    T_I_C = se3.make(so3.exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)) * 0.1)
+    scale = ImuIntrinsics(
+        np.eye(3) + np.triu(rng.normal(size=(3, 3)) * 0.02),
+        np.eye(3) + np.triu(rng.normal(size=(3, 3)) * 0.02),
+        so3.to_matrix(so3.exp(rng.normal(size=3) * 0.05)),
+    )
+    imu = Imu("", 2e-3, 3e-3, 1e-4, 2e-5, topic="/imu", intrinsics=scale if intrinsics else None)
+    return make_device(cameras, T_I_C, imu)
+
+
+@pytest.mark.parametrize("form", ["kalibr", "openvins"])
+@pytest.mark.parametrize("intrinsics", [False, True])
+def test_what_we_export_reads_back(tmp_path: Path, form: str, intrinsics: bool) -> None:
+    device = _device(intrinsics=intrinsics)
+    files = exported(device.sensors, device.imu_id, device.rig_id, form, imu_rate_hz=200.0)
+    paths = []
+    for name, text in files.items():
+        paths.append(tmp_path / name)
+        paths[-1].write_text(text)
+    again = read_calibration(*paths)
+    np.testing.assert_allclose(again.T_I_C, device.T_I_C, atol=1e-9)
+    for ours, theirs in zip(again.cameras, device.cameras, strict=True):
+        assert ours.intrinsics.tolist() == theirs.intrinsics.tolist()
+        assert (ours.time_offset_ns, ours.topic) == (1_500_000, theirs.topic)
+    assert again.imu is not None
+    assert device.imu is not None
+    assert again.imu.acc_noise_density == 2e-3
+    wanted, read = device.imu.intrinsics, again.imu.intrinsics
+    if wanted is None:
+        assert read is None or np.abs(read.T_g - np.eye(3)).max() < 1e-12
+        return
+    assert read is not None
+    for name in ("T_g", "T_a", "R_A_I"):
+        np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), atol=1e-12)
+
+
+def test_upper_triangular_and_rotation() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        matrix = np.eye(3) + rng.normal(size=(3, 3)) * 0.3
+        if np.linalg.det(matrix) <= 0:
+            continue
+        T, R = upper_triangular_and_rotation(matrix)
+        np.testing.assert_allclose(T @ R, matrix, atol=1e-12)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.all(np.diag(T) > 0)
+        assert np.all(np.tril(T, -1) == 0)
+        assert np.linalg.det(R) > 0
+
+
+def test_ids_follow_from_the_calibration(tmp_path: Path) -> None:
+    first, again = _device(intrinsics=True), _device(intrinsics=True)
+    assert (first.imu_id, first.rig_id) == (again.imu_id, again.rig_id)
+    other = _device(intrinsics=False)
+    assert (other.rig_id, other.imu_id != first.imu_id) == (first.rig_id, True)
+    ids = {first.imu_id, first.rig_id, *(camera.id for camera in first.cameras)}
+    assert len(ids) == 4
+    parse_sensors(write_sensors(first.sensors), "text")  # ids and mounts are valid
+
+
+def test_sensors_yaml(tmp_path: Path) -> None:
+    folder = write_folder(make_content(frames=1), tmp_path / "room")
+    device = read_folder_calibration(folder / "mav0")
+    again = read_calibration(write_calibration(device, tmp_path / "sensors.yaml"))
+    assert (again.imu_id, again.rig_id) == (device.imu_id, device.rig_id)
+    np.testing.assert_allclose(again.T_I_C, device.T_I_C, atol=1e-15)
+    with pytest.raises(UserError, match="belongs to a camera chain of kalibr"):
+        read_calibration(tmp_path / "sensors.yaml", tmp_path / "imu.yaml")
+    twice = dict(device.sensors.sensors)
+    twice["f" * 32] = dataclasses.replace(twice[device.imu_id], id="f" * 32)
+    text = write_sensors(dataclasses.replace(device.sensors, sensors=twice))
+    (tmp_path / "two.yaml").write_text(text)
+    with pytest.raises(UserError, match="has 1 camera rigs and 2 IMUs: leave one of each"):
+        read_calibration(tmp_path / "two.yaml")
+
+
+def test_tum_vi_folder_with_calibration_beside_it(tmp_path: Path) -> None:
+    folder = write_folder(make_content(frames=1), tmp_path / "room1")
+    for path in folder.rglob("sensor.yaml"):
+        path.unlink()
+    (folder / "dso").mkdir()
+    source = shared_data("tumvi_imu")
+    for name, target in (("imucam_chain", "camchain"), ("imu_chain", "imu_config")):
+        text = (source / f"kalibr_{name}.yaml").read_text()
+        (folder / "dso" / f"{target}.yaml").write_text(text)
+    device = read_folder_calibration(folder / "mav0")
+    assert [camera.distortion for camera in device.cameras] == [Distortion.EQUIDISTANT] * 2
+    assert device.imu is not None
+    assert device.imu.acc_noise_density == 0.0028
+
+
+CHAIN = """cam0:
+  T_cam_imu:
+  - [1.0, 0.0, 0.0, 0.0]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [300.0, 300.0, 320.0, 240.0]
+  resolution: [640, 480]
+  rostopic: /cam0
+"""
+IMU = """accelerometer_noise_density: 0.01
+accelerometer_random_walk: 0.001
+gyroscope_noise_density: 0.001
+gyroscope_random_walk: 0.0001
+rostopic: /imu0
+update_rate: 200.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "T_cam_imu",
+            "T_x",
+            r"cam0: key 'T_cam_imu' is missing: calibrate cameras and IMU together",
+        ),
+        ("radtan", "ftheta", "cam0: key 'distortion_model': 'ftheta' is not supported"),
+        ("pinhole", "eucm", "cam0: key 'camera_model': 'eucm' is not supported"),
+        ("[640, 480]", "[640]", "key 'resolution' needs 2 values"),
+        ("[300.0", "[-300.0", "must be positive"),
+        ("update_rate: 200.0", "time_offset: 0.01", "key 'time_offset' of the only IMU must be 0"),
+        ("gyroscope_noise_density", "noise", "key 'gyroscope_noise_density' is missing"),
+        (
+            "update_rate: 200.0",
+            "Tg: [[0.1, 0, 0], [0, 0, 0], [0, 0, 0]]",
+            "sensitivity to acceleration is not modelled",
+        ),
+        ("update_rate: 200.0", "Tw: [[0, 0, 0], [0, 1, 0], [0, 0, 1]]", "no proper matrix"),
+        ("cam0:", "cam0: [", "not valid YAML"),
+    ],
+)
+def test_wrong_kalibr_files(tmp_path: Path, old: str, new: str, message: str) -> None:
+    chain, imu = tmp_path / "camchain.yaml", tmp_path / "imu.yaml"
+    assert old in CHAIN + IMU
+    chain.write_text(CHAIN.replace(old, new))
+    imu.write_text(IMU.replace(old, new))
+    with pytest.raises(MapError, match=message) as caught:
+        read_calibration(chain, imu)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_kalibr_without_imu_file_has_the_first_camera_as_body(tmp_path: Path) -> None:
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text(CHAIN.replace("T_cam_imu", "T_unknown"))
+    device = read_calibration(chain)
+    assert device.imu is None
+    np.testing.assert_array_equal(device.T_I_C, se3.identity(1))
+    with pytest.raises(MaplabError, match="cannot read"):
+        read_calibration(tmp_path / "absent.yaml")

@@ -1,0 +1,373 @@
+"""EuRoC and TUM-VI folders: written and read again, real ones, and damaged ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import tracemalloc
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from maplab_py.errors import FlagError, MapError, MaplabError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+from maplab_py.interop.recordings.protocol import CameraImage, FrameSet, ImuBatch
+from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.recordings.summary import summarise
+from maplab_py.sensors import Distortion
+from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.simulation.raw_data import write_raw_data
+from maplab_py.simulation.simulate import simulate
+from tests.interop.recordings.written import (
+    INTRINSICS,
+    START_NS,
+    assert_content,
+    assert_in_order,
+    frame_sets,
+    make_content,
+    samples,
+    write_calibration,
+    write_folder,
+)
+from tests.simulation.small import PERFECT
+from tests.support.data import shared_data
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_folder(make_content(), tmp_path / "room")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_folder_reads_back(tmp_path: Path, dtype: type, channels: int) -> None:
+    content = make_content(dtype=dtype, channels=channels)
+    recording = open_recording(write_folder(content, tmp_path / "room"))
+    events = list(EventStream(recording))
+    assert_content(events, content)
+    assert list(map(type, EventStream(recording))) == list(map(type, events))  # read again
+
+
+def test_the_path_may_be_mav0(folder: Path) -> None:
+    assert_content(list(EventStream(open_recording(folder / "mav0"))), make_content())
+
+
+def test_grey_values_of_any_image(tmp_path: Path) -> None:
+    content = make_content(cameras=1, frames=1, dtype=np.uint16)
+    (deep,) = frame_sets(
+        list(EventStream(open_recording(write_folder(content, tmp_path / "deep"))))
+    )
+    np.testing.assert_array_equal(deep.images[0].grey(), content.images[0][0] >> 8)
+    colours = make_content(cameras=1, frames=1, channels=3)
+    (bright,) = frame_sets(
+        list(EventStream(open_recording(write_folder(colours, tmp_path / "bright"))))
+    )
+    luminance = colours.images[0][0] @ np.array([0.114, 0.587, 0.299])
+    assert np.max(np.abs(bright.images[0].grey() - luminance)) < 1.0
+    assert bright.images[0].grey().dtype == np.uint8
+
+
+def test_sensors_of_a_folder(folder: Path) -> None:
+    device = open_recording(folder).device
+    assert [camera.distortion for camera in device.cameras] == [Distortion.RADTAN] * 2
+    assert device.cameras[0].intrinsics.tolist() == INTRINSICS
+    assert device.imu is not None
+    assert device.imu.gyro_noise_density == 1.6968e-04
+    assert device.T_I_C[:, 4:].tolist() == [[0.0, 0.0, 0.02], [0.1, 0.0, 0.02]]
+    again = open_recording(folder).device
+    assert (again.imu_id, again.rig_id) == (device.imu_id, device.rig_id)
+    assert write_sensors(again.sensors) == write_sensors(device.sensors)
+
+
+def test_cameras_are_on_the_imu_even_if_it_is_not_the_body(folder: Path) -> None:
+    path = folder / "mav0" / "imu0" / "sensor.yaml"
+    text = path.read_text().replace("[1.0, 0.0, 0.0, 0.0,", "[1.0, 0.0, 0.0, 0.5,")
+    path.write_text(text)
+    T_I_C = open_recording(folder).device.T_I_C
+    np.testing.assert_allclose(T_I_C[:, 4:], [[-0.5, 0.0, 0.02], [-0.4, 0.0, 0.02]], atol=1e-15)
+
+
+def test_some_cameras(folder: Path) -> None:
+    content, options = make_content(), SourceOptions(rovio_active_camera_indices="1")
+    recording = open_recording(folder, options)
+    assert recording.device.rig_id != open_recording(folder).device.rig_id
+    second = dataclasses.replace(
+        content, stamps_ns=content.stamps_ns[1:], images=content.images[1:]
+    )
+    assert_content(list(EventStream(recording)), second)
+    np.testing.assert_allclose(recording.device.T_I_C[:, 4:], [[0.1, 0.0, 0.02]])
+    for wrong in ("2", "0,0", "-1", "x"):
+        with pytest.raises(MaplabError, match="rovio_active_camera_indices"):
+            open_recording(folder, SourceOptions(rovio_active_camera_indices=wrong))
+
+
+def test_a_time_offset_replaces_that_of_the_calibration(folder: Path) -> None:
+    plain = open_recording(folder)
+    late = open_recording(folder, SourceOptions(imu_to_camera_time_offset_ns=4_000_000))
+    assert {camera.time_offset_ns for camera in late.device.cameras} == {4_000_000}
+    images, late_images = (
+        [item for item in recording.items() if isinstance(item, CameraImage)]
+        for recording in (plain, late)
+    )
+    assert [image.stamp_ns for image in late_images] == [image.stamp_ns for image in images]
+    shifts = {a.time_ns - b.time_ns for a, b in zip(late_images, images, strict=True)}
+    assert shifts == {4_000_000}
+
+
+def test_part_of_a_recording(folder: Path) -> None:
+    content, recording = make_content(), open_recording(folder)
+    events = list(EventStream(recording, StreamOptions(start_s=0.1, end_s=0.2)))
+    begin, end = START_NS - 20_000_000 + 100_000_000, START_NS - 20_000_000 + 200_000_000
+    times_ns, _ = samples(events)
+    inside = (content.imu_ns >= begin) & (content.imu_ns < end)
+    np.testing.assert_array_equal(times_ns, content.imu_ns[inside])
+    wanted = content.stamps_ns[0]
+    assert [s.time_ns for s in frame_sets(events)] == wanted[
+        (wanted >= begin) & (wanted < end)
+    ].tolist()
+    with pytest.raises(UserError, match="nothing was recorded from 100 s on"):
+        list(EventStream(recording, StreamOptions(start_s=100.0)))
+    for options in (StreamOptions(start_s=-1.0), StreamOptions(start_s=2.0, end_s=1.0)):
+        with pytest.raises(FlagError, match="--vio_rosbag"):
+            EventStream(recording, options)
+
+
+def test_frames_before_the_first_imu_sample_are_dropped_and_counted(tmp_path: Path) -> None:
+    content = make_content()
+    late = dataclasses.replace(
+        content, imu_ns=content.imu_ns[20:], accel_gyro=content.accel_gyro[20:]
+    )
+    stream = EventStream(open_recording(write_folder(late, tmp_path / "room")))
+    events = list(stream)
+    assert stream.statistics.dropped_before_imu == 2
+    assert isinstance(events[0], ImuBatch)
+    assert len(frame_sets(events)) == 6
+
+
+def test_gaps_and_saturation_are_reported(tmp_path: Path) -> None:
+    content = make_content()
+    keep = np.ones(len(content.imu_ns), dtype=np.bool_)
+    keep[30:50] = False
+    values = content.accel_gyro.copy()
+    values[5, 4] = -7.5  # the limit of maplab's default gyroscope
+    values[6, 0] = 200.0
+    gappy = dataclasses.replace(content, imu_ns=content.imu_ns[keep], accel_gyro=values[keep])
+    recording = open_recording(write_folder(gappy, tmp_path / "room"))
+    events = list(EventStream(recording))
+    flags = np.concatenate([e.is_saturated for e in events if isinstance(e, ImuBatch)])
+    assert np.flatnonzero(flags).tolist() == [5, 6]
+    report = summarise(recording)
+    assert report.imu is not None
+    assert (report.imu.gaps, report.imu.saturated_samples) == (1, 2)
+    assert report.imu.largest_interval_s == pytest.approx(0.105)
+    assert report.imu.first_gap_s == pytest.approx(29 * 0.005)
+    assert any("longer than 0.05 s" in note for note in report.notes)
+    relaxed = summarise(recording, StreamOptions(imu_gap_s=0.2))
+    assert relaxed.imu is not None
+    assert relaxed.imu.gaps == 0
+
+
+def _edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def _flip(path: Path) -> None:
+    """Change a byte in the middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(data)
+
+
+CAM = f"mav0/cam1/data/{START_NS + 1000 + 50_000_000}.png"
+DAMAGES = {
+    "missing image": (lambda f: (f / CAM).unlink(), r"\.png: the image is missing \(1 of 8 are\)"),
+    "truncated image": (lambda f: _truncate(f / CAM), r"\.png: the image is truncated"),
+    "empty image": (lambda f: (f / CAM).write_bytes(b""), r"\.png: the image is empty"),
+    "damaged image": (lambda f: _flip(f / CAM), r"\.png: the image is damaged"),
+    "no image": (lambda f: (f / CAM).write_bytes(b"text" * 99), "neither a PNG nor a JPEG"),
+    "other size": (
+        lambda f: _edit(f / "mav0/cam1/sensor.yaml", "[64, 48]", "[64, 50]"),
+        r"the image is 64 x 48, the calibration is of 64 x 50: calibrate",
+    ),
+    "no image folder": (lambda f: shutil.rmtree(f / "mav0/cam0/data"), "copy the images there"),
+    "no image table": (lambda f: (f / "mav0/cam0/data.csv").unlink(), r"cam0/data\.csv: No such"),
+    "backward image stamp": (
+        lambda f: _edit(f / "mav0/cam0/data.csv", f"\n{START_NS + 10**8},", f"\n{START_NS - 1},"),
+        r"cam0/data\.csv:4: the time stamp does not come after",
+    ),
+    "bad image row": (
+        lambda f: _edit(f / "mav0/cam0/data.csv", f"\n{START_NS},", "\nsoon,"),
+        r"cam0/data\.csv:2: a row must be",
+    ),
+    "image elsewhere": (
+        lambda f: _edit(f / "mav0/cam0/data.csv", f"{START_NS}.png", "../../secret.png"),
+        r"cam0/data\.csv:2: a row must be",
+    ),
+    "no images": (
+        lambda f: (f / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n"),
+        "the recording is empty",
+    ),
+    "no IMU table": (lambda f: (f / "mav0/imu0/data.csv").unlink(), "imu0/data.csv: the table is"),
+    "no samples": (lambda f: (f / "mav0/imu0/data.csv").write_text("#t\n"), "there are no rows"),
+    "backward IMU stamp": (
+        lambda f: _edit(f / "mav0/imu0/data.csv", f"\n{START_NS}", f"\n{START_NS - 10**9}"),
+        r"imu0/data\.csv:6: the time stamp does not come after",
+    ),
+    "no calibration": (
+        lambda f: [p.unlink() for p in f.rglob("sensor.yaml")],
+        "there is no calibration .*--sensor_calibration_file",
+    ),
+    "no camera model": (
+        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "pinhole", "ds"),
+        r"cam0/sensor\.yaml: key 'camera_model': 'ds' is not supported",
+    ),
+    "no intrinsics": (
+        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "intrinsics", "intrinsic"),
+        "key 'intrinsics' is missing",
+    ),
+    "no noise": (
+        lambda f: _edit(f / "mav0/imu0/sensor.yaml", "gyroscope_random_walk", "walk"),
+        "key 'gyroscope_random_walk' is missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_folders_are_refused_in_one_line(folder: Path, damage: str) -> None:
+    harm, message = DAMAGES[damage]
+    harm(folder)
+    with pytest.raises(MapError) as caught:
+        summarise(open_recording(folder), check_images=True)
+    text = str(caught.value)
+    assert re.search(message, text), text
+    assert "\n" not in text
+    assert str(folder) in text
+
+
+def test_decoding_refuses_what_the_check_refuses(folder: Path) -> None:
+    _truncate(folder / CAM)
+    sets = frame_sets(list(EventStream(open_recording(folder))))
+    assert sets[1].images[0].decode().shape == (48, 64)
+    with pytest.raises(MapError, match="truncated"):
+        sets[1].images[1].decode()
+
+
+def test_a_calibration_with_more_cameras_than_the_folder(folder: Path) -> None:
+    file = write_calibration(open_recording(folder).device, folder / "sensors.yaml")
+    shutil.rmtree(folder / "mav0" / "cam1")
+    with pytest.raises(MapError, match=r"cam1: the folder is missing.*--rovio_active_camera_ind"):
+        open_recording(folder, SourceOptions(sensor_calibration_file=file))
+    first = SourceOptions(sensor_calibration_file=file, rovio_active_camera_indices="0")
+    assert len(frame_sets(list(EventStream(open_recording(folder, first))))) == 8
+
+
+def test_a_truncated_jpeg_is_refused(tmp_path: Path) -> None:
+    folder = write_folder(make_content(), tmp_path / "room", suffix=".jpg")
+    assert summarise(open_recording(folder), check_images=True).checked_images == 16
+    _truncate((folder / CAM).with_suffix(".jpg"))
+    with pytest.raises(MapError, match=r"\.jpg: the image is truncated"):
+        summarise(open_recording(folder), check_images=True)
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="does not exist"):
+        open_recording(tmp_path / "absent")
+    with pytest.raises(UserError, match="is no recording: wants a folder with mav0/cam0"):
+        open_recording(tmp_path)
+
+
+def test_simulated_recordings_read_back(tmp_path: Path) -> None:
+    data = simulate(PERFECT)
+    (folder,) = write_raw_data(PERFECT, data, tmp_path)
+    session = data.recordings[0]
+    for home in (folder / "mav0").glob("cam*"):  # the scenario renders no images
+        (home / "data").mkdir()
+        for stamp in session.recording.time_ns.tolist():
+            (home / "data" / f"{stamp}.png").touch()
+    recording = open_recording(folder)
+    events = list(EventStream(recording))
+    times_ns, accel_gyro = samples(events)
+    np.testing.assert_array_equal(times_ns, session.recording.imu_time_ns)
+    np.testing.assert_array_equal(accel_gyro, session.recording.imu.accel_gyro)
+    assert [s.time_ns for s in frame_sets(events)] == session.recording.time_ns.tolist()
+    np.testing.assert_allclose(recording.device.T_I_C, session.device.rig.T_B_C, atol=1e-12)
+    for ours, theirs in zip(recording.device.cameras, session.device.rig.cameras, strict=True):
+        assert ours.intrinsics.tolist() == theirs.intrinsics.tolist()
+
+
+def test_real_stereo_recording() -> None:
+    folder = shared_data("euroc_mh01_10s")
+    recording = open_recording(folder)
+    events = list(EventStream(recording))
+    assert_in_order(events)
+    sets = frame_sets(events)
+    assert len(sets) == 200
+    assert (sets[0].time_ns, sets[-1].time_ns) == (1403636584763555584, 1403636594713555456)
+    assert all(image.stamp_ns == s.time_ns for s in sets for image in s.images)
+    times_ns, accel_gyro = samples(events)
+    assert len(times_ns) == 2111
+    assert times_ns[0] == 1403636584263555584
+    assert accel_gyro[0, 0] == 10.133538333333334
+    assert sets[7].images[1].grey().shape == (480, 752)
+    report = summarise(recording, check_images=True)
+    assert (report.checked_images, report.frame_sets, report.dropped_before_imu) == (400, 200, 0)
+    assert report.imu is not None
+    assert report.imu.rate_hz == pytest.approx(200.0, abs=0.01)
+    assert report.imu.gaps == 0
+    baseline_m = np.linalg.norm(se3.relative(*recording.device.T_I_C)[4:])
+    assert baseline_m == pytest.approx(0.1101, abs=1e-4)
+
+
+def test_real_irregular_keyframes_without_imu() -> None:
+    recording = open_recording(shared_data("euroc_v101_keyframes"))
+    events = list(EventStream(recording))
+    assert len(frame_sets(events)) == len(events) == 50
+    steps_s = np.diff([event.time_ns for event in events]) * 1e-9
+    assert steps_s.min() < 1.0 < 7.0 < steps_s.max() < 7.5
+    report = summarise(recording)
+    assert report.imu is None
+    assert report.notes == ("there is no IMU",)
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_stereo_are_never_held_at_once(tmp_path: Path) -> None:
+    frames, content = 12_000, make_content(frames=1)
+    imu_ns = START_NS + np.arange(120_000) * 5_000_000
+    long = dataclasses.replace(
+        content, imu_ns=imu_ns, accel_gyro=np.random.default_rng(1).normal(size=(120_000, 6))
+    )
+    folder = write_folder(long, tmp_path / "long")
+    stamps = START_NS + np.arange(frames) * 50_000_000
+    big = np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8)
+    size = 2 * frames * big.nbytes
+    cv2.imwrite(str(tmp_path / "big.png"), big)
+    for camera in (0, 1):
+        home = folder / "mav0" / f"cam{camera}"
+        _edit(home / "sensor.yaml", "[64, 48]", "[752, 480]")
+        rows = "".join(f"{stamp},a{row % 50}.png\n" for row, stamp in enumerate(stamps.tolist()))
+        (home / "data.csv").write_text(rows)
+        for row in range(50):
+            (home / "data" / f"a{row}.png").symlink_to(tmp_path / "big.png")
+    stream = EventStream(open_recording(folder))
+    tracemalloc.start()
+    try:
+        for event in stream:
+            if isinstance(event, FrameSet) and stream.statistics.frame_sets.count % 100 == 0:
+                assert event.images[1].grey().shape == (480, 752)
+        now, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (stream.statistics.frame_sets.count, stream.statistics.imu.count) == (frames, 120_000)
+    assert peak < size / 30, peak  # while the table of the IMU is read
+    assert now < 30e6, now

@@ -1,0 +1,126 @@
+"""From stereo images to a mesh in the console, with undo, a new process, and bad input."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
+from maplab_py.errors import FlagError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.ply import parse_ply
+from maplab_py.storage.native import save_map
+from tests.e2e.support import run_program
+from tests.support.stereo_room import StereoRoom, quarter_size
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> StereoRoom:
+    room = StereoRoom.simulated(tmp_path_factory.mktemp("stereo"), quarter_size(5.0))
+    true_map = room.true_map
+    shutil.rmtree(room.map_folder)
+    save_map(true_map, room.map_folder)
+    return room
+
+
+@pytest.fixture
+def session(room: StereoRoom) -> Iterator[Session]:
+    with Session(load_registry()) as session:
+        session.run("load", map_folder=room.map_folder)
+        session.run("import_images", dataset_folder=room.recording)
+        yield session
+
+
+def test_stereo_images_become_a_mesh(session: Session, room: StereoRoom, tmp_path: Path) -> None:
+    stereo: Any = session.run(
+        "stereo_dense_reconstruction", dense_stereo_sgbm_speckle_window_size=125
+    )
+    assert stereo.resources == len(session.vi_map.vertices)
+    mesh = tmp_path / "room.ply"
+    session.run("tsdf", dense_result_mesh_output_file=mesh)
+    cloud = parse_ply(mesh.read_bytes(), "room.ply")
+    assert cloud.faces is not None
+    off_m = room.distances_to_surfaces(cloud.p)
+    assert len(cloud.p) > 2000
+    # voxels of 10 cm, images of a quarter of the pixels
+    assert off_m.mean() < 0.05
+    assert np.mean(off_m > 0.1) < 0.1
+    view: Any = session.run("visualize_mesh", viewer_port=0)
+    assert ("Mesh", len(cloud.faces)) in [(line.layer, line.in_map) for line in view.layers]
+    painted = tmp_path / "painted.ply"
+    session.run(
+        "export_tsdf", dense_result_mesh_output_file=painted, dense_result_mesh_colours=True
+    )
+    colours = parse_ply(painted.read_bytes(), "painted.ply").colours
+    assert colours is not None
+    assert len(colours) == len(cloud.p)
+    seen = (colours != 128).any(axis=1)
+    assert seen.mean() > 0.8
+    assert colours[seen].std() > 10.0  # textures, not one grey
+    folder = tmp_path / "map"
+    session.run("save", map_folder=folder)
+    assert session.run("check_map_consistency").failure == ""
+    again = tmp_path / "again.ply"
+    line = f"load '{folder}'; create_mesh_from_tsdf_grid --dense_result_mesh_output_file='{again}'"
+    result = run_program(tmp_path, "-c", line)
+    assert result.returncode == 0, result.stderr
+    assert again.read_bytes() == mesh.read_bytes()
+
+
+def test_undo_and_failure_leave_nothing_behind(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    before = session.vi_map
+    part = {"dense_stereo_debug_reconstruction_end_fraction_of_trajectory": 0.2}
+    session.run("sdr", **part)
+    mesh = tmp_path / "mesh.ply"
+    with pytest.raises(UserError, match="--dense_max_memory_gb"):
+        session.run("tsdf", dense_max_memory_gb=1e-5, dense_result_mesh_output_file=mesh)
+    assert not mesh.exists()
+    session.run("tsdf")
+    for _ in range(2):
+        session.run("undo")
+    assert session.vi_map is before
+    session.run("delete_map", yes=True)
+    gc.collect()
+    assert [path for path in temporary.rglob("*") if path.is_file()] == []
+
+
+def test_a_grid_follows_the_poses(session: Session, tmp_path: Path) -> None:
+    part = {"dense_stereo_debug_reconstruction_end_fraction_of_trajectory": 0.2}
+    session.run("sdr", **part)
+    session.run("tsdf")
+    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 0
+    vi_map = session.vi_map
+    T_M_I = np.array(vi_map.vertices.T_M_I)
+    T_M_I[2] = se3.retract(T_M_I[2], np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    entry = session.maps.selected
+    changed = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I))
+    session.maps.update(entry.with_value(changed, "move"))
+    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 1
+    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 0
+
+
+def test_wrong_values_are_refused(session: Session, tmp_path: Path) -> None:
+    with pytest.raises(FlagError, match="downscaling_factor"):
+        session.run("sdr", dense_stereo_downscaling_factor=0.0)
+    with pytest.raises(FlagError, match="dense_tsdf_voxel_size_m"):
+        session.run("tsdf", dense_tsdf_voxel_size_m=-1.0)
+    with pytest.raises(UserError, match="no such resource type"):
+        session.run("tsdf", dense_depth_resource_input_type="stereo")
+    with pytest.raises(UserError, match=r"\.ply, \.obj, \.stl, \.glb"):
+        session.run("tsdf", dense_result_mesh_output_file=tmp_path / "mesh.txt")
+    (tmp_path / "mesh.ply").write_text("mine")
+    with pytest.raises(UserError, match="--overwrite"):
+        session.run("export_tsdf", dense_result_mesh_output_file=tmp_path / "mesh.ply")

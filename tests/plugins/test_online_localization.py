@@ -1,0 +1,146 @@
+"""rovioli in a map, and evaluate_localization, through the console."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.console.session.session import Session
+from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.frontend.reports import MappingReport
+from maplab_py.interop.trajectories import Trajectory, write_euroc
+from maplab_py.storage.native import save_map
+from maplab_py.storage.summary_map import write_summary_map
+from tests.frontend.localization.places import place, summary
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the map, its summary map, the recording, and the truth of both in G."""
+    folder, where = tmp_path_factory.mktemp("localisation"), place()
+    save_map(where.vi_map, folder / "map")
+    save_map(where.query, folder / "query")
+    write_summary_map(summary(), folder / "summary")
+    write_euroc(Trajectory(where.times_ns, where.T_G_I), folder / "truth.csv")
+    write_euroc(
+        Trajectory(where.vi_map.vertices.timestamp_ns, where.vi_map.T_G_I), folder / "map_truth.csv"
+    )
+    return folder
+
+
+def localized(session: Session, folders: Path, **flags: object) -> MappingReport:
+    report = session.run(
+        "rovioli", datasource_folder=folders / "query", rovioli_run_map_builder=False, **flags
+    )
+    assert isinstance(report, MappingReport)
+    return report
+
+
+def test_poses_in_the_map_are_written_and_evaluated(folders: Path, tmp_path: Path) -> None:
+    file = tmp_path / "vil.csv"
+    with Session() as session:
+        report = localized(
+            session, folders, vio_localization_map_folder=folders / "summary",
+            export_localized_poses_to_csv=file,
+        )  # fmt: skip
+        said = report.localization
+        assert said is not None
+        assert said.mode == "vil"
+        assert said.starts == 1
+        assert said.csv_file == file
+        assert 0.5 < said.localized_share <= 1.0
+        assert any(stage.stage == "localise" for stage in report.frame_times)
+        assert len(file.read_text().splitlines()) == 1 + report.estimated_frames
+        evaluation = session.run(
+            "evaluate_localization", localization_csv=str(file), ground_truth=folders / "truth.csv"
+        )
+        errors = evaluation.files[0]
+        assert evaluation.failure == ""
+        assert errors.median_m < 0.05
+        assert errors.localized_share > 0.8
+        assert 0.0 < errors.first_localized_s < 5.0
+        aligned = session.run(
+            "evaluate_localization", localization_csv=f"{file}, {file}",
+            ground_truth=folders / "truth.csv", map_folder=folders / "map",
+            map_ground_truth=folders / "map_truth.csv",
+        )  # fmt: skip
+        assert len(aligned.files) == 2
+        assert aligned.files[0].median_m == pytest.approx(errors.median_m, abs=1e-3)
+        with pytest.raises(UserError, match=r"vil.csv exists already"):
+            localized(
+                session, folders, vio_localization_map_folder=folders / "summary",
+                export_localized_poses_to_csv=file,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["swl", "pose", "odo"])
+def test_baselines_run_from_the_console(folders: Path, mode: str) -> None:
+    with Session() as session:
+        report = localized(
+            session, folders, vio_localization_map_folder=folders / "map", localization_mode=mode
+        )
+    assert report.localization is not None
+    assert report.localization.mode == mode
+    assert report.localization.localized_share > 0.5
+
+
+def test_without_a_map_nothing_is_said_of_localisation(folders: Path) -> None:
+    with Session() as session:
+        assert localized(session, folders).localization is None
+
+
+def test_wrong_input_is_told_in_one_line(folders: Path, tmp_path: Path) -> None:
+    with Session() as session:
+        for flags, error, message in (
+            ({"vio_localization_map_folder": tmp_path}, UserError, "neither a map folder nor"),
+            ({"export_localized_poses_to_csv": tmp_path / "x.csv"}, FlagError, "needs --vio_loc"),
+            (
+                {
+                    "vio_localization_map_folder": folders / "summary",
+                    "vil_map_tilt_sigma_deg": 0.0,
+                },
+                FlagError,
+                "vil_map_tilt_sigma_deg=0: must be positive",
+            ),
+        ):
+            with pytest.raises(error, match=message) as told:
+                localized(session, folders, **flags)
+            assert "\n" not in str(told.value)
+        damaged = tmp_path / "damaged" / "localization_summary_map"
+        damaged.parent.mkdir()
+        content = (folders / "summary" / "localization_summary_map").read_bytes()
+        damaged.write_bytes(content[: len(content) // 2])
+        with pytest.raises(MapError, match="localization_summary_map"):
+            localized(session, folders, vio_localization_map_folder=damaged.parent)
+
+
+def test_evaluation_tells_what_is_missing(folders: Path, tmp_path: Path) -> None:
+    late = Trajectory(place().times_ns + 10**12, place().T_G_I)
+    write_euroc(late, tmp_path / "late.csv")
+    with Session() as session:
+        with pytest.raises(UserError, match="--localization_csv=FILE"):
+            session.run("evaluate_localization", ground_truth=folders / "truth.csv")
+        with pytest.raises(Exception, match="no frame lies in the time span"):
+            session.run(
+                "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+                ground_truth=tmp_path / "late.csv",
+            )  # fmt: skip
+        with pytest.raises(Exception, match="fewer than 3 vertices"):
+            session.run(
+                "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+                ground_truth=folders / "truth.csv", map_folder=folders / "map",
+            )  # fmt: skip
+
+
+def test_a_perfect_trajectory_has_no_errors(folders: Path) -> None:
+    with Session() as session:
+        report = session.run(
+            "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+            ground_truth=folders / "truth.csv",
+        )  # fmt: skip
+    errors = report.files[0]
+    assert errors.localized_share == 1.0
+    assert errors.largest_m == pytest.approx(0.0, abs=1e-12)
+    assert np.isclose(errors.first_localized_s, 0.0)

@@ -1,0 +1,280 @@
+"""The command rovioli: from a recording to a map that the other commands take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.cancellation import CancelToken, current_token, obeying
+from maplab_py.console.session.session import Session
+from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.reports import MappingReport
+from maplab_py.storage.native import load_map, save_map
+from maplab_py.vimap.consistency import check_consistency
+from tests.frontend.simulated import REST_FIRST, replayed
+from tests.interop.recordings.written import make_content, write_folder
+from tests.support.data import shared_data
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a map folder to replay: at rest first, then a walk."""
+    folder = tmp_path_factory.mktemp("recording") / "walk"
+    save_map(replayed(REST_FIRST, 2)[0], folder)
+    return folder
+
+
+def run(session: Session, folder: Path | None, **flags: object) -> MappingReport:
+    words = {} if folder is None else {"datasource_folder": folder}
+    report = session.run("rovioli", **words, **flags)
+    assert isinstance(report, MappingReport)
+    return report
+
+
+def test_the_map_is_saved_and_selected(walk: Path, tmp_path: Path) -> None:
+    target = tmp_path / "map"
+    with Session() as session:
+        report = run(session, walk, save_map_folder=target)
+        assert report.failure == ""
+        assert report.map_folder == target
+        assert session.maps.selected_key == report.map_key == "map"
+        assert session.maps.selected.is_saved
+        assert session.maps.selected.folder == target
+        vi_map, _ = load_map(target)
+        assert check_consistency(vi_map).failure == ""
+        assert len(vi_map.vertices) == len(session.vi_map.vertices) == report.vertices > 50
+        assert len(report.starts) == 1
+        assert 0.4 < report.starts[0].time_s < 2.0
+
+
+@pytest.mark.slow
+def test_the_other_commands_take_the_map(walk: Path, tmp_path: Path) -> None:
+    with Session() as session:
+        run(session, walk)
+        assert session.maps.selected_key == "rovioli"
+        assert not session.maps.selected.is_saved
+        session.run("check_map_consistency")
+        assert session.run("optvi").failure == ""
+        summary = tmp_path / "summary"
+        session.run("summary_map", summary_map_save_path=summary)
+        localized = session.run("localize", localization_map=str(summary))
+        assert localized.failure == ""
+        assert session.run("kfh").failure == ""
+        # the walk has no loop: that is what lc has to say about its tracks
+        assert session.run("lc").failure.startswith("no loop closures")
+        assert session.run("optvi").failure == ""
+        assert session.run("elq").failure == ""
+        session.run("save", map_folder=tmp_path / "map")
+        assert check_consistency(load_map(tmp_path / "map")[0]).failure == ""
+
+
+@pytest.mark.slow
+def test_a_localisation_map_keeps_a_share_of_the_landmarks(walk: Path) -> None:
+    with Session() as session:
+        whole = run(session, walk, map_key="all", optimize_map_to_localization_map=True)
+        part = run(
+            session, walk, map_key="part", optimize_map_to_localization_map=True,
+            localization_map_keep_landmark_fraction=0.25,
+        )  # fmt: skip
+    assert whole.vertices == part.vertices
+    assert 0.1 * whole.good_landmarks < part.good_landmarks <= 0.3 * whole.good_landmarks
+
+
+def test_poses_are_exported_and_not_overwritten(walk: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "poses.csv"
+    with Session() as session:
+        report = run(
+            session, walk, rovioli_run_map_builder=False, export_estimated_poses_to_csv=poses
+        )
+        assert len(session.maps) == 0
+        assert report.poses_file == poses
+        assert len(poses.read_text().splitlines()) == 1 + report.estimated_frames
+        with pytest.raises(UserError, match=r"poses.csv exists already: give --overwrite"):
+            run(session, walk, export_estimated_poses_to_csv=poses)
+
+
+def test_an_existing_target_is_refused_before_any_work(walk: Path, tmp_path: Path) -> None:
+    target = tmp_path / "map"
+    vi_map, _ = replayed(REST_FIRST, 2)
+    save_map(vi_map, target)
+    with Session() as session:
+        with pytest.raises(UserError, match="holds a map already"):
+            run(session, walk, save_map_folder=target)
+        (tmp_path / "other").mkdir()
+        (tmp_path / "other" / "notes.txt").write_text("mine")
+        with pytest.raises(UserError, match="not empty and not a map"):
+            run(session, walk, save_map_folder=tmp_path / "other")
+        report = run(session, walk, save_map_folder=target, overwrite_existing_map=True)
+        assert len(load_map(target)[0].vertices) == report.vertices
+
+
+def test_an_error_in_the_recording_is_reported_and_the_map_saved(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = Mapping._take
+    count = 0
+
+    def failing(mapping: Mapping, *words: object) -> None:
+        nonlocal count
+        count += 1
+        if count == 60:
+            raise MapError("cam0/60.png: the image is truncated; copy it again")
+        plain(mapping, *words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Mapping, "_take", failing)
+    with Session() as session:
+        report = run(session, walk, save_map_folder=tmp_path / "map")
+        assert report.failure.startswith("cam0/60.png: the image is truncated")
+        assert len(session.vi_map.vertices) == report.vertices > 20
+    assert len(load_map(tmp_path / "map")[0].vertices) == report.vertices
+
+
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_ctrl_c_ends_the_recording_and_keeps_the_map(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_saved: bool
+) -> None:
+    press_at_frame(monkeypatch, 60)
+    folder = {"save_map_folder": tmp_path / "map"} if is_saved else {}
+    with Session() as session, obeying(CancelToken()):
+        report = run(session, walk, map_key="part", **folder)
+        assert report.failure == ""
+        assert report.frames == 60
+        assert session.maps.selected_key == "part"
+        assert len(session.vi_map.vertices) == report.vertices > 20
+        assert session.maps.selected.is_saved == is_saved
+        assert check_consistency(session.vi_map).failure == ""
+        session.run("save", map_folder=tmp_path / "saved_later")
+    for name in ("saved_later", *(["map"] if is_saved else [])):
+        assert len(load_map(tmp_path / name)[0].vertices) == report.vertices
+
+
+def test_a_second_ctrl_c_leaves_the_session_as_it_was(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press_at_frame(monkeypatch, 60, 60)
+    with Session() as session, obeying(CancelToken()):
+        with pytest.raises(Cancelled):
+            run(session, walk, save_map_folder=tmp_path / "map")
+        assert len(session.maps) == 0
+    assert not (tmp_path / "map").exists()
+
+
+def press_at_frame(monkeypatch: pytest.MonkeyPatch, *frames: int) -> None:
+    """Press Ctrl-C after some frames of a run."""
+    plain = Mapping._take
+
+    def interrupted(mapping: Mapping, *words: object) -> None:
+        plain(mapping, *words)  # type: ignore[arg-type]
+        for _ in range(frames.count(mapping.statistics.frames)):
+            token = current_token()
+            token.cancelled = not token.request_end()
+
+    monkeypatch.setattr(Mapping, "_take", interrupted)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({}, "no recording: give --datasource_folder"),
+        ({"datasource_folder": "nowhere"}, "nowhere does not exist: give a folder"),
+        ({"datasource_folder": "empty"}, "is no recording: wants a folder with mav0/cam0"),
+        ({"datasource_folder": "empty", "datasource_type": "map"}, "empty is not a map folder"),
+        ({"datasource_folder": "WALK", "datasource_type": "euroc"}, "give --datasource_type=map"),
+        ({"datasource_folder": "WALK", "map_mission": "ffff"}, "no mission"),
+        ({"datasource_folder": "images", "map_mission": "ff"}, "images is not a map folder"),
+        ({"datasource_folder": "images", "datasource_type": "rosbag"}, "is a EuRoC folder"),
+        ({"datasource_rosbag": "x.bag", "datasource_type": "euroc"}, "needs --datasource_folder"),
+        ({"datasource_rosbag": "x.bag", "datasource_folder": "images"}, "not both"),
+        ({"datasource_rosbag": "x.bag"}, "x.bag does not exist"),
+        ({"datasource_folder": "images", "camera_topics": "/a,/b"}, "apply to bags only"),
+        (
+            {"datasource_folder": "images", "feature_tracking_descriptor_type": "freak"},
+            "FREAK is not in the OpenCV",
+        ),
+        ({"datasource_folder": "images", "rovio_image_mask_path": "m.png"}, "cannot be read"),
+        ({"datasource_folder": "images", "vio_num_keyframes": 0}, "vio_num_keyframes"),
+        ({"datasource_folder": "WALK", "map_key": "a/b"}, "cannot be a map key"),
+    ],
+)
+def test_wrong_requests_are_refused_in_one_line(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: dict[str, str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    write_folder(make_content(), tmp_path / "images")
+    given: dict[str, object] = {
+        name: Path(value.replace("WALK", str(walk))) if name.startswith("datasource_") else value
+        for name, value in flags.items()
+    }
+    if "datasource_type" in flags:
+        given["datasource_type"] = flags["datasource_type"]
+    with Session() as session:
+        with pytest.raises((UserError, FlagError, MapError), match=message) as error:
+            session.run("rovioli", **given)
+        assert "\n" not in str(error.value)
+        assert len(session.maps) == 0
+
+
+def test_a_recording_that_does_not_start_says_why(tmp_path: Path) -> None:
+    folder = write_folder(make_content(), tmp_path / "images")
+    with Session() as session, pytest.raises(EstimationError, match="has not started: "):
+        run(session, folder)
+
+
+def test_folders_without_calibration_or_imu(tmp_path: Path) -> None:
+    folder = write_folder(make_content(), tmp_path / "images")
+    with Session() as session:
+        (folder / "mav0" / "cam0" / "sensor.yaml").rename(tmp_path / "sensor.yaml")
+        with pytest.raises(MapError, match="there is no calibration"):
+            run(session, folder)
+        (tmp_path / "sensor.yaml").rename(folder / "mav0" / "cam0" / "sensor.yaml")
+        (folder / "mav0" / "imu0").rename(tmp_path / "imu0")
+        with pytest.raises(UserError, match="odometry needs an IMU"):
+            run(session, folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cameras", "bar_m"), [("", 0.008), ("0", 0.010)])
+def test_real_images(tmp_path: Path, cameras: str, bar_m: float) -> None:
+    folder = shared_data("euroc_mh01_10s")
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    with Session() as session:
+        report = run(
+            session, folder, rovio_active_camera_indices=cameras, save_map_folder=tmp_path / "map",
+            map_builder_save_image_as_resources=True,
+        )  # fmt: skip
+        assert report.failure == ""
+        assert report.missions == 1
+        evaluated = session.run("evaluate_trajectory", ground_truth=truth)
+        assert evaluated.ape_m.rmse <= bar_m
+        images = list((tmp_path / "map" / "resources" / "raw_images").iterdir())
+        assert len(images) == report.vertices * (1 if cameras else 2)
+        assert check_consistency(load_map(tmp_path / "map")[0]).failure == ""
+        assert np.all(session.vi_map.binary_descriptor_size == 64)
+
+
+def test_the_viewer_follows(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from maplab_plugins.visualization.following import Following
+
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.display.viewer import Viewer
+
+    followed: list[tuple[int, int]] = []
+
+    def follow(viewer: Viewer, subject: Subject) -> None:
+        followed.append((len(subject.vi_map.vertices), len(subject.vi_map.landmarks)))
+
+    monkeypatch.setattr(Viewer, "pages", property(lambda _: 1))
+    monkeypatch.setattr(Viewer, "follow", follow)
+    with Session() as session:
+        session.run("set", "--viewer_port=0")
+        report = run(session, walk, rovioli_visualize_map=True, map_publish_interval_s=0.0)
+        assert session.watchers.find("viewer", Following) is not None
+    vertices = [count for count, _ in followed]
+    assert vertices == sorted(vertices)
+    assert vertices[0] == 2
+    assert vertices[-1] == report.vertices
+    assert followed[-1][1] > 100

@@ -1,0 +1,126 @@
+"""The joint filter, a baseline: exact without noise, about as good as it says with it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
+from maplab_py.errors import EstimationError
+from maplab_py.estimation.blocks import ParameterBlocks
+from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS
+from maplab_py.geometry import se3
+from maplab_py.research.ekf_tracks import linearised, tracks_of
+from maplab_py.research.joint_ekf import (
+    WINDOW,
+    JointFilter,
+    filter_jointly,
+)
+from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.vimap import VIMap
+from tests.algorithms.self_calibration.scenes import OPTIONS, device, nominal, scene_map
+
+
+def with_known_lens(truth: VIMap) -> VIMap:
+    """Forget IMU calibration and mounting; intrinsics are given to a filter."""
+    imu, rig = device(truth)
+    wrong = nominal(truth)
+    sensors: dict[str, Sensor] = {
+        imu.id: wrong.imu(imu.id),
+        rig.id: dataclasses.replace(rig, T_B_C=wrong.camera_rig(rig.id).T_B_C),
+    }
+    return truth.replace(sensors=dataclasses.replace(truth.sensors, sensors=sensors))
+
+
+def error(truth: VIMap, result: JointFilter) -> np.ndarray:
+    true = filter_jointly_blocks(truth)
+    return result.parameters.difference(result.blocks, true)
+
+
+def filter_jointly_blocks(truth: VIMap) -> ParameterBlocks:
+    """The blocks of the true sensors, as the filter lays them out."""
+    from maplab_py.algorithms.vi_optimization.calibration_states import rig_cameras
+    from maplab_py.estimation.terms.cameras import camera_blocks
+    from maplab_py.estimation.terms.inertial_calibration import imu_blocks
+
+    rig = rig_cameras(truth, np.arange(1))
+    imu = truth.sensors.imu(device(truth)[0].id)
+    return ParameterBlocks([*camera_blocks(rig.cameras, rig.delay_s), *imu_blocks((imu,))])
+
+
+def test_without_noise_the_truth_is_a_fixed_point() -> None:
+    result = filter_jointly(scene_map(vertices=41), OPTIONS)
+    assert np.abs(result.change).max() <= 1e-9
+    assert result.tracks_used > 50
+    assert result.tracks_rejected == 0
+
+
+def test_without_noise_the_calibration_is_approached() -> None:
+    truth = scene_map(vertices=121)
+    start = with_known_lens(truth)
+    result = filter_jointly(start, OPTIONS)
+    after = error(truth, result)
+    sigma = np.sqrt(np.diag(result.covariance))
+    assert np.abs(after / sigma).max() <= 0.5
+    gyro = [k for k, name in enumerate(result.parameters.names) if "gyroscope x scale" in name]
+    assert np.abs(after[gyro]).max() <= 1e-4
+    assert result.blocks[INTRINSICS].values == pytest.approx(result.before[INTRINSICS].values)
+    assert np.shape(result.changes) == (121, 21)
+    report = result.report()
+    assert len(report.parameters) == 21
+    assert report.keyframes == 121
+
+
+@pytest.mark.slow
+def test_errors_are_about_as_large_as_announced() -> None:
+    total, seeds = 0.0, 8
+    for seed in range(1, seeds + 1):
+        truth = scene_map(vertices=81, noise=1.0, seed=seed)
+        result = filter_jointly(with_known_lens(truth), OPTIONS)
+        off = error(truth, result)
+        total += float(off @ np.linalg.solve(result.covariance, off))
+        assert result.mean_square == pytest.approx(1.0, abs=0.3)
+    # filters linearise once: they promise somewhat too much
+    assert 21 * 0.5 <= total / seeds <= 21 * 2.0
+
+
+def test_derivatives_of_tracks() -> None:
+    vi_map = scene_map(vertices=21)
+    _, rig = device(vi_map)
+    tracks = tracks_of(vi_map, np.arange(21), rig.cameras, WINDOW)
+    T_G_I, T_I_C = vi_map.T_G_I, rig.T_B_C
+    chosen = np.arange(min(5, len(tracks.camera)))
+    at = linearised(tracks, chosen, T_G_I, T_I_C, T_G_I)
+    assert np.abs(at.residual).max() <= 1e-6
+    # what points take up cannot be seen: compare after projecting on what they cannot
+    step = 1e-6
+    for column in range(6):
+        delta = np.zeros((1, 6))
+        delta[0, column] = step
+        moved = linearised(tracks, chosen, T_G_I, se3.retract(T_I_C, delta), T_G_I)
+        for one in range(len(chosen)):
+            own = at.track == one
+            points = at.by_point[own].reshape(-1, 3)
+            across = np.eye(len(points)) - points @ np.linalg.pinv(points)
+            expected = -across @ at.by_camera[own][:, :, column].reshape(-1)
+            found = across @ (moved.residual[own] - at.residual[own]).reshape(-1) / step
+            np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-2)
+
+
+def test_intrinsics_alone_are_refused() -> None:
+    options = dataclasses.replace(OPTIONS, states="intrinsics")
+    with pytest.raises(EstimationError, match="neither intrinsics"):
+        filter_jointly(scene_map(vertices=21), options)
+
+
+def test_only_what_is_asked_for_moves() -> None:
+    truth = scene_map(vertices=61)
+    options = dataclasses.replace(OPTIONS, states="extrinsics_rotation")
+    result = filter_jointly(with_known_lens(truth), options)
+    assert isinstance(result.parameters, Parameters)
+    assert len(result.parameters) == 3
+    moved = result.blocks[EXTRINSICS].difference(result.before[EXTRINSICS].values)[0]
+    assert np.abs(moved[:3]).max() <= 1e-12
+    assert np.abs(moved[3:]).max() > 1e-4

@@ -1,0 +1,139 @@
+"""The studies run, continue where they stopped, and make the page of results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.self_calibration.segments.selection import Evaluation, evaluate
+from maplab_py.research import accuracy, odometry, predicted_deviations
+from maplab_py.research.__main__ import main
+from maplab_py.research.data_sets import lines_of
+from maplab_py.research.selections import METHODS, chosen_segments, joint_designs, rankings
+from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
+from maplab_py.simulation.scenario_file import load_scenario
+from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map
+
+NAMES = ["gyroscope x scale", "accelerometer z scale", "camera centre u", "camera position x"]
+
+
+@cache
+def evaluation() -> Evaluation:
+    return evaluate(scene_map(vertices=61, noise=1.0), OPTIONS)
+
+
+def short_scenario() -> Scenario:
+    motion = MotionOptions(
+        kind="figure_8",
+        duration_s=14.0,
+        turns=0.4,
+        wall_distance_m=2.6,
+        shake_m=0.06,
+        shake_rad=0.2,
+    )
+    return dataclasses.replace(
+        load_scenario("ar_room"), sessions=(SessionOptions(phases=(motion,)),)
+    )
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m not in ("batch", "two sessions")])
+def test_methods_select_segments(method: str) -> None:
+    chosen = chosen_segments(evaluation(), method, 0, 2)
+    known = {tuple(one.rows) for one in evaluation().segments}
+    assert {tuple(rows) for rows in chosen} <= known
+    assert 0 < len(chosen) <= 8
+
+
+def test_the_most_and_the_least_informative_segments_are_at_opposite_ends() -> None:
+    order = rankings(evaluation(), "a_optimality", "imu+camera+extrinsics")[0]
+    options = {name: chosen_segments(evaluation(), name, 0, 1) for name in
+               ("4: A-optimality", "4: least informative")}  # fmt: skip
+    rows = [one.rows for one in evaluation().segments]
+    for name, wanted in (("4: A-optimality", order[:4]), ("4: least informative", order[-4:])):
+        firsts = sorted(int(chosen[0]) for chosen in options[name])
+        assert firsts == sorted(int(rows[k][0]) for k in wanted)
+
+
+def test_joint_designs_are_no_worse_than_single_scores_at_what_they_minimise() -> None:
+    found = evaluation()
+    prior = np.diag(found.parameters.prior_sigma**-2.0)
+    information = [np.linalg.inv(one.covariance) - prior for one in found.segments]
+
+    def log_determinant(chosen: list[int]) -> float:
+        total = prior + sum(information[k] for k in chosen)
+        return float(-np.linalg.slogdet(total)[1])
+
+    (design,) = [
+        chosen[:2]
+        for name, chosen in joint_designs(found, found.parameters.prior_sigma).items()
+        if name.endswith("determinant")
+    ]
+    first = rankings(found, "d_optimality", "imu+camera+extrinsics")[0][:2]
+    assert log_determinant(design) <= log_determinant(first) + 1e-9
+
+
+def test_the_page_shows_what_was_measured(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    rows = [{"set": -1, "method": "truth", "map_m": 0.01}]
+    for number in range(3):
+        for method, error in (("8: A-optimality", 1e-3), ("8: random", 2e-3)):
+            row = {"set": number, "method": method, "names": NAMES, "error": [error] * 4}
+            row |= {"nees": 4.0, "segments": 8, "cpu_s": 1.0, "map_m": 20.0 * error}
+            rows.append({**row, "selection_s_per_segment": 0.05})
+    results = tmp_path / "room.jsonl"
+    results.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    notes = tmp_path / "notes.md"
+    notes.write_text("A note.")
+    words = ["page", f"--results={results}", f"--notes={notes}", f"--docs={tmp_path}"]
+    assert main(words) == 0
+    page = (tmp_path / "self_calibration_results.md").read_text()
+    assert "| 8: random | 3 | 8 | 1.0 | 4 |" in page
+    assert (
+        "| error of the parameters, 8 informative over random |  | 0.50; worse in 100% of" in page
+    )
+    assert page.endswith("A note.\n")
+    assert (tmp_path / "images" / "self_calibration_room.svg").read_text().count("<circle") == 6
+
+
+@pytest.mark.slow
+def test_a_study_from_the_simulation_to_the_page(tmp_path: Path) -> None:
+    scenario, out = short_scenario(), tmp_path / "short.jsonl"
+    methods = ["batch", "8: A-optimality", "8: random", "information gain"]
+    for _ in range(2):  # the second time everything is there
+        accuracy.measure(scenario, range(1), 2, methods, ["batch"], out)
+        odometry.measure_odometry(scenario, out, ["batch"], tmp_path / "short_vio.jsonl")
+        predicted_deviations.predict(scenario, range(1), tmp_path / "short_predicted.jsonl")
+    rows = {row["method"]: row for row in lines_of(out)}
+    assert [*rows] == ["nominal", "truth", *methods]
+    assert rows["batch"]["map_m"] < 0.5 * rows["nominal"]["map_m"]
+    errors_m = {row["method"]: row["vio_m"] for row in lines_of(tmp_path / "short_vio.jsonl")}
+    assert errors_m["truth"] < errors_m["nominal"]
+    sigma = {
+        r["selection"]: np.array(r["sigma"]) for r in lines_of(tmp_path / "short_predicted.jsonl")
+    }
+    assert np.all(sigma["batch"] <= sigma["8: random"] * (1.0 + 1e-9))
+    (tmp_path / "images").mkdir()
+    assert main(["page", f"--results={out}", f"--docs={tmp_path}"]) == 0
+    assert (
+        "Deviations that a selection can reach"
+        in (tmp_path / "self_calibration_results.md").read_text()
+    )
+
+
+@pytest.mark.slow
+def test_errors_are_compared_with_deviations(tmp_path: Path) -> None:
+    out = tmp_path / "clean.jsonl"
+    words = ["consistency", "--sets=1", f"--out={out}"]
+    assert main(words) == 0
+    (row,) = lines_of(out)
+    assert 5.0 < row["nees"] < 60.0
+    assert len(row["error"]) == len(row["names"]) == 26
+    shutil.copy(out, tmp_path / "again.jsonl")
+    assert main(words) == 0
+    assert out.read_bytes() == (tmp_path / "again.jsonl").read_bytes()

@@ -1,0 +1,45 @@
+"""After the warmup, rendering compiles nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from maplab_py.simulation.raw_data import write_raw_data
+from maplab_py.simulation.ray_kernels import cast_rays
+from maplab_py.simulation.scenario import (
+    CameraOptions,
+    ImageOptions,
+    MeasurementOptions,
+    Scenario,
+    SessionImages,
+    SessionOptions,
+    WorldOptions,
+)
+from maplab_py.simulation.shading_kernels import pack_texels
+from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.warmup import compile_rendering
+
+CAMERA = CameraOptions(intrinsics=(40.0, 40.0, 40.0, 30.0), width_px=80, height_px=60)
+
+
+def test_rendering_compiles_nothing_after_the_warmup(tmp_path: Path) -> None:
+    compile_rendering()
+    before = [list(kernel.signatures) for kernel in (cast_rays, pack_texels)]
+    assert all(before)
+    scenario = Scenario(
+        world=WorldOptions(landmarks_per_room=300),
+        cameras=(CAMERA, dataclasses.replace(CAMERA, line_delay_s=1e-5)),
+        measurement=MeasurementOptions(frame_rate_hz=2.0),
+        images=ImageOptions(render=True, texel_m=0.05),
+        sessions=(
+            SessionOptions(
+                kind="loop",
+                duration_s=1.0,
+                turns=0.02,
+                images=SessionImages(light=0.5, repainted_share=0.1),
+            ),
+        ),
+    )
+    write_raw_data(scenario, simulate(scenario), tmp_path)
+    assert [list(kernel.signatures) for kernel in (cast_rays, pack_texels)] == before

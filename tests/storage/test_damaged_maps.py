@@ -1,0 +1,242 @@
+"""Every kind of damage is refused in one line that names file and field, or loaded with a note."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from maplab_py.algorithms.warmup import _jobs
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.status import Status, status_of
+from maplab_py.errors import MapError
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.message_scan import MemoryBudget, estimate, quick_estimate
+from maplab_py.storage.message_scan_kernel import count_parts
+from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.warmup import compile_scan
+from maplab_py.vimap.consistency import check_consistency
+from tests.e2e.support import run_program
+from tests.storage.damages import BOMB_ENTRIES, DAMAGES
+from tests.storage.damaging import BOUND_MEGABYTES, write_whole_map, zeros
+from tests.support.data import REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def whole_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "map"
+    write_whole_map(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(whole_map: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole_map, tmp_path / "map"))
+
+
+def test_the_map_itself_is_whole(whole_map: Path) -> None:
+    vi_map, report = load_map(whole_map, max_size_megabytes=BOUND_MEGABYTES)
+    assert report.notes == []
+    assert check_consistency(vi_map).failure == ""
+    assert len(DAMAGES) >= 79
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damage_is_told_in_one_line(folder: Path, name: str) -> None:
+    damage = DAMAGES[name]
+    damage.apply(folder)
+    session = Session()
+    session.run("create_new_map", map_key="earlier")
+    before = session.maps.state
+    megabytes = {"proto_max_size_megabytes": BOUND_MEGABYTES}
+    if damage.is_note:
+        session.run("load", map_folder=folder, **megabytes)
+        _, report = load_map(folder)
+        said = "\n".join(report.notes)
+        assert len(report.notes) == 1
+    else:
+        with pytest.raises(MapError) as error:
+            session.run("load", map_folder=folder, **megabytes)
+        assert status_of(error.value) is Status.USER_ERROR
+        assert session.maps.state is before
+        said = str(error.value)
+        assert "\n" not in said
+        assert str(folder / damage.file) in said
+    for part in damage.said:
+        assert part in said
+
+
+@pytest.mark.parametrize("members", [2, 5])
+def test_all_members_of_a_gzip_file_are_read(folder: Path, members: int) -> None:
+    path = folder / "vi_map/edges0"
+    whole = load_map(folder)[0]
+    data = gzip.decompress(path.read_bytes())
+    step = -(-len(data) // members)
+    parts = [gzip.compress(data[k : k + step]) for k in range(0, len(data), step)]
+    path.write_bytes(b"".join(parts))
+    vi_map = load_map(folder)[0]
+    assert len(parts) == members
+    assert vi_map.imu_edges.id.tolist() == whole.imu_edges.id.tolist()
+    assert vi_map.imu_samples.accel_gyro.tolist() == whole.imu_samples.accel_gyro.tolist()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a vertex that lists an edge that is not there",
+        "a vertex that lists an edge of another",
+        "landmark seen at a keypoint that is not there",
+        "index entry lost",
+    ],
+)
+def test_what_repair_is_advised_for_it_repairs(folder: Path, tmp_path: Path, name: str) -> None:
+    DAMAGES[name].apply(folder)
+    vi_map, report = load_map(folder, repair=True)
+    assert len(report.notes) == 1
+    assert check_consistency(vi_map).failure == ""
+    save_map(vi_map, tmp_path / "repaired")
+    assert load_map(tmp_path / "repaired")[1].notes == []
+
+
+@pytest.mark.parametrize("name", ["m" * 255, "/".join(["deep" * 60] * 12)])
+def test_maps_with_long_names_are_loaded(whole_map: Path, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / name
+    shutil.copytree(whole_map, folder)
+    assert load_map(folder)[1].notes == []
+
+
+@pytest.mark.parametrize("name", ["m" * 256, "/".join(["deep" * 60] * 30)])
+def test_names_that_no_file_can_have_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MapError, match=r"cannot be read \(File name too long\)$"):
+        load_map(tmp_path / name)
+
+
+_IN_THE_PROGRAM = [
+    "T_M_I with NaN",
+    "edge without kind",
+    "edges0 with rubbish behind",
+    "listing with files misspelt",
+    "imu stamps that run backwards",
+    "vertices0 of zero bytes",
+    "sensors.yaml with an alias bomb",
+    "resource_info a bomb",
+]
+
+
+@pytest.mark.parametrize("name", _IN_THE_PROGRAM)
+def test_the_program_says_it_and_keeps_its_maps(
+    whole_map: Path, folder: Path, tmp_path: Path, name: str
+) -> None:
+    DAMAGES[name].apply(folder)
+    bound = f"--proto_max_size_megabytes={BOUND_MEGABYTES}"
+    (tmp_path / "script").write_text(
+        f"load --map_folder={whole_map} --map_key=earlier\n"
+        f"load --map_folder={folder} {bound}\nlist\n"
+    )
+    done = run_program(tmp_path, "run", "script", "--keep_going")
+    assert done.returncode == Status.USER_ERROR
+    assert "Traceback" not in done.stderr + done.stdout
+    (line,) = [one for one in done.stderr.splitlines() if one.startswith("error: load: ")]
+    assert str(folder) in line
+    assert all(part in line for part in DAMAGES[name].said)
+    (listed,) = [one for one in done.stdout.splitlines() if " saved " in one]
+    assert listed.startswith("earlier")
+
+
+_MEASURE = """
+import resource, sys
+from pathlib import Path
+from maplab_py.errors import MapError
+from maplab_py.storage.native import load_map
+def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+load_map(Path(sys.argv[1]))
+before = peak()
+try:
+    load_map(Path(sys.argv[2]), max_size_megabytes=int(sys.argv[3]))
+    print("loaded", peak() - before)
+except MapError as error:
+    print("refused" if "proto_max_size" in str(error) else error, peak() - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="needs the peak of memory")
+@pytest.mark.parametrize("megabytes", [40])
+@pytest.mark.parametrize("name", BOMB_ENTRIES)
+def test_a_bomb_takes_at_most_twice_the_bound(
+    whole_map: Path, folder: Path, name: str, megabytes: int
+) -> None:
+    file, entry, wrappers = BOMB_ENTRIES[name]
+    size = megabytes * 900_000  # below the bound: only the entries tell
+    (folder / "vi_map" / file).write_bytes(zeros(entry, size, *wrappers))
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURE, whole_map, folder, str(megabytes)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    verdict, peak_bytes = done.stdout.split()
+    assert verdict == "refused"
+    assert int(peak_bytes) < 2 * megabytes * 1_000_000
+
+
+def test_many_files_are_charged_what_they_take(whole_map: Path) -> None:
+    """Quick estimates that do not fit together give way to the exact ones."""
+    path = whole_map / "vi_map/vertices0"
+    data = gzip.decompress(path.read_bytes())
+    exact, quick = estimate(data, pb.VIMap.DESCRIPTOR), quick_estimate(data)
+    assert exact < quick
+    budget = MemoryBudget(5 * exact)
+    for _ in range(10):
+        budget.admit(path, data, pb.VIMap.DESCRIPTOR)
+    with pytest.raises(MapError, match="vertices0: its entries need more than"):
+        budget.admit(path, data, pb.VIMap.DESCRIPTOR)
+
+
+_AS_SOMEBODY_ELSE = """
+import os, sys
+from pathlib import Path
+from maplab_py.errors import MapError
+from maplab_py.storage.native import load_map
+if os.geteuid() == 0: os.setresuid(65534, 65534, 65534)
+try: load_map(Path(sys.argv[1]))
+except MapError as error: print(error)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "setresuid"), reason="root must become somebody else")
+@pytest.mark.parametrize("name", ["vi_map", "vi_map/vi_map_metadata", "vi_map/vertices0"])
+def test_what_may_not_be_read_is_named_in_one_line(folder: Path, name: str) -> None:
+    temporary = Path(tempfile.gettempdir()).resolve()
+    parents = [parent for parent in folder.parents if temporary in parent.parents]
+    for parent in (folder, folder / "vi_map", *parents):
+        parent.chmod(0o755)
+    mode = (folder / name).stat().st_mode
+    (folder / name).chmod(0)
+    done = subprocess.run(
+        [sys.executable, "-c", _AS_SOMEBODY_ELSE, str(folder)],
+        cwd=REPOSITORY, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    (folder / name).chmod(mode)
+    (line,) = done.stdout.splitlines()
+    assert line.startswith(str(folder / name))
+    assert "cannot be read (Permission denied)" in line
+    assert done.stderr == ""
+
+
+def test_the_warmup_compiles_the_scan_of_messages_once_for_all() -> None:
+    compile_scan()
+    signatures = list(count_parts.signatures)
+    assert len(signatures) == 1
+    data = pb.VIMapMetadata(files=[pb.FileTypeWithPath(path="a")]).SerializeToString()
+    assert estimate(data, pb.VIMapMetadata.DESCRIPTOR) > 0
+    assert estimate(bytearray(data), pb.VIMapMetadata.DESCRIPTOR) > 0
+    assert list(count_parts.signatures) == signatures
+    assert compile_scan in _jobs().values()

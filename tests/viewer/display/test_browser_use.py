@@ -1,0 +1,111 @@
+"""What the viewer leaves behind, and what browsers may do to it, each test with a viewer of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from maplab_py.viewer import colours
+from maplab_py.viewer.building import Subject
+from maplab_py.viewer.display import picture
+from maplab_py.viewer.display.picture import find_browser
+from maplab_py.viewer.display.viewer import Viewer
+from maplab_py.viewer.options import VisualizationOptions
+from tests.support.machine import slowness
+from tests.support.waiting import wait_until
+from tests.viewer.display.browsing import IN_BROWSER, Page, chromium, colour_count, is_blank
+from tests.vimap.builders import walk_map
+
+pytestmark = IN_BROWSER
+
+MAP = walk_map(vertices=14, landmarks=300, seed=3)
+SUBJECT = Subject(MAP, "walk", VisualizationOptions(scale=2.0))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+def test_a_view_opens_from_a_file(browser: Any, tmp_path: Path) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    target = tmp_path / "view.html"
+    size = viewer.export(target)
+    assert size == target.stat().st_size < 5_000_000
+    viewer.stop()
+    page = Page(browser, target.as_uri())
+    assert page.wait_until(lambda: colour_count(page.picture(), colours.MISSIONS[0]) > 100)
+    assert page.outside_requests("file:") == []
+    assert page.page.get_by_text("walk", exact=True).count() == 1
+    page.page.close()
+
+
+def test_pictures_are_saved_with_and_without_a_page(browser: Any, tmp_path: Path) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    alone = tmp_path / "alone.png"
+    assert viewer.save_picture(alone, (640, 480), "top") == 0
+    image = cv2.imread(str(alone))
+    assert image is not None
+    assert image.shape == (480, 640, 3)
+    assert not is_blank(image)
+    assert colour_count(image[:, :, ::-1], colours.MISSIONS[0]) > 100
+    page = Page(browser, viewer.url)
+    assert page.wait_until(lambda: viewer.pages == 1)
+    page.settle()
+    results: list[int] = []
+    taker = threading.Thread(
+        target=lambda: results.append(viewer.save_picture(tmp_path / "page.jpg", (400, 300)))
+    )
+    taker.start()
+    assert page.wait_until(lambda: bool(results))
+    taker.join()
+    assert results == [1]
+    page.page.close()
+    shown = cv2.imread(str(tmp_path / "page.jpg"))
+    assert shown is not None
+    assert shown.shape == (300, 400, 3)
+    viewer.stop()
+
+
+def test_many_pages_do_no_harm(browser: Any) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    pages = [Page(browser, viewer.url, (240, 160), frame_ms=1500) for _ in range(10)]
+    assert pages[0].wait_until(lambda: viewer.pages == 10)
+    viewer.set_layer("imu_edges", True)
+    for opened in pages[:9]:
+        opened.page.close()
+    assert pages[9].wait_until(lambda: viewer.pages == 1)
+    began = time.perf_counter()
+    viewer.follow(SUBJECT.replace(vi_map=MAP.replace()))
+    assert viewer.wait(10.0)
+    assert time.perf_counter() - began < 5.0 * slowness()
+    assert pages[9].errors == []
+    pages[9].page.close()
+    viewer.stop()
+
+
+def test_a_killed_browser_does_no_harm(capfd: pytest.CaptureFixture[str]) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    path = find_browser()
+    assert path is not None
+    with picture.headless_browser(path, viewer.url, (300, 200)) as process:
+        assert wait_until(lambda: viewer.pages == 1, 60.0)
+        os.killpg(process.pid, signal.SIGKILL)
+        assert wait_until(lambda: viewer.pages == 0, 60.0)
+    viewer.follow(SUBJECT.replace(vi_map=MAP.replace()))
+    assert viewer.wait(10.0)
+    viewer.stop()
+    assert capfd.readouterr() == ("", "")
