@@ -47,7 +47,7 @@ class Engine(Protocol):
         """Stop all orders and everything that was started."""
 
 
-class OneAfterAnother:
+class SequentialEngine:
     """Runs orders in turn, without Dask."""
 
     address = ""
@@ -97,7 +97,7 @@ def engine_of(options: PipelineOptions) -> Engine:
         UserError: Dask is not installed.
     """
     if options.scheduler == "none":
-        return OneAfterAnother()
+        return SequentialEngine()
     from maplab_py.pipeline.cluster import Cluster
 
     return Cluster(options)

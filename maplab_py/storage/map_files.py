@@ -154,7 +154,7 @@ def read_unpacked(path: Path, max_bytes: int) -> bytes | bytearray:
         while rest:
             if bytes(rest[:2]) != _GZIP_MAGIC:
                 raise MapError(
-                    f"{path}: is damaged: {counted(len(rest), 'byte')} too many behind the gzip data; "
+                    f"{path}: is damaged: {counted(len(rest), 'byte')} follow the gzip data; "
                     f"{COPY_AGAIN}"
                 )
             content, size = inflate(rest, max_bytes - len(data), wbits=_GZIP)

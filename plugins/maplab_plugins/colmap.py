@@ -56,7 +56,7 @@ def export_colmap(
     "import_colmap",
     example="import_colmap --colmap_folder=office_colmap --align_to=office_truth.csv",
     needs_map=False,
-    see_also=("export_colmap", "compare_maps", "itl", "optv"),
+    see_also=("export_colmap", "compare_maps", "init_track_landmarks", "optimize_visual"),
 )
 def import_colmap(
     context: CommandContext,

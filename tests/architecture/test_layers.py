@@ -100,6 +100,8 @@ MAY_WRITE = (
     "plugins/maplab_plugins/console/new_plugin.py",
     "maplab_py/console/commands/plugin_template.py",  # text of a test
     "maplab_py/console/terminal/output.py",  # a transcript is appended to
+    "maplab_py/interop/colmap/child.py",  # databases and models in a temporary folder
+    "maplab_py/interop/colmap/child_process.py",  # likewise
     "maplab_py/pipeline/child.py",  # the output of a running task
     "maplab_py/pipeline/execution.py",  # its log is appended to
 )

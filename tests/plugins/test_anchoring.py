@@ -50,7 +50,7 @@ def test_thresholds_are_flags() -> None:
     session = session_of(known=[True, False, False])
     before = session.vi_map
     report = session.run("aam", anchor_transform_min_inlier_count=1000)
-    assert "1000 are expected" in report.failure
+    assert "1000 are needed" in report.failure
     assert session.vi_map is before
     assert session.vi_map.baseframes.is_known.tolist() == [True, False, False]
 

@@ -68,7 +68,7 @@ def test_nothing_found_fails_with_an_explanation(command: str) -> None:
 def test_seed_and_gates_are_flags() -> None:
     session = session_of(TWICE)
     report = session.run("lc", lc_seed=7, lc_min_inlier_count=1000)
-    assert "wanted 1000" in report.failure
+    assert "needed 1000" in report.failure
 
 
 def test_closures_are_listed_removed_and_forgotten(tmp_path: Path) -> None:

@@ -17,7 +17,13 @@ from pymap3d import enu2geodetic
 
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
-from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
+from maplab_py.simulation.scenario import (
+    LidarOptions,
+    MeasurementOptions,
+    Scenario,
+    SessionOptions,
+    WorldOptions,
+)
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.frontend.simulated import REST_FIRST, replayed
@@ -36,6 +42,15 @@ ROUND = Scenario(
     ),
 )
 """Two walks round a room, each with a loop and much in common."""
+
+SCANNED = Scenario(
+    name="scanned",
+    world=WorldOptions(landmarks_per_room=800),
+    measurement=MeasurementOptions(max_keypoints=60),
+    lidar=LidarOptions(rate_hz=0.5, columns=600),
+    sessions=(SessionOptions(duration_s=22.0, turns=1.7),),
+)
+"""A walk round a room with a lidar."""
 
 MERGED = "load_merge_all_maps --maps_folder=maps --target_map_key=office; elq"
 PREPARED = {
@@ -86,6 +101,11 @@ PREPARED["import_calibration"] = f"{MERGED}; export_calibration --format=kalibr 
 PREPARED["import_trajectory"] = (
     f"{MERGED}; ettc --pose_export_file=poses.csv --csv_export_format=rpg --map_mission=59f0"
 )
+PREPARED["compare_maps"] = "load maps/v1_01 --map_key=before_optvi; load maps/v1_02"
+PREPARED["import_colmap"] = (
+    "load maps/v1_01; export_colmap --colmap_folder=office_colmap; "
+    "ettc --pose_export_file=office_truth.csv --csv_export_format=rpg"
+)
 PREPARED["visualize_difference"] = f"{MERGED}; snapshot before; rlq"
 
 for _name in ("export_images", "remove_resources", "clean_up_resource_folders"):
@@ -95,7 +115,9 @@ PREPARED["stereo_dense_reconstruction"] = _ROOM
 PREPARED["convert_all_depth_maps_to_point_clouds"] = f"{_ROOM}; sdr"
 PREPARED["create_tsdf_from_depth_resource"] = f"{_ROOM}; sdr"
 PREPARED["create_mesh_from_tsdf_grid"] = f"{_ROOM}; sdr; tsdf"
+PREPARED["export_colmap_mvs"] = PREPARED["export_for_pmvs_reconstruction"] = _ROOM
 PREPARED["visualize_mesh"] = PREPARED["create_mesh_from_tsdf_grid"]
+PREPARED["register_point_clouds"] = "load lidar"
 
 _SHOWING = ("images", "depth_maps", "disparity_maps", "pointclouds")
 
@@ -150,12 +172,18 @@ def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
     (folder / "images").mkdir()
     write_stamped_files(first, folder)
     StereoRoom.simulated(folder / "stereo_room", quarter_size(frame_rate_hz=2.0))
+    _write_scanned_map(folder / "lidar")
     write_folder(make_content(), folder / "MH_01_easy")
     save_map(replayed(REST_FIRST, 1)[0], folder / "walk")  # a recording to replay
     with Session() as session:
         session.run("load", map_folder=folder / "maps" / "v1_01")
         for name in ("V1_01_easy.csv", "vil.csv"):
             session.run("ettc", pose_export_file=folder / name, csv_export_format="rpg")
+
+
+def _write_scanned_map(folder: Path) -> None:
+    """Write a map with the clouds of a lidar."""
+    save_map(simulated(SCANNED).maps[0], folder)
 
 
 def _write_fixes(vi_map: VIMap, path: Path) -> None:

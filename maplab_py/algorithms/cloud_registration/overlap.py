@@ -39,15 +39,17 @@ class Overlap:
 def compare_clouds(target: PreparedCloud, source: PreparedCloud, T_T_S: F64) -> Overlap:
     """Return how far clouds agree at a pose (7,) of the source in the target."""
     ends = (
-        _one_way(target, source, T_T_S),
-        _one_way(source, target, se3.inverse(T_T_S)),
+        _directed_overlap(target, source, T_T_S),
+        _directed_overlap(source, target, se3.inverse(T_T_S)),
     )
     less = min(ends, key=lambda end: end[1] / end[0])
     conflict = max(end[2] / max(end[1] + end[2], 1) for end in ends)
     return Overlap(less[1] / less[0], conflict, less[0], less[1])
 
 
-def _one_way(seen: PreparedCloud, points: PreparedCloud, T_S_P: F64) -> tuple[int, int, int]:
+def _directed_overlap(
+    seen: PreparedCloud, points: PreparedCloud, T_S_P: F64
+) -> tuple[int, int, int]:
     """Return how many points there are, lie on seen surfaces, and lie in space seen to be free."""
     p, nearest, near = correspondences(seen, points, T_S_P, _NEAREST_M)
     range_m = np.linalg.norm(p, axis=1)

@@ -24,26 +24,26 @@ class CameraModel:
     name: str
     parameters: int
     distortion: Distortion | None = None  # None = maplab has no such model
-    has_one_focal_length: bool = False
+    has_single_focal_length: bool = False
 
 
 _RADTAN, _EQUIDISTANT = Distortion.RADTAN, Distortion.EQUIDISTANT
 _MODELS = (
-    CameraModel(0, "SIMPLE_PINHOLE", 3, Distortion.NONE, has_one_focal_length=True),
+    CameraModel(0, "SIMPLE_PINHOLE", 3, Distortion.NONE, has_single_focal_length=True),
     CameraModel(1, "PINHOLE", 4, Distortion.NONE),
-    CameraModel(2, "SIMPLE_RADIAL", 4, _RADTAN, has_one_focal_length=True),
-    CameraModel(3, "RADIAL", 5, _RADTAN, has_one_focal_length=True),
+    CameraModel(2, "SIMPLE_RADIAL", 4, _RADTAN, has_single_focal_length=True),
+    CameraModel(3, "RADIAL", 5, _RADTAN, has_single_focal_length=True),
     CameraModel(4, "OPENCV", 8, _RADTAN),
     CameraModel(5, "OPENCV_FISHEYE", 8, _EQUIDISTANT),
     CameraModel(6, "FULL_OPENCV", 12),
     CameraModel(7, "FOV", 5, Distortion.FOV),
-    CameraModel(8, "SIMPLE_RADIAL_FISHEYE", 4, _EQUIDISTANT, has_one_focal_length=True),
-    CameraModel(9, "RADIAL_FISHEYE", 5, _EQUIDISTANT, has_one_focal_length=True),
+    CameraModel(8, "SIMPLE_RADIAL_FISHEYE", 4, _EQUIDISTANT, has_single_focal_length=True),
+    CameraModel(9, "RADIAL_FISHEYE", 5, _EQUIDISTANT, has_single_focal_length=True),
     CameraModel(10, "THIN_PRISM_FISHEYE", 12),
     CameraModel(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
     CameraModel(12, "SIMPLE_DIVISION", 4),
     CameraModel(13, "DIVISION", 5),
-    CameraModel(14, "SIMPLE_FISHEYE", 3, _EQUIDISTANT, has_one_focal_length=True),
+    CameraModel(14, "SIMPLE_FISHEYE", 3, _EQUIDISTANT, has_single_focal_length=True),
     CameraModel(15, "FISHEYE", 4, _EQUIDISTANT),
     CameraModel(16, "EUCM", 6),
     CameraModel(17, "EQUIRECTANGULAR", 2),
@@ -96,7 +96,7 @@ def map_camera(camera: ColmapCamera, sensor_id: str) -> Camera:
             f"camera {camera.id}: maplab has no camera model {model.name}: give --undistort to import "
             "perspective keypoints"
         )
-    focal, rest = (values[[0, 0]], values[1:]) if model.has_one_focal_length else _split(values)
+    focal, rest = (values[[0, 0]], values[1:]) if model.has_single_focal_length else _split(values)
     coefficients = np.zeros(DISTORTION_SIZE[distortion])
     coefficients[: len(rest) - 2] = rest[2:]
     return Camera(

@@ -9,9 +9,20 @@ from pathlib import Path
 
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError
+from maplab_py.interop.colmap.binary_writing import binary_files
+from maplab_py.interop.colmap.child import BINARY
+from maplab_py.interop.colmap.model import ColmapModel
 
 _POLL_S = 0.05
 _SILENT_END_S = 5.0
+
+
+def write_job_model(model: ColmapModel, folder: Path) -> None:
+    """Write a model for a job: the folder `binary` below the job's folder, which is temporary."""
+    (folder / BINARY).mkdir()
+    for name, content in binary_files(model).items():
+        with (folder / BINARY / name).open("wb") as stream:
+            stream.writelines(content)
 
 
 def run_job(job: str, folder: Path, source: Path) -> None:

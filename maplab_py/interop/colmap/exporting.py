@@ -12,11 +12,11 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import UserError
 from maplab_py.interop.colmap.binary_writing import binary_files
-from maplab_py.interop.colmap.child import BINARY, TEXT
-from maplab_py.interop.colmap.child_process import run_job
+from maplab_py.interop.colmap.child import TEXT
+from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.database_writing import database_arrays
 from maplab_py.interop.colmap.from_map import ExportedModel, model_of_map
-from maplab_py.interop.colmap.model import FILES, ColmapModel
+from maplab_py.interop.colmap.model import FILES
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
 from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.colmap.undistortion import undistorted
@@ -53,7 +53,7 @@ def export_colmap(
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
         if options.colmap_format == "text" or options.colmap_database:
-            _write_for_child(model, work / BINARY)
+            write_job_model(model, work)
         if options.colmap_format == "text":
             run_job("write_text", work, folder)
             for kind in FILES:
@@ -100,13 +100,6 @@ def _check_folder(
     for file in names:
         check_writable(folder / file, overwrite=overwrite)
     return tuple(names)
-
-
-def _write_for_child(model: ColmapModel, folder: Path) -> None:
-    folder.mkdir()
-    for name, content in binary_files(model).items():
-        with (folder / name).open("wb") as stream:
-            stream.writelines(content)
 
 
 def _write_database(

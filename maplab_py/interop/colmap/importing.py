@@ -11,10 +11,8 @@ from maplab_py.array_types import I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap.additions import with_features, with_images
-from maplab_py.interop.colmap.binary_writing import binary_files
 from maplab_py.interop.colmap.camera_models import MODELS, has_model
-from maplab_py.interop.colmap.child import BINARY
-from maplab_py.interop.colmap.child_process import run_job
+from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.image_times import image_times
 from maplab_py.interop.colmap.model import ColmapModel
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
@@ -140,10 +138,7 @@ def _perspective(model: ColmapModel, folder: Path) -> ColmapModel:
             )
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
-        (work / BINARY).mkdir()
-        for file, content in binary_files(model).items():
-            with (work / BINARY / file).open("wb") as stream:
-                stream.writelines(content)
+        write_job_model(model, work)
         return perspective_model(model, work, lambda: run_job("undistort", work, folder))
 
 

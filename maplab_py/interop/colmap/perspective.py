@@ -56,6 +56,6 @@ def perspective_model(model: ColmapModel, work: Path, undistort: Callable[[], No
 
 
 def _pinhole(camera: ColmapCamera) -> ColmapCamera:
-    has_one_focal_length = len(camera.parameters) == 4  # SIMPLE_DIVISION: f cx cy k
-    values = camera.parameters[[0, 0, 1, 2]] if has_one_focal_length else camera.parameters[:4]
+    has_single_focal_length = len(camera.parameters) == 4  # SIMPLE_DIVISION: f cx cy k
+    values = camera.parameters[[0, 0, 1, 2]] if has_single_focal_length else camera.parameters[:4]
     return dataclasses.replace(camera, model=_PINHOLE, parameters=values)

@@ -160,7 +160,10 @@ def _refuse_sensitivity(entry: Entry, key: str) -> None:
 
 def _invertible(matrix: F64, entry: Entry) -> F64:
     if np.linalg.det(matrix) <= 0.0:
-        raise MapError(f"{entry.where}: scale and misalignment do not form a valid matrix")
+        raise MapError(
+            f"{entry.where}: scale and misalignment do not form a valid matrix: the determinant must be "
+            "positive"
+        )
     return matrix
 
 

@@ -233,7 +233,11 @@ update_rate: 200.0
             "Tg: [[0.1, 0, 0], [0, 0, 0], [0, 0, 0]]",
             "sensitivity to acceleration is not modelled",
         ),
-        ("update_rate: 200.0", "Tw: [[0, 0, 0], [0, 1, 0], [0, 0, 1]]", "no proper matrix"),
+        (
+            "update_rate: 200.0",
+            "Tw: [[0, 0, 0], [0, 1, 0], [0, 0, 1]]",
+            "do not form a valid matrix",
+        ),
         ("cam0:", "cam0: [", "not valid YAML"),
     ],
 )

@@ -78,9 +78,9 @@ def _seen(resources: FrameResources, frame: int, p_C: F64, depth: F32) -> tuple[
     camera = resources.camera(frame)
     uv, visible = project(camera, p_C)
     rows = np.flatnonzero(visible & (p_C[:, 2] > 0.0))
-    pixel = np.round(uv[rows]).astype(np.int64)
-    inside = is_inside_image(camera, pixel)
-    rows, pixel = rows[inside], pixel[inside]
+    rounded = np.round(uv[rows])  # may exceed the integers for points at the side of the camera
+    inside = is_inside_image(camera, rounded)
+    rows, pixel = rows[inside], rounded[inside].astype(np.int64)
     z, measured = p_C[rows, 2], depth[pixel[:, 1], pixel[:, 0]]
     near = np.abs(z - measured) <= np.maximum(_VISIBLE_M, _VISIBLE_PART * z)
     near &= measured > 0.0
