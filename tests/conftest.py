@@ -11,7 +11,9 @@ from hypothesis import settings
 from tests.support.coverage import not_run_here
 
 # how long a case takes says more of the machine's other work than of ours
-settings.register_profile("maplab", deadline=None)
+# the same cases in every run; --hypothesis-profile=search looks for new ones
+settings.register_profile("maplab", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None, max_examples=1000)
 settings.load_profile("maplab")
 
 # programs that tests start import the package that is tested, not that of the working folder
