@@ -55,7 +55,7 @@ class VIOptimizationReport(Report):
     iterations: int
     rejected_steps: int
     termination: str
-    recent_decrease_percent: float  # of the cost in the last ten steps
+    recent_decrease_percent: float  # in the last ten steps, of the cost before them
     vertices: int
     vertices_held: int  # without any constraint
     landmarks: int
@@ -88,10 +88,10 @@ class VIOptimizationReport(Report):
             return "no landmarks were used: init_track_landmarks makes them from feature tracks"
         if self.termination != "iteration limit":
             return ""
-        gained = (
-            f"iteration limit, the last {min(self.iterations, 10)} iterations lowered the cost by "
-            f"{self.recent_decrease_percent:.2g} %"
-        )
+        percent = self.recent_decrease_percent
+        shown = f"{percent:.0f} %" if percent >= 10.0 else f"{percent:.2g} %"
+        steps = min(self.iterations, 10)
+        gained = f"iteration limit, the last {steps} iterations lowered the cost by {shown}"
         if self.recent_decrease_percent < _SMALL_DECREASE_PERCENT:
             return f"{gained}: stop here"
         return f"{gained}: run optvi again"

@@ -110,20 +110,29 @@ def _make_bar(stream: TextIO) -> RichProgress:
     from rich.progress import (
         BarColumn,
         Progress,
+        Task,
         TaskProgressColumn,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
+
+    class RemainingColumn(TimeRemainingColumn):
+        """The time that is left; empty until it can be estimated."""
+
+        def render(self, task: Task) -> Text:
+            if task.total is None or task.time_remaining is None:
+                return Text()
+            return super().render(task).append(" left", "dim")
 
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("left", style="dim"),
-        TimeRemainingColumn(),
-        TextColumn("elapsed", style="dim"),
+        RemainingColumn(),
         TimeElapsedColumn(),
+        TextColumn("elapsed", style="dim"),
         console=Console(file=stream),
         transient=True,
         redirect_stdout=False,  # the streams are swapped by the prompt too, in its own order
