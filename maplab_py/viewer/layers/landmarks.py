@@ -84,13 +84,21 @@ def first_observation_s(vi_map: VIMap) -> F64:
 
 def first_observer(vi_map: VIMap) -> I64:
     """Return the first observing vertex row (L,) of each landmark in its mission, else any; or -1."""
-    vertex = vi_map.keypoint_vertex[vi_map.observations].astype(np.int64)
-    landmark = vi_map.keypoints.landmark[vi_map.observations]
+    first = first_observation(vi_map)
+    vertex = np.full(len(first), -1, dtype=np.int64)
+    vertex[first >= 0] = vi_map.keypoint_vertex[first[first >= 0]]
+    return vertex
+
+
+def first_observation(vi_map: VIMap) -> I64:
+    """Return the first observing keypoint row (L,) of each landmark in its mission, else any; or -1."""
+    keypoint = vi_map.observations
+    landmark = vi_map.keypoints.landmark[keypoint]
     home = vi_map.vertices.mission[vi_map.landmarks.vertex]
-    is_foreign = vi_map.vertices.mission[vertex] != home[landmark]
-    order = np.lexsort((vertex, is_foreign, landmark))
+    is_foreign = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoint]] != home[landmark]
+    order = np.lexsort((keypoint, is_foreign, landmark))[::-1]
     first = np.full(len(vi_map.landmarks), -1, dtype=np.int64)
-    first[landmark[order[::-1]]] = vertex[order[::-1]]
+    first[landmark[order]] = keypoint[order]
     return first
 
 
@@ -110,12 +118,29 @@ def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
         palette = colours.mission_colours(max(len(kinds), 1))
         names = zip(kinds.tolist(), colours.hex_codes(palette), strict=False)
         return palette[place], tuple(LegendEntry(f"type {kind}", (c,)) for kind, c in names)
+    if rule == "camera":
+        return _camera_colours(drawing.vi_map)
     if rule == "grey":
         grey = np.full(3, drawing.options.landmark_gray_level, dtype=np.uint8)
         return np.tile(grey, (len(drawing.vi_map.landmarks), 1)), ()
     if rule in ("observations", "missions"):
         return _count_colours(drawing, rule)
     return _scale_colours(drawing, rule)
+
+
+def _camera_colours(vi_map: VIMap) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour by the index of the camera whose frame observed a landmark first."""
+    first = first_observation(vi_map)
+    seen = first >= 0
+    camera = vi_map.frames.camera_index[vi_map.keypoint_frame[first[seen]]].astype(np.int64)
+    palette = colours.mission_colours(int(camera.max(initial=0)) + 1)
+    every = np.tile(colours.REFERENCE, (len(first), 1))
+    every[seen] = palette[camera]
+    codes = colours.hex_codes(palette)
+    legend = [LegendEntry(f"camera {k}", (codes[k],)) for k in np.unique(camera).tolist()]
+    if not seen.all():
+        legend.append(LegendEntry("not observed", (colours.to_hex(colours.REFERENCE),)))
+    return every, tuple(legend)
 
 
 def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, ...]]:
