@@ -13,7 +13,7 @@ from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Part, Segments
 LOOP_CLOSURES, ABSOLUTE_POSES = "loop_closure_covariances", "absolute_pose_covariances"
 _CIRCLE_POINTS = 24
 _MAX_ELLIPSOIDS = 3000
-_LINE_PX = 1.5
+_LINE_PX = 1.0
 
 
 def covariance_layers(drawing: Drawing) -> list[Layer]:
