@@ -83,6 +83,11 @@ class VisualizationOptions:
     offset_x_m: float = option(0.0, help="Shift of the whole drawing along x.", unit="m")
     offset_y_m: float = option(0.0, help="Shift of the whole drawing along y.", unit="m")
     offset_z_m: float = option(0.0, help="Shift of the whole drawing along z.", unit="m")
+    offset_landmarks_by_first_observer_frame_m: float = option(
+        0.0,
+        help="Shift landmarks along x by this times the index of the camera that saw them first.",
+        unit="m",
+    )
     spatially_distribute_missions_meters: float = option(
         0.0,
         help="Shift every mission by this much against the one before, along x.",

@@ -340,3 +340,17 @@ def test_landmarks_that_nothing_observes_are_grey_by_camera() -> None:
     colour, legend = landmark_colours(make_drawing(vi_map, options))
     assert tuple(colour[5]) == tuple(colours.REFERENCE)
     assert [entry.text for entry in legend] == ["camera 0", "not observed"]
+
+
+def test_landmarks_are_separated_by_the_camera_that_saw_them_first(two_missions: VIMap) -> None:
+    frames = two_missions.frames
+    camera_index = (np.arange(len(frames)) % 3).astype(frames.camera_index.dtype)
+    vi_map = two_missions.replace(frames=frames.replace(camera_index=camera_index))
+    options = VisualizationOptions(offset_landmarks_by_first_observer_frame_m=5.0)
+    shift = make_drawing(vi_map, options).p_landmarks - vi_map.p_G
+    assert not shift[:, 1:].any()
+    camera = camera_index[vi_map.keypoint_frame]
+    for row, x in enumerate(shift[:, 0]):
+        observing = np.flatnonzero(vi_map.keypoints.landmark == row)
+        assert x == pytest.approx(5.0 * camera[observing[0]])
+    assert len(np.unique(shift[:, 0].round())) > 1

@@ -7,6 +7,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
+from maplab_py.viewer.first_sightings import first_camera, first_observer
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -82,26 +83,6 @@ def first_observation_s(vi_map: VIMap) -> F64:
     return seconds
 
 
-def first_observer(vi_map: VIMap) -> I64:
-    """Return the first observing vertex row (L,) of each landmark in its mission, else any; or -1."""
-    first = first_observation(vi_map)
-    vertex = np.full(len(first), -1, dtype=np.int64)
-    vertex[first >= 0] = vi_map.keypoint_vertex[first[first >= 0]]
-    return vertex
-
-
-def first_observation(vi_map: VIMap) -> I64:
-    """Return the first observing keypoint row (L,) of each landmark in its mission, else any; or -1."""
-    keypoint = vi_map.observations
-    landmark = vi_map.keypoints.landmark[keypoint]
-    home = vi_map.vertices.mission[vi_map.landmarks.vertex]
-    is_foreign = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoint]] != home[landmark]
-    order = np.lexsort((keypoint, is_foreign, landmark))[::-1]
-    first = np.full(len(vi_map.landmarks), -1, dtype=np.int64)
-    first[landmark[order]] = keypoint[order]
-    return first
-
-
 def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Return a colour (L, 3) for each landmark by the rule of the options, and the legend."""
     rule = drawing.options.landmark_colouring
@@ -130,14 +111,13 @@ def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
 
 def _camera_colours(vi_map: VIMap) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Colour by the index of the camera whose frame observed a landmark first."""
-    first = first_observation(vi_map)
-    seen = first >= 0
-    camera = vi_map.frames.camera_index[vi_map.keypoint_frame[first[seen]]].astype(np.int64)
+    camera = first_camera(vi_map)
+    seen = camera >= 0
     palette = colours.mission_colours(int(camera.max(initial=0)) + 1)
-    every = np.tile(colours.REFERENCE, (len(first), 1))
-    every[seen] = palette[camera]
+    every = np.tile(colours.REFERENCE, (len(camera), 1))
+    every[seen] = palette[camera[seen]]
     codes = colours.hex_codes(palette)
-    legend = [LegendEntry(f"camera {k}", (codes[k],)) for k in np.unique(camera).tolist()]
+    legend = [LegendEntry(f"camera {k}", (codes[k],)) for k in np.unique(camera[seen]).tolist()]
     if not seen.all():
         legend.append(LegendEntry("not observed", (colours.to_hex(colours.REFERENCE),)))
     return every, tuple(legend)
