@@ -1,39 +1,132 @@
-"""Write docs/migration.md: what becomes of each of maplab's commands, checked against the registry.
+"""Write docs/migration.md and docs/migration_flags.md: what became of maplab's commands and flags.
 
 python docs/scripts/generate_migration_page.py
+
+Both pages are checked against the registry: a command or a flag of maplab that is neither there nor
+explained in the tables beside this file is an error.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from maplab_py.console.commands.flags import COMMON_FLAGS
 from maplab_py.console.commands.registry import Registry, load_registry
 
 DOCS = Path(__file__).resolve().parents[1]
 PAGE = DOCS / "migration.md"
-_COMMANDS = Path(__file__).with_name("maplab_commands.tsv")
+FLAGS_PAGE = DOCS / "migration_flags.md"
+COMMANDS = Path(__file__).with_name("maplab_commands.tsv")
+FLAG_NAMES = Path(__file__).with_name("maplab_flag_names.tsv")
+ELSEWHERE = Path(__file__).with_name("maplab_flags_elsewhere.tsv")
+RENAMED, DROPPED = "renamed", "dropped"
 _HEAD = Path(__file__).with_name("migration_head.txt")
+_FLAGS_HEAD = Path(__file__).with_name("migration_flags_head.txt")
+_SHOWN_COMMANDS = 3
 
 
 def page(registry: Registry) -> str:
-    """Return the page's text."""
+    """Return the text of the page of commands.
+
+    Raises:
+        ValueError: A command of maplab is neither in the registry nor explained.
+    """
     rows = []
-    for line in _COMMANDS.read_text(encoding="utf-8").splitlines():
-        names, _, note = line.partition("\t")
-        name, *aliases = (part.strip() for part in names.split(","))
-        shown = ", ".join(f"`{each}`" for each in (name, *aliases))
-        rows.append(f"| {shown} | {_here(name, aliases, registry)} | {note} |")
+    for names, note in command_table():
+        shown = ", ".join(f"`{each}`" for each in names)
+        rows.append(f"| {shown} | {_here(names, note, registry)} | {note} |")
     return _HEAD.read_text(encoding="utf-8") + "\n".join(rows) + "\n"
 
 
-def _here(name: str, aliases: list[str], registry: Registry) -> str:
+def command_table() -> list[tuple[list[str], str]]:
+    """Return name and aliases of each of maplab's commands, with the note on it."""
+    table = []
+    for line in COMMANDS.read_text(encoding="utf-8").splitlines():
+        names, _, note = line.partition("\t")
+        table.append(([part.strip() for part in names.split(",")], note))
+    return table
+
+
+def _here(names: list[str], note: str, registry: Registry) -> str:
+    name, *aliases = names
     if name.replace("-", "_") not in registry.names and name not in registry.names:
-        return "not there yet"
+        if not note:
+            raise ValueError(f"{COMMANDS.name}: '{name}' is no command here and has no reason")
+        return "dropped"
     command = registry.find(name)
     missing = [alias for alias in aliases if alias not in command.names]
     text = f"[`{command.name}`](commands/{registry.owner(command)}.md#{command.name})"
     return f"{text}, without {', '.join(missing)}" if missing else text
 
 
+def flags_page(registry: Registry) -> str:
+    """Return the text of the page of flags: one table per module, flags of one fate in one row.
+
+    Raises:
+        ValueError: A flag of maplab is neither in the registry nor explained, or is both, or a new
+            name is no flag.
+    """
+    elsewhere = _explained(registry)
+    modules: dict[str, dict[tuple[str, str], list[str]]] = {}
+    for module, name in flag_names():
+        fates = modules.setdefault(module, {})
+        fates.setdefault(_fate(name, elsewhere, registry), []).append(name)
+    parts = [_FLAGS_HEAD.read_text(encoding="utf-8")]
+    for module, fates in modules.items():
+        parts.append(f"\n## {module}\n\n| maplab | here | |\n|---|---|---|\n")
+        for (fate, text), names in fates.items():
+            parts.append(f"| {', '.join(f'`{name}`' for name in names)} | {fate} | {text} |\n")
+    return "".join(parts)
+
+
+def flag_names() -> list[tuple[str, str]]:
+    """Return the module and the name of each of maplab's flags; some names are in two modules."""
+    lines = FLAG_NAMES.read_text(encoding="utf-8").splitlines()
+    return [(module, name) for module, _, name in (line.partition("\t") for line in lines)]
+
+
+def _explained(registry: Registry) -> dict[str, tuple[str, str]]:
+    """Return fate and text of the flags that have no namesake here."""
+    known = {name for _, name in flag_names()}
+    fates: dict[str, tuple[str, str]] = {}
+    for line in ELSEWHERE.read_text(encoding="utf-8").splitlines():
+        names, fate, text = line.split("\t")
+        if fate == RENAMED:
+            new_name, _, note = text.partition(": ")
+            if not registry.flags_named(new_name.removeprefix("--")):
+                raise ValueError(f"{ELSEWHERE.name}: no command has the flag {new_name}")
+            text = f"`{new_name}`{': ' if note else ''}{note}"
+        for name in names.split(", "):
+            if name in fates or name not in known or fate not in (RENAMED, DROPPED) or not text:
+                raise ValueError(f"{ELSEWHERE.name}: the line of '{name}' is wrong")
+            fates[name] = fate, text
+    return fates
+
+
+def _fate(name: str, elsewhere: dict[str, tuple[str, str]], registry: Registry) -> tuple[str, str]:
+    commands = [command for command, _ in registry.flags_named(name)]
+    if (bool(commands) or name in COMMON_FLAGS) == (name in elsewhere):
+        reason = "has a namesake here and a line" if name in elsewhere else "has neither"
+        raise ValueError(f"{ELSEWHERE.name}: flag '{name}' {reason}")
+    if name in elsewhere:
+        return elsewhere[name]
+    if name in COMMON_FLAGS:
+        return "same name", "every command"
+    commands.sort(key=lambda command: command.name)
+    links = [
+        f"[`{command.name}`](commands/{registry.owner(command)}.md#{command.name})"
+        for command in commands[:_SHOWN_COMMANDS]
+    ]
+    more = len(commands) - len(links)
+    return "same name", ", ".join(links) + (f" and {more} more" if more else "")
+
+
+def main() -> None:
+    """Rewrite both pages."""
+    registry = load_registry()
+    PAGE.write_text(page(registry), encoding="utf-8")
+    FLAGS_PAGE.write_text(flags_page(registry), encoding="utf-8")
+
+
 if __name__ == "__main__":
-    PAGE.write_text(page(load_registry()), encoding="utf-8")
+    main()

@@ -36,6 +36,7 @@ def open_source(
     if options.type in ("euroc", "rosbag") and is_map:
         raise UserError(f"{path} is a map folder: give --datasource_type=map")
     if is_map:
+        source.device.check_unused("a mission names its sensors")
         vi_map, _ = load_map(path)
         return MapRecording(vi_map, _mission(vi_map, options.map_mission))
     if options.map_mission:

@@ -14,9 +14,14 @@ import numpy as np
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.basalt import read_basalt
-from maplab_py.interop.recordings.calibration import device_of, read_folder_calibration
+from maplab_py.interop.recordings.calibration import (
+    ANY_DEVICE,
+    device_of,
+    read_folder_calibration,
+)
 from maplab_py.interop.recordings.kalibr import is_camera_chain, read_kalibr, read_kalibr_imu
 from maplab_py.interop.recordings.models import make_device, read_camera, read_entry, read_imu_noise
+from maplab_py.interop.recordings.options import DeviceOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.sensors import Extrinsics, Imu, SensorSet
 from maplab_py.sensors.sensors_yaml import read_sensors
@@ -38,13 +43,16 @@ class CalibrationFile:
     imu_id: str = ""
 
 
-def import_calibration(path: Path, imu_file: Path | None = None) -> CalibrationFile:
+def import_calibration(
+    path: Path, imu_file: Path | None = None, chosen: DeviceOptions = ANY_DEVICE
+) -> CalibrationFile:
     """Read the calibration of another program.
 
     Args:
         path: kalibr's or OpenVINS' camera chain or IMU file, OpenVINS' estimator_config.yaml or the
             folder with it, a sensor.yaml of EuRoC or its folder, Basalt's json, or sensors.yaml.
         imu_file: IMU file that belongs to a camera chain, or imu0/sensor.yaml to that of a camera.
+        chosen: Sensors of a sensors.yaml that has several of a kind.
 
     Raises:
         MapError: A file cannot be read, a key is missing or wrong, or a model is not supported.
@@ -52,7 +60,9 @@ def import_calibration(path: Path, imu_file: Path | None = None) -> CalibrationF
     """
     if path.is_dir() and (path / _OPENVINS).exists():
         path = path / _OPENVINS
-    result = _import_any(path, imu_file)
+    result = _import_any(path, imu_file, chosen)
+    if result.format != "maplab":
+        chosen.check_unused(f"{path} is none")
     for camera in result.sensors.camera_rig(result.rig_id).cameras if result.rig_id else ():
         if abs(camera.time_offset_ns) > _MAX_TIME_OFFSET_NS:
             raise MapError(
@@ -62,7 +72,7 @@ def import_calibration(path: Path, imu_file: Path | None = None) -> CalibrationF
     return result
 
 
-def _import_any(path: Path, imu_file: Path | None) -> CalibrationFile:
+def _import_any(path: Path, imu_file: Path | None, chosen: DeviceOptions) -> CalibrationFile:
     if path.is_dir():
         _refuse_imu_file(path, imu_file)
         folder = path / "mav0" if (path / "mav0").is_dir() else path
@@ -93,7 +103,7 @@ def _import_any(path: Path, imu_file: Path | None) -> CalibrationFile:
         return _file(path, "EuRoC", _euroc_camera(entry, imu_file))
     if "sensors" in entry:
         _refuse_imu_file(path, imu_file)
-        return _file(path, "maplab", device_of(read_sensors(path), str(path)))
+        return _file(path, "maplab", device_of(read_sensors(path), str(path), chosen))
     raise UserError(
         f"{path}: the format is not known: give a camera chain or IMU file of kalibr, a sensor.yaml of "
         "EuRoC, OpenVINS' estimator_config.yaml, Basalt's calibration.json, or sensors.yaml"

@@ -11,12 +11,12 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import F32, I64, U8
 from maplab_py.interop.text_table import format_rows
 from maplab_py.options import option
 from maplab_py.output_files import check_writable, write_text
@@ -46,6 +46,20 @@ _LANDMARKS = (
 )
 _OBSERVATIONS = "vertex index, frame index, keypoint index, landmark index"
 _NUMBER = ", %.17g"
+_SINGLE = "%.9g"
+"""Single precision, so that reading gives back the same number."""
+_ROWS_AT_ONCE = 1 << 15
+
+
+class DescriptorProjector(Protocol):
+    """What projects binary descriptors to few real numbers."""
+
+    @property
+    def descriptor_size(self) -> int:
+        """Length [bytes] of the descriptors that it takes."""
+
+    def project(self, descriptors: U8) -> F32:
+        """Return descriptors (N, bytes) as points (N, dimensions)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +120,7 @@ def export_csv_dataset(
     options: CsvExportOptions,
     *,
     missions: NDArray[np.integer] | None = None,
+    projector: DescriptorProjector | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> CsvExportReport:
@@ -116,6 +131,7 @@ def export_csv_dataset(
         folder: Output folder; created if it does not exist.
         options: Tables to write.
         missions: Mission rows; None = all.
+        projector: Write projected descriptors instead of their bytes; None = bytes.
         overwrite: Replace files that exist.
         progress: Reports progress by file.
 
@@ -129,7 +145,7 @@ def export_csv_dataset(
     for mission in rows.tolist():
         part = _part_of(vi_map, mission, options)
         home = folder / ids.to_hex(vi_map.missions.id[mission])
-        tables = _tables(vi_map, part, options)
+        tables = _tables(vi_map, part, options, projector)
         targets.extend((home / f"{name}.csv", chunks) for name, chunks in tables)
         counts += [
             len(part.vertices),
@@ -176,14 +192,17 @@ def _part_of(vi_map: VIMap, mission: int, options: CsvExportOptions) -> _Part:
 
 
 def _tables(
-    vi_map: VIMap, part: _Part, options: CsvExportOptions
+    vi_map: VIMap,
+    part: _Part,
+    options: CsvExportOptions,
+    projector: DescriptorProjector | None,
 ) -> list[tuple[str, Iterable[str]]]:
     """Return name and text of every wanted table."""
     tables = [
         (options.vertices, "vertices", _vertices(vi_map, part)),
         (options.imu_data, "imu", _imu(vi_map, part)),
         (options.tracks_and_keypoints, "tracks", _tracks(vi_map, part)),
-        (options.descriptors, "descriptors", _descriptors(vi_map, part)),
+        (options.descriptors, "descriptors", _descriptors(vi_map, part, projector)),
         (options.landmarks, "landmarks", _landmarks(vi_map, part)),
         (options.observations, "observations", _observations(vi_map, part)),
     ]
@@ -235,27 +254,41 @@ def _tracks(vi_map: VIMap, part: _Part) -> Iterator[str]:
     return chain([_TRACKS + "\n"], format_rows(places, columns))
 
 
-def _descriptors(vi_map: VIMap, part: _Part) -> Iterator[str]:
-    """Yield descriptors as fixed-width text; rows are as many as in tracks.csv, without a header.
+def _descriptors(
+    vi_map: VIMap, part: _Part, projector: DescriptorProjector | None
+) -> Iterator[str]:
+    """Yield descriptors, rows as many as in tracks.csv, without a header.
 
-    The row of a keypoint without a binary descriptor is empty.
+    The row of a keypoint without a binary descriptor is empty, and with a projector also that of a
+    descriptor of another length than it takes.
     """
-    digits = "".join(f"{byte:3d}," for byte in range(256)).encode()
-    text_of_byte = np.frombuffer(digits, dtype=np.uint8).reshape(256, 4)
-    sizes = vi_map.binary_descriptor_size
-    cuts = np.flatnonzero(np.diff(sizes[part.keypoints])) + 1
-    for run in np.split(part.keypoints, cuts):
+    sizes = vi_map.binary_descriptor_size[part.keypoints]
+    if projector is not None:
+        sizes = np.where(sizes == projector.descriptor_size, sizes, 0)
+    cuts = np.flatnonzero(np.diff(sizes)) + 1
+    for first, run in zip([0, *cuts.tolist()], np.split(part.keypoints, cuts), strict=True):
         if len(run) == 0:
             continue
-        size = int(sizes[run[0]])
+        size = int(sizes[first])
         if size == 0:
             yield "\n" * len(run)
             continue
-        for begin in range(0, len(run), 1 << 15):
-            rows = run[begin : begin + (1 << 15)]
-            text = text_of_byte[vi_map.keypoints.descriptor[rows, :size]]
-            text[:, -1, 3] = ord("\n")
-            yield text.tobytes().decode("ascii")
+        for begin in range(0, len(run), _ROWS_AT_ONCE):
+            rows = run[begin : begin + _ROWS_AT_ONCE]
+            descriptors = vi_map.keypoints.descriptor[rows, :size]
+            if projector is None:
+                yield _text_of_bytes(descriptors)
+            else:
+                points = projector.project(descriptors)
+                yield from format_rows(", ".join([_SINGLE] * points.shape[1]), [points])
+
+
+def _text_of_bytes(descriptors: U8) -> str:
+    """Return descriptors (N, bytes) as lines of numbers of three places each."""
+    digits = "".join(f"{byte:3d}," for byte in range(256)).encode()
+    text = np.frombuffer(digits, dtype=np.uint8).reshape(256, 4)[descriptors]
+    text[:, -1, 3] = ord("\n")
+    return text.tobytes().decode("ascii")
 
 
 def _landmarks(vi_map: VIMap, part: _Part) -> Iterator[str]:

@@ -11,7 +11,15 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_drawing
 from maplab_py.viewer.extension import plugin_layers
-from maplab_py.viewer.layers import cameras, closures, clouds, landmarks, paths, references
+from maplab_py.viewer.layers import (
+    cameras,
+    closures,
+    clouds,
+    covariances,
+    landmarks,
+    paths,
+    references,
+)
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
@@ -74,6 +82,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers: list[Layer] = [paths.trajectories(drawing), paths.vertices(drawing)]
     layers += landmarks.landmarks(drawing)
     layers += [paths.loop_closures(drawing), paths.absolute_poses(drawing)]
+    layers += covariances.covariance_layers(drawing)
     layers += [cameras.frusta(drawing), paths.imu_edges(drawing)]
     layers += [*paths.transformation_edges(drawing), paths.base_frames(drawing)]
     if subject.segments is not None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.geometry import so3
 from maplab_py.viewer import colours
+from maplab_py.viewer.first_sightings import first_camera
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import Extent, Points, Segments
 from maplab_py.viewer.subsampling import spread_rows
@@ -60,7 +61,11 @@ class Drawing:
     @cached_property
     def p_landmarks(self) -> F64:
         """Positions (L, 3) of the landmarks in the scene."""
-        return self.vi_map.p_G + self.shift[self.landmark_mission]
+        p = self.vi_map.p_G + self.shift[self.landmark_mission]
+        offset_m = self.options.offset_landmarks_by_first_observer_frame_m
+        if offset_m:
+            p[:, 0] += offset_m * np.maximum(first_camera(self.vi_map), 0)
+        return p
 
     @property
     def unit_m(self) -> float:

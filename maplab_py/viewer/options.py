@@ -7,7 +7,17 @@ from typing import ClassVar
 
 from maplab_py.options import option
 
-COLOURINGS = ("mission", "height", "observations", "missions", "quality", "time", "type", "grey")
+COLOURINGS = (
+    "mission",
+    "height",
+    "observations",
+    "missions",
+    "quality",
+    "time",
+    "type",
+    "camera",
+    "grey",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +39,9 @@ class VisualizationOptions:
         False, help="Colour landmarks by when they were first observed."
     )
     color_by_landmark_type: bool = option(False, help="Colour landmarks by feature type.")
+    color_landmarks_by_first_observer_frame: bool = option(
+        False, help="Colour landmarks by the camera of the frame that observed them first."
+    )
     color_by_height_offset_m: float = option(0.0, help="Height of the first colour.", unit="m")
     color_by_height_period_m: float = option(
         0.0, help="Height after which colours repeat; 0 = over the height of the map.", unit="m"
@@ -56,11 +69,25 @@ class VisualizationOptions:
     max_points: int = option(
         300_000, help="Draw at most this many landmarks, and as many points of dense clouds."
     )
+    lc_edge_covariances: bool = option(
+        False, help="Show the covariance of the position of each loop closure edge as an ellipsoid."
+    )
+    abs_6dof_constraint_covariances: bool = option(
+        False, help="Show the covariance of the position of each absolute pose as an ellipsoid."
+    )
+    covariance_scale: float = option(
+        3.0, help="Half axes of the ellipsoids of covariances, in standard deviations."
+    )
     scale: float = option(1.0, help="Size of points, frusta and axes.")
     frustum_every_nth: int = option(0, help="Draw every n-th camera; 0 = as suits the mission.")
     offset_x_m: float = option(0.0, help="Shift of the whole drawing along x.", unit="m")
     offset_y_m: float = option(0.0, help="Shift of the whole drawing along y.", unit="m")
     offset_z_m: float = option(0.0, help="Shift of the whole drawing along z.", unit="m")
+    offset_landmarks_by_first_observer_frame_m: float = option(
+        0.0,
+        help="Shift landmarks along x by this times the index of the camera that saw them first.",
+        unit="m",
+    )
     spatially_distribute_missions_meters: float = option(
         0.0,
         help="Shift every mission by this much against the one before, along x.",
@@ -73,8 +100,9 @@ class VisualizationOptions:
         for name in ("max_points", "landmarks_max_observers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--vis_{name}={getattr(self, name)}: must be 1 or greater")
-        if not self.scale > 0.0:
-            raise ValueError(f"--vis_scale={self.scale:g}: must be greater than 0")
+        for name in ("scale", "covariance_scale"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"--vis_{name}={getattr(self, name):g}: must be greater than 0")
         if not 0 <= self.landmark_gray_level <= 255:
             raise ValueError(
                 f"--vis_landmark_gray_level={self.landmark_gray_level}: must be 0 to 255"
@@ -94,6 +122,7 @@ class VisualizationOptions:
             (self.color_landmarks_by_quality, "quality"),
             (self.color_landmarks_by_time, "time"),
             (self.color_by_landmark_type, "type"),
+            (self.color_landmarks_by_first_observer_frame, "camera"),
             (self.color_by_mission, "mission"),
         )
         return next((name for is_wanted, name in rules if is_wanted), "grey")
@@ -108,6 +137,7 @@ class VisualizationOptions:
             color_landmarks_by_quality=colouring == "quality",
             color_landmarks_by_time=colouring == "time",
             color_by_landmark_type=colouring == "type",
+            color_landmarks_by_first_observer_frame=colouring == "camera",
             color_by_mission=colouring == "mission",
         )
 

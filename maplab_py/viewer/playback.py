@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.viewer.drawing import Drawing
-from maplab_py.viewer.layers.landmarks import first_observer
+from maplab_py.viewer.first_sightings import first_observer
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.subsampling import spread_rows
 

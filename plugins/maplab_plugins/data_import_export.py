@@ -6,12 +6,15 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from maplab_py.interop.csv_dataset import CsvExportOptions, CsvExportReport
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
 if TYPE_CHECKING:
     from maplab_py.interop.recordings.summary import RecordingReport
+    from maplab_py.vision.projection import DescriptorProjection
 
 _SOURCE = SourceOptions()
 _STREAM = StreamOptions()
@@ -38,6 +41,8 @@ def csv_export(
     *,
     csv_export_path: Path | None = None,
     options: CsvExportOptions = CsvExportOptions(),  # noqa: B008
+    export_projected_descriptor: bool = False,
+    lc_projection_matrix_filename: str = "",
     map_mission: str = "",
     overwrite: bool = False,
 ) -> CsvExportReport:
@@ -45,10 +50,37 @@ def csv_export(
 
     Args:
         csv_export_path: Folder to write into; it gets one folder per mission.
+        export_projected_descriptor: Write to descriptors.csv the real numbers that loop closure
+            compares, in place of the bytes of the descriptors.
+        lc_projection_matrix_filename: Projection that train_projection_matrix wrote, for
+            --export_projected_descriptor; empty, or of another length of descriptors = learned from
+            the tracks of the exported missions, as loop closure among them does.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
         overwrite: Replace files that exist.
     """
-    return _export_csv(context, csv_export_path, options, map_mission, overwrite)
+    if lc_projection_matrix_filename and not export_projected_descriptor:
+        raise UserError(
+            "csv_export: --lc_projection_matrix_filename needs --export_projected_descriptor"
+        )
+    projection = None
+    if export_projected_descriptor:
+        if not options.descriptors:
+            raise UserError(
+                "csv_export: --export_projected_descriptor needs --csv_export_descriptors"
+            )
+        projection = _projection(context, map_mission, lc_projection_matrix_filename)
+    return _export_csv(context, csv_export_path, options, map_mission, overwrite, projection)
+
+
+def _projection(context: CommandContext, map_mission: str, file: str) -> DescriptorProjection:
+    """Return the projection of descriptors that loop closure among the chosen missions uses."""
+    from maplab_py.algorithms.loop_closure.features import map_features
+    from maplab_py.vision.projection_file import load_projection
+
+    rows = context.mission_rows(map_mission)
+    missions = np.arange(len(context.vi_map.missions)) if rows is None else rows
+    given = load_projection(Path(file)) if file else None
+    return map_features(context.vi_map, missions, projection=given)[1]
 
 
 @command(
@@ -82,6 +114,7 @@ def _export_csv(
     options: CsvExportOptions,
     map_mission: str,
     overwrite: bool,
+    projection: DescriptorProjection | None = None,
 ) -> CsvExportReport:
     from maplab_py.interop.csv_dataset import export_csv_dataset
 
@@ -90,6 +123,7 @@ def _export_csv(
         _given(folder, "csv_export_path"),
         options,
         missions=context.mission_rows(map_mission),
+        projector=projection,
         overwrite=overwrite,
         progress=context.progress,
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.external_poses.options import GpsOptions, TrajectoryOptions
+from maplab_py.interop.recordings.options import DeviceOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from maplab_py.interop.calibration_import import CalibrationFile
     from maplab_py.interop.trajectories import Trajectory
 
-_TRAJECTORY, _GPS = TrajectoryOptions(), GpsOptions()
+_TRAJECTORY, _GPS, _DEVICE = TrajectoryOptions(), GpsOptions(), DeviceOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +69,7 @@ def import_calibration(
     calibration_file: Path,
     *,
     imu_calibration_file: Path | None = None,
+    device: DeviceOptions = _DEVICE,
     sensors_file: Path | None = None,
     apply: bool = False,
     apply_imu_noise: bool = True,
@@ -91,7 +93,7 @@ def import_calibration(
     from maplab_py.interop.calibration_import import import_calibration as read
     from maplab_py.sensors.sensors_yaml import write_sensors
 
-    calibration = read(calibration_file, imu_calibration_file)
+    calibration = read(calibration_file, imu_calibration_file, device)
     changes: tuple[ComparedParameter, ...] = ()
     if apply:
         changes = _apply(context, calibration, chosen, imu_noise=apply_imu_noise)

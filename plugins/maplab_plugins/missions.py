@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_labels
+from maplab_py.vimap.queries import mission_distances_m, mission_labels, mission_time_spans_ns
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
 
 _LAYOUT = LayoutOptions()
 
@@ -32,6 +41,99 @@ def remove_mission(
     context.confirm(f"remove mission {ids}?", yes=yes)
     context.commit(remove_missions(context.vi_map, rows))
     return Message(f"removed mission {ids}")
+
+
+@command(
+    "remove_mission_interactive", "rmi", example="rmi", see_also=("remove_mission", "visualize")
+)
+def remove_mission_interactive(context: CommandContext, *, map_mission_list: str = "") -> Message:
+    """Go through the missions and ask of each whether to remove it.
+
+    y = remove, n = keep, q = keep this and all further ones. A viewer that is running shows the
+    mission that is asked about. The missions are removed after the last question: one `undo` brings
+    all of them back, and Ctrl-C at a question removes none.
+
+    Args:
+        map_mission_list: Ask about these missions only, separated by commas.
+    """
+    from maplab_py.vimap.edits import remove_missions
+
+    vi_map = context.vi_map
+    rows = context.mission_rows(map_mission_list=map_mission_list)
+    asked = np.arange(len(vi_map.missions)) if rows is None else rows
+    if context.is_trial:
+        return Message(f"would ask about {counted(len(asked), 'mission')}")
+    if not context.terminal.is_interactive:
+        raise UserError(
+            f"{context.command}: nobody is there to answer; in a script use "
+            "remove_mission --map_mission_list=ID,ID --yes"
+        )
+    removed = _missions_to_remove(context, asked.tolist())
+    if not removed:
+        return Message("no mission is removed")
+    labels = mission_labels(vi_map)
+    context.commit(remove_missions(vi_map, np.array(removed)))
+    names = ", ".join(labels[row] for row in removed)
+    return Message(f"removed {counted(len(removed), 'mission')}: {names}")
+
+
+def _missions_to_remove(context: CommandContext, rows: list[int]) -> list[int]:
+    """Ask about each mission (row) and return those to remove."""
+    labels, facts = mission_labels(context.vi_map), _mission_facts(context.vi_map)
+    removed: list[int] = []
+    with _shown_alone(context) as show_mission:
+        for place, row in enumerate(rows, start=1):
+            show_mission(row)
+            context.terminal.note(f"mission {place} of {len(rows)}: {facts[row]}")
+            answer = context.terminal.choose(
+                f"remove mission {labels[row]}?", ("yes", "no", "quit")
+            )
+            if answer == "quit":
+                break
+            if answer == "yes":
+                removed.append(row)
+    return removed
+
+
+def _mission_facts(vi_map: VIMap) -> list[str]:
+    """Return name, id, length, duration and size of each mission as a line."""
+    length_m = mission_distances_m(vi_map)
+    duration_s = 1e-9 * np.diff(mission_time_spans_ns(vi_map), axis=1)[:, 0]
+    vertices = np.diff(vi_map.vertex_start)
+    return [
+        f"{name or 'without a name'}, id {to_hex(vi_map.missions.id[row])}, {length_m[row]:.1f} m, "
+        f"{duration_s[row]:.1f} s, {counted(int(vertices[row]), 'vertex', 'vertices')}"
+        for row, name in enumerate(vi_map.missions.name)
+    ]
+
+
+@contextmanager
+def _shown_alone(context: CommandContext) -> Iterator[Callable[[int], None]]:
+    """Give a function that shows one mission (row) in the viewer, if one runs and shows the map.
+
+    At the end the viewer shows what it showed before.
+    """
+    from maplab_plugins.visualization.following import NAME, Following
+    from maplab_py.viewer.building import Subject
+    from maplab_py.vimap.selection import keep_rows
+
+    following = context.session.watchers.find(NAME, Following)
+    viewer = None if following is None or following.viewer.is_stopped else following.viewer
+    before = None if viewer is None else viewer.wanted
+    if viewer is None or before is None or before.title != context.map_key:
+        yield lambda _: None
+        return
+    vi_map = context.vi_map
+
+    def show(row: int) -> None:
+        mission = keep_rows(vi_map, missions=np.array([row]))
+        if len(mission.vertices):
+            viewer.follow(Subject(mission, before.title, before.options))
+
+    try:
+        yield show
+    finally:
+        viewer.follow(before)
 
 
 @command("rename_mission", example="rename_mission monday --map_mission=59f0")

@@ -19,7 +19,8 @@ DOCS = REPOSITORY / "docs"
 PAGES = sorted([*REPOSITORY.glob("*.md"), *DOCS.rglob("*.md")])
 
 
-def _script(name: str) -> ModuleType:
+def script_module(name: str) -> ModuleType:
+    """Return a script of docs/scripts as a module."""
     spec = importlib.util.spec_from_file_location(name, DOCS / "scripts" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -31,7 +32,7 @@ def _script(name: str) -> ModuleType:
 def test_command_pages_are_those_of_the_registry() -> None:
     registry = load_registry()
     assert registry.problems == []
-    expected = _script("generate_command_pages").pages(registry)
+    expected = script_module("generate_command_pages").pages(registry)
     present = {path.name: path.read_text() for path in (DOCS / "commands").glob("*.md")}
     assert sorted(present) == sorted(expected)
     stale = [name for name, text in expected.items() if present[name] != text]
@@ -39,9 +40,13 @@ def test_command_pages_are_those_of_the_registry() -> None:
 
 
 def test_generated_pages_are_up_to_date() -> None:
-    migration = _script("generate_migration_page").page(load_registry())
-    assert (DOCS / "migration.md").read_text() == migration, "run generate_migration_page.py"
-    script = _script("generate_command_pages")
+    migration = script_module("generate_migration_page")
+    for path, text in (
+        (migration.PAGE, migration.page(load_registry())),
+        (migration.FLAGS_PAGE, migration.flags_page(load_registry())),
+    ):
+        assert path.read_text() == text, "run docs/scripts/generate_migration_page.py"
+    script = script_module("generate_command_pages")
     for folder, expected in (("decisions", script.decisions()), ("studies", script.studies())):
         assert (DOCS / folder / "index.md").read_text() == expected, (
             "run docs/scripts/generate_command_pages.py"

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from maplab_py.storage.native import save_map
+from maplab_py.vimap.merge import merge_maps
 from tests.e2e.support import Console
 from tests.support.machine import slowness
+from tests.vimap.builders import walk_map
 
 CTRL_C, CTRL_D, CTRL_R, UP, TAB = "\x03", "\x04", "\x12", "\x1b[A", "\t"
 
@@ -246,3 +249,22 @@ def test_ctrl_c_at_a_question_is_no(console: Console) -> None:
     console.type(CTRL_C)
     console.wait_for_text("delete_map: cancelled")
     console.wait_for_prompt("maplab <a>:/$")
+
+
+def test_missions_are_removed_by_questions_and_ctrl_c_removes_none(
+    console: Console, tmp_path: Path
+) -> None:
+    save_map(merge_maps(walk_map(), walk_map(vertices=7, seed=4))[0], tmp_path / "walks")
+    console.enter("load walks")
+    console.wait_for_prompt("maplab <walks>:/$")
+    console.enter("remove_mission_interactive")
+    console.wait_for_text("mission 1 of 2")
+    console.enter("y")
+    console.wait_for_text("mission 2 of 2")
+    console.type(CTRL_C)
+    console.wait_for_text("remove_mission_interactive: cancelled")
+    console.wait_for_prompt("maplab <walks>:/$")
+    console.enter("rmi")
+    console.wait_for_text("[y/n/q]")
+    console.enter("q")
+    console.wait_for_text("no mission is removed")

@@ -123,3 +123,25 @@ def test_nothing_is_written_when_one_file_exists(tmp_path: Path) -> None:
 def test_tables_can_be_left_out(tmp_path: Path, name: str) -> None:
     options = dataclasses.replace(CsvExportOptions(), **{name: False})
     assert export_csv_dataset(make_map(), tmp_path, options).files == 10
+
+
+class FirstTwoBytes:
+    """Stands for a projection: halves of the first two bytes of descriptors of 48 bytes."""
+
+    descriptor_size = 48
+
+    def project(self, descriptors: np.ndarray) -> np.ndarray:
+        assert descriptors.shape[1] == self.descriptor_size
+        return (descriptors[:, :2] / np.float32(3.0)).astype(np.float32)
+
+
+def test_projected_descriptors_are_read_back_exactly(tmp_path: Path) -> None:
+    vi_map = make_map()
+    export_csv_dataset(vi_map, tmp_path, CsvExportOptions(), projector=FirstTwoBytes())
+    first, second = (tmp_path / text for text in ids.to_hex_list(vi_map.missions.id))
+    lines = (first / "descriptors.csv").read_text().splitlines()
+    read = np.array([line.split(", ") for line in lines], dtype=np.float32)
+    expected = FirstTwoBytes().project(vi_map.keypoints.descriptor[:24, :48])
+    assert np.array_equal(read, expected)
+    # descriptors of another length than the projection takes have an empty row
+    assert (second / "descriptors.csv").read_text() == "\n" * 24

@@ -8,15 +8,20 @@ import numpy as np
 import pytest
 from maplab_plugins import data_import_export
 
+from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
-from maplab_py.errors import UserError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import VIMap, ids
+from maplab_py.vimap.merge import merge_maps
+from maplab_py.vision.projection import DescriptorProjection
+from maplab_py.vision.projection_file import save_projection
 from tests.interop.recordings.written import make_content, write_folder
 from tests.interop.small_map import RIG_ID, make_map
+from tests.simulation.small import simulated
 
 
 @pytest.fixture
@@ -38,6 +43,49 @@ def test_csv_export(tmp_path: Path, session: Session) -> None:
         session.run("csv_export", csv_export_path=path)
     session.run("csv_export", csv_export_path=path, overwrite=True)
     assert (path / mission / "descriptors.csv").exists()
+
+
+def test_projected_descriptors_are_those_of_loop_closure(tmp_path: Path) -> None:
+    session = Session(load_registry())
+    session.maps.add("walk", merge_maps(*simulated().maps)[0])
+    vi_map = session.vi_map
+    session.run("csv_export", csv_export_path=tmp_path / "csv", export_projected_descriptor=True)
+    features, projection = map_features(vi_map, np.arange(2))
+    mission = vi_map.vertices.mission[vi_map.keypoint_vertex]
+    for row, name in enumerate(ids.to_hex_list(vi_map.missions.id)):
+        text = (tmp_path / "csv" / name / "descriptors.csv").read_text()
+        read = np.array([line.split(", ") for line in text.splitlines()], dtype=np.float32)
+        of_mission = np.flatnonzero(mission == row)
+        assert read.shape == (len(of_mission), 10)
+        chosen = np.isin(features.keypoint, of_mission)
+        projected = features.descriptors.projected[chosen]
+        assert np.array_equal(read[features.keypoint[chosen] - of_mission[0]], projected)
+    save_projection(DescriptorProjection(projection.matrix[:3]), tmp_path / "p.npz")
+    session.run(
+        "csv_export",
+        csv_export_path=tmp_path / "three",
+        export_projected_descriptor=True,
+        lc_projection_matrix_filename=str(tmp_path / "p.npz"),
+    )
+    line = (tmp_path / "three" / name / "descriptors.csv").read_text().splitlines()[0]
+    assert len(line.split(", ")) == 3
+
+
+def test_wrong_combinations_with_projected_descriptors(tmp_path: Path, session: Session) -> None:
+    for flags, needed in (
+        ({"lc_projection_matrix_filename": "p.npz"}, "--export_projected_descriptor"),
+        (
+            {"export_projected_descriptor": True, "csv_export_descriptors": False},
+            "--csv_export_descriptors",
+        ),
+    ):
+        with pytest.raises(UserError, match=f"needs {needed}"):
+            session.run("csv_export", csv_export_path=tmp_path / "csv", **flags)
+    with pytest.raises(EstimationError, match="do not match each other"):
+        session.run(
+            "csv_export", csv_export_path=tmp_path / "csv", export_projected_descriptor=True
+        )
+    assert not (tmp_path / "csv").exists()
 
 
 def test_csv_export_vertices_only(tmp_path: Path, session: Session) -> None:

@@ -33,6 +33,18 @@ NAMES = [pytest.param(c.name, marks=pytest.mark.slow if c.name in SLOW else ()) 
 ALL_NAMES = [command.name for command in COMMANDS]
 
 
+class _Agreeing(ConsoleTerminal):
+    """A terminal at which somebody answers every question with the first answer."""
+
+    @property
+    def is_interactive(self) -> bool:
+        return True
+
+    def choose(self, question: str, answers: tuple[str, ...]) -> str:
+        assert question
+        return answers[0]
+
+
 class _Writes:
     """Files opened for writing while it is active; an audit hook cannot be taken off again."""
 
@@ -88,6 +100,8 @@ def prepare(runner: Runner, name: str, capsys: Capture) -> str:
     example = REGISTRY.find(name).example
     if name == "tour":  # somebody has to type
         runner.terminal.is_prompt = True
+    if name == "remove_mission_interactive":  # somebody has to answer
+        runner.terminal.__class__ = _Agreeing
     if name == "remove_loopclosure":  # whose argument is an id that nobody knows beforehand
         closures = runner.session.run("lc_report").as_dict()["closures"]
         example = example.replace("59f0a1b2", closures[0]["id"])

@@ -12,7 +12,9 @@ from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.layers.clouds import Cloud
+from maplab_py.viewer.layers.landmarks import landmark_colours
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
 from maplab_py.viewer.scene import Axes, Mesh, Points, Scene, Segments
@@ -310,3 +312,45 @@ def test_options_refuse_nonsense() -> None:
     for wrong in ({"max_points": 0}, {"scale": 0.0}, {"landmark_gray_level": 300}):
         with pytest.raises(ValueError, match="--vis_"):
             VisualizationOptions(**wrong)
+
+
+def test_landmarks_have_the_colour_of_the_camera_that_saw_them_first(
+    two_missions: VIMap,
+) -> None:
+    frames = two_missions.frames
+    camera_index = (np.arange(len(frames)) % 3).astype(frames.camera_index.dtype)
+    vi_map = two_missions.replace(frames=frames.replace(camera_index=camera_index))
+    options = VisualizationOptions(color_landmarks_by_first_observer_frame=True)
+    colour, legend = landmark_colours(make_drawing(vi_map, options))
+    camera = camera_index[vi_map.keypoint_frame]
+    palette = colours.mission_colours(3)
+    for row, shown in enumerate(colour):
+        observing = np.flatnonzero(vi_map.keypoints.landmark == row)
+        assert tuple(shown) == tuple(palette[camera[observing[0]]])
+    assert len(np.unique(colour, axis=0)) > 1
+    assert {entry.text for entry in legend} <= {"camera 0", "camera 1", "camera 2"}
+
+
+def test_landmarks_that_nothing_observes_are_grey_by_camera() -> None:
+    vi_map = walk_map()
+    keypoints = vi_map.keypoints
+    landmark = np.where(keypoints.landmark == 5, -1, keypoints.landmark)
+    vi_map = vi_map.replace(keypoints=keypoints.replace(landmark=landmark))
+    options = VisualizationOptions(color_landmarks_by_first_observer_frame=True)
+    colour, legend = landmark_colours(make_drawing(vi_map, options))
+    assert tuple(colour[5]) == tuple(colours.REFERENCE)
+    assert [entry.text for entry in legend] == ["camera 0", "not observed"]
+
+
+def test_landmarks_are_separated_by_the_camera_that_saw_them_first(two_missions: VIMap) -> None:
+    frames = two_missions.frames
+    camera_index = (np.arange(len(frames)) % 3).astype(frames.camera_index.dtype)
+    vi_map = two_missions.replace(frames=frames.replace(camera_index=camera_index))
+    options = VisualizationOptions(offset_landmarks_by_first_observer_frame_m=5.0)
+    shift = make_drawing(vi_map, options).p_landmarks - vi_map.p_G
+    assert not shift[:, 1:].any()
+    camera = camera_index[vi_map.keypoint_frame]
+    for row, x in enumerate(shift[:, 0]):
+        observing = np.flatnonzero(vi_map.keypoints.landmark == row)
+        assert x == pytest.approx(5.0 * camera[observing[0]])
+    assert len(np.unique(shift[:, 0].round())) > 1

@@ -55,18 +55,37 @@ class ConsoleTerminal:
             Cancelled: The answer is Ctrl-C.
         """
         self._hide_progress()
-        return in_waiting_thread(lambda: self._ask(question))
+        answer = in_waiting_thread(lambda: self._answer(f"{question} [y/N] "))
+        return answer.strip().lower() in ("y", "yes")
 
-    def _ask(self, question: str) -> bool:
-        sys.stderr.write(f"{question} [y/N] ")
+    def choose(self, question: str, answers: tuple[str, ...]) -> str:
+        """Ask until one of the answers, or its first letter, is given; return the answer.
+
+        Raises:
+            Cancelled: The answer is Ctrl-C, or the input has ended.
+        """
+        self._hide_progress()
+        letters = "/".join(answer[0] for answer in answers)
+        while True:
+            text = in_waiting_thread(lambda: self._answer(f"{question} [{letters}] "))
+            if not text:
+                raise Cancelled("cancelled: the input has ended")
+            given = text.strip().lower()
+            for answer in answers:
+                if given in (answer, answer[0]):
+                    return answer
+
+    def _answer(self, prompt: str) -> str:
+        """Return the line that the user types behind a prompt, empty at the end of the input."""
+        sys.stderr.write(prompt)
         sys.stderr.flush()
         try:
             with interruptible():
-                answer = sys.stdin.readline().strip()
+                text = sys.stdin.readline()
         except KeyboardInterrupt:
             raise Cancelled("cancelled") from None
-        self._copy(f"{question} [y/N] {answer}")
-        return answer.lower() in ("y", "yes")
+        self._copy(f"{prompt}{text.strip()}")
+        return text
 
     def show(self, report: Report, command: str, seconds: float | None = None) -> None:
         """Print a report to standard output."""

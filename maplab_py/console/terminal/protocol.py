@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Protocol
 
+from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
@@ -23,6 +24,9 @@ class Terminal(Protocol):
 
     def ask(self, question: str) -> bool:
         """Ask a yes-or-no question."""
+
+    def choose(self, question: str, answers: tuple[str, ...]) -> str:
+        """Ask until one of the answers, or its first letter, is given; return the answer."""
 
     def show(self, report: Report, command: str) -> None:
         """Show the report of a command."""
@@ -53,6 +57,10 @@ class SilentTerminal:
     def ask(self, question: str) -> bool:  # noqa: ARG002
         """Answer no."""
         return False
+
+    def choose(self, question: str, answers: tuple[str, ...]) -> str:  # noqa: ARG002
+        """Refuse: nobody can choose."""
+        raise UserError("nobody is there to answer")
 
     def show(self, report: Report, command: str) -> None:
         """Show nothing: the program has the report."""

@@ -12,42 +12,65 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.kalibr import is_camera_chain, read_kalibr
 from maplab_py.interop.recordings.models import make_device, read_camera, read_entry, read_imu_noise
+from maplab_py.interop.recordings.options import DeviceOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.sensors import Camera, CameraRig, Imu, SensorSet
 from maplab_py.sensors.sensors_yaml import read_sensors
 
+ANY_DEVICE = DeviceOptions()
 HOW_TO_CALIBRATE = "give --sensor_calibration_file=FILE (sensors.yaml, or kalibr's camchain)"
 
 
-def read_calibration(path: Path, imu_file: Path | None = None) -> RecordedSensors:
+def read_calibration(
+    path: Path, imu_file: Path | None = None, chosen: DeviceOptions = ANY_DEVICE
+) -> RecordedSensors:
     """Read a sensors.yaml, or kalibr's camera chain with its IMU file.
 
     Raises:
         MapError: A file cannot be read or is wrong.
-        UserError: There is an IMU file for a sensors.yaml, or not exactly one rig and one IMU.
+        UserError: There is an IMU file for a sensors.yaml, sensors are chosen for a camera chain, or
+            it remains open which rig or IMU is to be used.
     """
     if is_camera_chain(read_entry(path)):
+        chosen.check_unused(f"{path} is a camera chain")
         return read_kalibr(path, imu_file)
     if imu_file is not None:
         raise UserError(
             f"--imu_calibration_file={imu_file} belongs to a camera chain of kalibr, and {path} is none"
         )
-    return device_of(read_sensors(path), str(path))
+    return device_of(read_sensors(path), str(path), chosen)
 
 
-def device_of(sensors: SensorSet, source: str) -> RecordedSensors:
-    """Return the only camera rig of a set of sensors, with the only IMU if there is one.
+def device_of(
+    sensors: SensorSet, source: str, chosen: DeviceOptions = ANY_DEVICE
+) -> RecordedSensors:
+    """Return the chosen camera rig of a set of sensors, with the chosen IMU if there is any.
 
     Raises:
-        UserError: There is another number of them.
+        UserError: There is no rig, a choice fits none or several, or is missing where there are
+            several.
     """
     rigs = [key for key, sensor in sensors.sensors.items() if isinstance(sensor, CameraRig)]
     imus = [key for key, sensor in sensors.sensors.items() if isinstance(sensor, Imu)]
-    if len(rigs) != 1 or len(imus) > 1:
-        raise UserError(
-            f"{source} has {len(rigs)} camera rigs and {len(imus)} IMUs: leave one of each in it"
-        )
-    return RecordedSensors(sensors, rigs[0], imus[0] if imus else "")
+    if not rigs:
+        raise UserError(f"{source} has no camera rig: give a calibration with cameras")
+    rig = _selected(rigs, chosen.ncamera_sensor_id, f"{source}: camera rigs", "ncamera")
+    has_imu = bool(imus or chosen.imu_sensor_id)
+    imu = _selected(imus, chosen.imu_sensor_id, f"{source}: IMUs", "imu") if has_imu else ""
+    return RecordedSensors(sensors, rig, imu)
+
+
+def _selected(ids: list[str], prefix: str, what: str, kind: str) -> str:
+    """Return the only id that begins with a prefix."""
+    flag = f"--selected_{kind}_sensor_id"
+    matches = [sensor_id for sensor_id in ids if sensor_id.startswith(prefix.lower())]
+    if len(matches) == 1:
+        return matches[0]
+    known = ", ".join(ids) or "none"
+    if not prefix:
+        raise UserError(f"{what} are {known}: choose one by {flag}=ID")
+    number = "none of them begins" if not matches else "several of them begin"
+    raise UserError(f"{flag}={prefix}: {what} are {known}, and {number} so")
 
 
 def read_folder_calibration(folder: Path) -> RecordedSensors:

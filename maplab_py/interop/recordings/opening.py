@@ -63,10 +63,13 @@ def _chosen(device: RecordedSensors, options: SourceOptions) -> RecordedSensors:
 def _calibration(options: SourceOptions) -> RecordedSensors | None:
     """Return the calibration that the options name, None if they name none."""
     if options.sensor_calibration_file is not None:
-        return read_calibration(options.sensor_calibration_file, options.imu_calibration_file)
+        return read_calibration(
+            options.sensor_calibration_file, options.imu_calibration_file, options.device
+        )
     if options.imu_calibration_file is not None:
         raise UserError(
             f"--imu_calibration_file={options.imu_calibration_file} needs the camera chain that it "
             "belongs to: give --sensor_calibration_file=FILE"
         )
+    options.device.check_unused("give it as --sensor_calibration_file=FILE")
     return None

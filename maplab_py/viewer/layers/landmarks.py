@@ -7,6 +7,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
+from maplab_py.viewer.first_sightings import first_camera, first_observer
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -82,18 +83,6 @@ def first_observation_s(vi_map: VIMap) -> F64:
     return seconds
 
 
-def first_observer(vi_map: VIMap) -> I64:
-    """Return the first observing vertex row (L,) of each landmark in its mission, else any; or -1."""
-    vertex = vi_map.keypoint_vertex[vi_map.observations].astype(np.int64)
-    landmark = vi_map.keypoints.landmark[vi_map.observations]
-    home = vi_map.vertices.mission[vi_map.landmarks.vertex]
-    is_foreign = vi_map.vertices.mission[vertex] != home[landmark]
-    order = np.lexsort((vertex, is_foreign, landmark))
-    first = np.full(len(vi_map.landmarks), -1, dtype=np.int64)
-    first[landmark[order[::-1]]] = vertex[order[::-1]]
-    return first
-
-
 def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Return a colour (L, 3) for each landmark by the rule of the options, and the legend."""
     rule = drawing.options.landmark_colouring
@@ -110,12 +99,28 @@ def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
         palette = colours.mission_colours(max(len(kinds), 1))
         names = zip(kinds.tolist(), colours.hex_codes(palette), strict=False)
         return palette[place], tuple(LegendEntry(f"type {kind}", (c,)) for kind, c in names)
+    if rule == "camera":
+        return _camera_colours(drawing.vi_map)
     if rule == "grey":
         grey = np.full(3, drawing.options.landmark_gray_level, dtype=np.uint8)
         return np.tile(grey, (len(drawing.vi_map.landmarks), 1)), ()
     if rule in ("observations", "missions"):
         return _count_colours(drawing, rule)
     return _scale_colours(drawing, rule)
+
+
+def _camera_colours(vi_map: VIMap) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour by the index of the camera whose frame observed a landmark first."""
+    camera = first_camera(vi_map)
+    seen = camera >= 0
+    palette = colours.mission_colours(int(camera.max(initial=0)) + 1)
+    every = np.tile(colours.REFERENCE, (len(camera), 1))
+    every[seen] = palette[camera[seen]]
+    codes = colours.hex_codes(palette)
+    legend = [LegendEntry(f"camera {k}", (codes[k],)) for k in np.unique(camera[seen]).tolist()]
+    if not seen.all():
+        legend.append(LegendEntry("not observed", (colours.to_hex(colours.REFERENCE),)))
+    return every, tuple(legend)
 
 
 def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, ...]]:

@@ -150,6 +150,7 @@ def visualize_loop_closures(
     from maplab_py.algorithms.loop_closure.closure_record import read_record
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.closures import ACCEPTED
+    from maplab_py.viewer.layers.covariances import LOOP_CLOSURES
 
     vi_map = context.vi_map
     if not len(vi_map.loop_closure_edges) and not len(read_record(vi_map).closures):
@@ -158,7 +159,7 @@ def visualize_loop_closures(
         )
     subject = Subject(
         vi_map, context.map_key, options,
-        only_layers=("trajectories", "vertices", "loop_closures", ACCEPTED),
+        only_layers=("trajectories", "vertices", "loop_closures", LOOP_CLOSURES, ACCEPTED),
     )  # fmt: skip
     return show(context, subject, viewer)
 

@@ -11,9 +11,16 @@ import pytest
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibration_export import exported
-from maplab_py.interop.recordings.calibration import read_calibration, read_folder_calibration
+from maplab_py.interop.calibration_import import import_calibration
+from maplab_py.interop.recordings.calibration import (
+    device_of,
+    read_calibration,
+    read_folder_calibration,
+)
 from maplab_py.interop.recordings.kalibr import upper_triangular_and_rotation
 from maplab_py.interop.recordings.models import make_device
+from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.options import DeviceOptions, SourceOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.sensors import Camera, Distortion, Imu, ImuIntrinsics, Projection
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
@@ -173,8 +180,53 @@ def test_sensors_yaml(tmp_path: Path) -> None:
     twice["f" * 32] = dataclasses.replace(twice[device.imu_id], id="f" * 32)
     text = write_sensors(dataclasses.replace(device.sensors, sensors=twice))
     (tmp_path / "two.yaml").write_text(text)
-    with pytest.raises(UserError, match="has 1 camera rigs and 2 IMUs: leave one of each"):
+    with pytest.raises(UserError, match="choose one by --selected_imu_sensor_id=ID"):
         read_calibration(tmp_path / "two.yaml")
+
+
+def test_of_several_rigs_and_imus_the_chosen_ones_are_used(tmp_path: Path) -> None:
+    folder = write_folder(make_content(frames=1), tmp_path / "room")
+    device = read_folder_calibration(folder / "mav0")
+    sensors, mounts = dict(device.sensors.sensors), dict(device.sensors.extrinsics)
+    for old, new in ((device.imu_id, "f" * 32), (device.rig_id, "fe" * 16)):
+        sensors[new] = dataclasses.replace(sensors[old], id=new)
+        mounts[new] = mounts[old]
+    several = dataclasses.replace(device.sensors, sensors=sensors, extrinsics=mounts)
+
+    def chosen(ncamera: str, imu: str) -> RecordedSensors:
+        return device_of(several, "two.yaml", DeviceOptions(ncamera, imu))
+
+    both = chosen("FE", "ff")
+    assert (both.rig_id, both.imu_id) == ("fe" * 16, "f" * 32)
+    first = chosen(device.rig_id, device.imu_id)
+    assert (first.rig_id, first.imu_id) == (device.rig_id, device.imu_id)
+    np.testing.assert_allclose(first.T_I_C, device.T_I_C, atol=1e-15)
+    for ncamera, imu, message in (
+        ("", "ff", f"two.yaml: camera rigs are {device.rig_id}, .*: choose one by --selected_nc"),
+        ("fe", "", "two.yaml: IMUs are .*: choose one by --selected_imu_sensor_id=ID"),
+        ("fe", "123z", "--selected_imu_sensor_id=123z: two.yaml: IMUs are .*, and none of them"),
+        ("fe", device.rig_id, "and none of them begins so"),
+    ):
+        with pytest.raises(UserError, match=message):
+            chosen(ncamera, imu)
+    cameras_alone = dataclasses.replace(
+        device.sensors, sensors={device.rig_id: sensors[device.rig_id]}
+    )
+    assert device_of(cameras_alone, "a").imu_id == ""
+    with pytest.raises(UserError, match="IMUs are none, and none of them begins so"):
+        device_of(cameras_alone, "a", DeviceOptions(imu_sensor_id="f"))
+    imu_alone = dataclasses.replace(device.sensors, sensors={device.imu_id: sensors[device.imu_id]})
+    with pytest.raises(UserError, match="a has no camera rig: give a calibration with cameras"):
+        device_of(imu_alone, "a")
+
+
+def test_sensors_are_chosen_of_a_sensors_yaml_only(tmp_path: Path) -> None:
+    folder = write_folder(make_content(frames=1), tmp_path / "room")
+    chosen = DeviceOptions(imu_sensor_id="ab")
+    with pytest.raises(UserError, match=r"_imu_sensor_id=ab needs a sensors\.yaml: give"):
+        open_recording(folder, SourceOptions(device=chosen))
+    with pytest.raises(UserError, match=r"needs a sensors\.yaml: .*mav0 is none"):
+        import_calibration(folder / "mav0", chosen=chosen)
 
 
 def test_tum_vi_folder_with_calibration_beside_it(tmp_path: Path) -> None:
