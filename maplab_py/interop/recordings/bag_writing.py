@@ -11,16 +11,21 @@ from enum import Enum
 from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from maplab_py.array_types import I64
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.output_files import check_writable, write_bytes
+from maplab_py.progress import Progress
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
 
 _CHUNK_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
+_PROGRESS_EVERY = 200
 
 
 class BagFormat(Enum):
@@ -94,6 +99,37 @@ def messages_of_topic(
 ) -> Iterator[BagMessage]:
     """Yield serialised standard messages of a topic, each arriving at its time (N,)."""
     return map(BagMessage, times_ns.tolist(), repeat(Channel(topic, kind)), rows)
+
+
+def messages_of_bag(reader: AnyReader, *, without: Sequence[str] = ()) -> Iterator[BagMessage]:
+    """Yield the messages of a bag as they are, but for some topics, in the order of arrival."""
+    connections = [c for c in reader.connections if c.topic not in without]
+    channels = {id(connection): channel_of(connection) for connection in connections}
+    if connections:  # the library takes none for all
+        for connection, time_ns, data in reader.messages(connections):
+            yield BagMessage(time_ns, channels[id(connection)], data)
+
+
+def channel_of(connection: Any) -> Channel:
+    """Return topic, type and definition of a connection of the library."""
+    ext = connection.ext
+    return Channel(
+        connection.topic,
+        connection.msgtype,
+        connection.msgdef.data,
+        connection.digest if connection.msgdef.data else "",
+        tuple(getattr(ext, "offered_qos_profiles", ())),
+        getattr(ext, "callerid", None),
+        getattr(ext, "latching", None),
+    )
+
+
+def watched(messages: Iterable[BagMessage], total: int, progress: Progress) -> Iterator[BagMessage]:
+    """Yield messages, and tell how many of a total are done."""
+    for done, message in enumerate(messages):
+        if done % _PROGRESS_EVERY == 0:
+            progress.step(min(done, total), total, "messages")
+        yield message
 
 
 def in_order(*streams: Iterable[BagMessage]) -> Iterator[BagMessage]:
