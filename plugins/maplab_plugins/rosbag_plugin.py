@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.interop.bags.exporting import BagExportOptions
-from maplab_py.interop.bags.poses import PoseToBagOptions
+from maplab_py.interop.bags.options import BagExportOptions, BagImportOptions, PoseToBagOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
     from maplab_py.interop.bags.listing import BagInfo
-    from maplab_py.interop.bags.reports import BagReport
+    from maplab_py.interop.bags.reports import BagImport, BagReport
 
-_POSES, _EXPORT = PoseToBagOptions(), BagExportOptions()
+_POSES, _EXPORT, _IMPORT = PoseToBagOptions(), BagExportOptions(), BagImportOptions()
 
 
 @command(
@@ -108,6 +107,42 @@ def bag_info(context: CommandContext, bag: Path) -> BagInfo:
     from maplab_py.interop.bags.listing import bag_info as read
 
     return read(bag, progress=context.progress)
+
+
+@command(
+    "import_bag_resources",
+    example="import_bag_resources images_of_v1_01.bag --resource_topic=/cam0/image_raw --camera=0 "
+    "--map_mission=59f0",
+    see_also=("bag_info", "import_images", "import_depth_maps", "import_point_clouds"),
+)
+def import_bag_resources(
+    context: CommandContext,
+    rosbag_path: Path,
+    *,
+    map_mission: str = "",
+    options: BagImportOptions = _IMPORT,
+) -> BagImport:
+    """Attach images, depth images or point clouds of a topic to frames or a sensor of a mission.
+
+    Image and frame belong together if each is the nearest of the other in time. Frames that have an image
+    keep it. Depth images are in millimetres (16UC1, compressedDepth) or metres (32FC1). The files are
+    written into the map when it is saved.
+
+    Args:
+        rosbag_path: ROS 1 bag, or file or folder of a ROS 2 bag.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+    """
+    from maplab_py.interop.bags.importing import import_bag_resources as attach
+
+    vi_map, report = attach(
+        context.vi_map,
+        context.mission_row(map_mission),
+        rosbag_path,
+        options,
+        progress=context.progress,
+    )
+    context.commit(vi_map)
+    return report
 
 
 def _given(path: Path | None, flag: str) -> Path:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
+from maplab_py.interop.bags.options import BagExportOptions
 from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
 from maplab_py.interop.bags.reports import BagReport, written_topics
 from maplab_py.interop.bags.sensor_messages import (
@@ -39,7 +39,6 @@ from maplab_py.interop.recordings.bag_writing import (
     write_bag,
 )
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
-from maplab_py.options import option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
@@ -47,43 +46,8 @@ from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_labels, mission_sensor_id
 from maplab_py.vimap.resource_queries import resources_of
 
-CONTENTS = ("poses", "odometry", "tf", "imu", "images", "depth", "clouds")
 _IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BagExportOptions:
-    """What is written, and in which format."""
-
-    flag_prefix: ClassVar[str] = "bag_"
-
-    format: str = option(
-        "",
-        help="ROS 1, or ROS 2 with sqlite3 or mcap; empty = ROS 1 for files .bag, else mcap",
-        choices=("", *(kind.value for kind in BagFormat)),
-    )
-    content: str = option(
-        ",".join(CONTENTS), help="What is written, separated by commas, where the map has it"
-    )
-    world_frame: str = option("map", help="Name of the global frame G")
-    odom_frame: str = option("mission", help="Name of the frame M of the mission")
-    base_frame: str = option("imu", help="Name of the body frame I")
-
-    @property
-    def contents(self) -> tuple[str, ...]:
-        """The parts that are written.
-
-        Raises:
-            FlagError: A part is unknown.
-        """
-        words = tuple(word.strip() for word in self.content.split(",") if word.strip())
-        unknown = [word for word in words if word not in CONTENTS]
-        if unknown or not words:
-            raise FlagError(
-                f"--bag_content={self.content}: wants some of {', '.join(CONTENTS)}, separated by commas"
-            )
-        return words
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

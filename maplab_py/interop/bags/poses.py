@@ -6,13 +6,13 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.bags.options import PoseToBagOptions
 from maplab_py.interop.bags.reports import BagReport, written_topics
 from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
 from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages
@@ -30,7 +30,6 @@ from maplab_py.interop.recordings.bag_writing import (
     write_bag,
 )
 from maplab_py.interop.vertex_states import poses_at
-from maplab_py.options import option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
@@ -38,30 +37,6 @@ from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
 TF_TOPIC, TF_TYPE = "/tf", "tf2_msgs/msg/TFMessage"
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
 _S_TO_NS = 1e9
-
-
-@dataclasses.dataclass(frozen=True)
-class PoseToBagOptions:
-    """Which poses are added to a bag, and what their frames are called."""
-
-    flag_prefix: ClassVar[str] = "rosbag_plugin_pose_to_bag_"
-
-    world_frame: str = option("map", help="Name of the global frame G")
-    odom_frame: str = option("mission", help="Name of the frame M of the mission")
-    base_frame: str = option("imu", help="Name of the body frame I")
-    add_tf: bool = option(True, help="Add the poses to /tf")
-    add_transform_stamped: bool = option(
-        True, help="Add the poses as the topics T_G_I, T_M_I and T_G_M"
-    )
-    interpolate_to_frequency_hz: float = option(
-        100.0, help="Rate of the poses between vertices, if higher than theirs", unit="Hz"
-    )
-    drop_tf: bool = option(False, help="Leave /tf of the input out")
-
-    def __post_init__(self) -> None:
-        """Check the rate."""
-        if not 0.0 < self.interpolate_to_frequency_hz <= _S_TO_NS:
-            raise ValueError("interpolate_to_frequency_hz must be positive and at most 1e9")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

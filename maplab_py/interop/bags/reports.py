@@ -33,3 +33,20 @@ class BagReport(Report):
 def written_topics(counts: Mapping[str, int]) -> tuple[WrittenTopic, ...]:
     """Return the topics with their numbers of messages, by name."""
     return tuple(WrittenTopic(topic, count) for topic, count in sorted(counts.items()))
+
+
+@dataclasses.dataclass(frozen=True)
+class BagImport(Report):
+    """Messages that became resources of a mission; their files are written when the map is saved."""
+
+    mission: str
+    topic: str
+    type: str
+    messages: int
+    resource_types: tuple[str, ...]
+    attached: int
+    had_some: int  # frames that had such a resource, or times of clouds
+    frames_without_message: int = 0
+    messages_outside_mission: int = 0
+    camera: int | None = None
+    calibration_difference_px: float | None = None

@@ -9,8 +9,9 @@ import pytest
 
 from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.errors import Cancelled, FlagError, MapError, UserError
-from maplab_py.interop.bags.exporting import BagExportOptions, export_bag
+from maplab_py.interop.bags.exporting import export_bag
 from maplab_py.interop.bags.listing import bag_info
+from maplab_py.interop.bags.options import BagExportOptions
 from maplab_py.interop.bags.sensor_messages import cloud_of
 from maplab_py.interop.recordings.bag_writing import BagFormat
 from maplab_py.interop.recordings.map_replay import mission_sample_rows

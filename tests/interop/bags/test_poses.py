@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.bags.poses import PoseToBagOptions, add_poses_to_bag, pose_times
+from maplab_py.interop.bags.options import PoseToBagOptions
+from maplab_py.interop.bags.poses import add_poses_to_bag, pose_times
 from maplab_py.interop.recordings.bag_files import opened_bag
 from maplab_py.interop.recordings.bag_layouts import pose_messages
 from maplab_py.interop.recordings.bag_writing import (
