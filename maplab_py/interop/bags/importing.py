@@ -17,6 +17,7 @@ from maplab_py.interop.bags.reports import BagImport
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.ply import encode_ply
 from maplab_py.interop.recordings.bag_files import (
+    all_messages,
     check_bag,
     header_stamp_ns,
     listed_topics,
@@ -44,7 +45,7 @@ from maplab_py.vimap.ids import from_hex
 from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from maplab_py.interop.recordings.bag_files import BagReader
 
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _COMPRESSED_DEPTH_HEADER = 12
@@ -58,7 +59,7 @@ class _Topic:
     """An open topic."""
 
     path: Path
-    reader: AnyReader
+    reader: BagReader
     topic: str
     type: str
     stamps_ns: I64  # (N,) as recorded, increasing
@@ -73,7 +74,7 @@ class _Topic:
         if not len(numbers):
             return
         wanted, last = set(numbers.tolist()), int(numbers[-1])
-        for number, (type_, data) in enumerate(_messages(self.reader, self.topic)):
+        for number, (type_, data) in enumerate(_messages(self.path, self.reader, self.topic)):
             if number in wanted:
                 yield number, self.reader.deserialize(data, type_)
             if number == last:
@@ -117,10 +118,12 @@ def import_bag_resources(
         return _import_images(vi_map, mission, topic, options, progress)
 
 
-def _opened_topic(path: Path, reader: AnyReader, asked: str) -> _Topic:
+def _opened_topic(path: Path, reader: BagReader, asked: str) -> _Topic:
     types = topic_types(reader)
     topic = _name_in_bag(path, types, asked, "--resource_topic", (IMAGE, COMPRESSED, CLOUD))
-    stamps = [header_stamp_ns(data, is_ros_2=reader.is2) for _, data in _messages(reader, topic)]
+    stamps = [
+        header_stamp_ns(data, is_ros_2=reader.is2) for _, data in _messages(path, reader, topic)
+    ]
     stamps_ns = np.array(stamps, dtype=np.int64)
     if not len(stamps_ns):
         raise MapError(f"{path}: {topic} has no messages: give another --resource_topic")
@@ -154,9 +157,9 @@ def _name_in_bag(
     return topic
 
 
-def _messages(reader: AnyReader, topic: str) -> Iterator[tuple[str, bytes]]:
+def _messages(path: Path, reader: BagReader, topic: str) -> Iterator[tuple[str, bytes]]:
     connections = [c for c in reader.connections if c.topic == topic]
-    for connection, _, data in reader.messages(connections):
+    for connection, _, data in all_messages(path, reader, connections):
         yield connection.msgtype, data
 
 
@@ -230,7 +233,7 @@ def _calibration_difference(
         return None
     types = topic_types(topic.reader)
     name = _name_in_bag(topic.path, types, asked, flag, (CAMERA_INFO,))
-    for type_, data in _messages(topic.reader, name):
+    for type_, data in _messages(topic.path, topic.reader, name):
         message = topic.reader.deserialize(data, type_)
         full_name = f"{topic.path}: {name}"
         return check_camera_info(message, full_name, camera, options.calibration_tolerance_px)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
+from maplab_py.interop.recordings.bag_files import all_messages, check_bag, opened_bag
 from maplab_py.interop.recordings.bag_writing import format_of_bag
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -65,7 +65,8 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
         for connection in reader.connections:
             topics[connection.topic, connection.msgtype] = _Times(connection.msgtype)
         total = reader.message_count
-        for done, (connection, time_ns, _) in enumerate(reader.messages()):
+        messages = all_messages(path, reader, list(reader.connections))
+        for done, (connection, time_ns, _) in enumerate(messages):
             if done % _PROGRESS_EVERY == 0:
                 progress.step(done, total, "messages")
             topics[connection.topic, connection.msgtype].add(time_ns)

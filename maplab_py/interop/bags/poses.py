@@ -105,7 +105,7 @@ def add_poses_to_bag(
             kind,
             watched(
                 in_order(
-                    _counted(messages_of_bag(reader, without=dropped), copied),
+                    _counted(messages_of_bag(source, reader, without=dropped), copied),
                     *(stream for streams in added for stream in streams),
                 ),
                 total,

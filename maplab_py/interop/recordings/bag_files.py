@@ -6,7 +6,7 @@ import contextlib
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
 
@@ -14,10 +14,13 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
+    BagReader = AnyReader
+
 _REMEDY = "copy the bag again, or repair it with `rosbag reindex` or `ros2 bag reindex`"
 _S_TO_NS = 1_000_000_000
 _IMU_NUMBERS, _GYRO, _ACCEL = 37, slice(13, 16), slice(25, 28)
 """Numbers behind the header of sensor_msgs/Imu, and which of them are the measurements."""
+_SQLITE, _SQLITE_HEADER = b"SQLite format 3\x00", 100
 
 
 def is_bag(path: Path) -> bool:
@@ -75,6 +78,7 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
         raise _library_missing(str(path)) from error
     try:
         # files of ROS 2 before Iron hold no definitions of their messages
+        _check_databases(path)
         with AnyReader([path], default_typestore=message_types(is_ros_2=True)) as reader:
             yield reader
     except MaplabError:
@@ -87,6 +91,23 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MapError(f"{path}: the bag cannot be read ({reason}): {_REMEDY}") from error
+
+
+def all_messages(
+    path: Path, reader: BagReader, connections: list[Any]
+) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield connection, time of arrival and data of the messages of some connections.
+
+    Raises:
+        MapError: There are fewer messages than the bag's index says, or more.
+    """
+    expected, count = sum(connection.msgcount for connection in connections), 0
+    if connections:  # the library takes none for all
+        for message in reader.messages(connections):
+            count += 1
+            yield message
+    if count != expected:
+        raise MapError(f"{path}: {count} messages can be read, the index has {expected}: {_REMEDY}")
 
 
 def header_stamp_ns(data: bytes, *, is_ros_2: bool) -> int:
@@ -125,6 +146,34 @@ def topic_types(reader: AnyReader) -> dict[str, str]:
 def listed_topics(types: dict[str, str]) -> str:
     """Return topics and types in one line."""
     return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())) or "none"
+
+
+def _check_databases(path: Path) -> None:
+    """Refuse truncated databases; where their end is missing, SQLite reads zeros.
+
+    Source: "Database File Format", section 1.3, sqlite.org.
+
+    Raises:
+        MapError: A file is shorter than its header says.
+    """
+    files = sorted(path.glob("*.db3")) if path.is_dir() else [path]
+    for file in files:
+        with file.open("rb") as stream:
+            header = stream.read(_SQLITE_HEADER)
+        if len(header) < _SQLITE_HEADER or not header.startswith(_SQLITE):
+            continue  # no database: the library knows what it is
+        page_bytes, pages = struct.unpack_from(">H", header, 16)[0], _number(header, 28)
+        page_bytes = 65536 if page_bytes == 1 else page_bytes
+        is_counted = _number(header, 24) == _number(header, 92)
+        if is_counted and file.stat().st_size < page_bytes * pages:
+            raise MapError(
+                f"{path}: the bag cannot be read ({file.name} has {file.stat().st_size:,} of "
+                f"{page_bytes * pages:,} bytes): {_REMEDY}"
+            )
+
+
+def _number(data: bytes, offset: int) -> int:
+    return int(struct.unpack_from(">I", data, offset)[0])
 
 
 def _library_missing(name: str) -> UserError:

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from maplab_py.array_types import I64
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.bag_files import all_messages, message_types
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.progress import Progress
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from maplab_py.interop.recordings.bag_files import BagReader
 
 _CHUNK_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
@@ -101,13 +101,18 @@ def messages_of_topic(
     return map(BagMessage, times_ns.tolist(), repeat(Channel(topic, kind)), rows)
 
 
-def messages_of_bag(reader: AnyReader, *, without: Sequence[str] = ()) -> Iterator[BagMessage]:
-    """Yield the messages of a bag as they are, but for some topics, in the order of arrival."""
+def messages_of_bag(
+    path: Path, reader: BagReader, *, without: Sequence[str] = ()
+) -> Iterator[BagMessage]:
+    """Yield the messages of a bag as they are, but for some topics, in the order of arrival.
+
+    Raises:
+        MapError: There are not as many messages as the bag's index says.
+    """
     connections = [c for c in reader.connections if c.topic not in without]
     channels = {id(connection): channel_of(connection) for connection in connections}
-    if connections:  # the library takes none for all
-        for connection, time_ns, data in reader.messages(connections):
-            yield BagMessage(time_ns, channels[id(connection)], data)
+    for connection, time_ns, data in all_messages(path, reader, connections):
+        yield BagMessage(time_ns, channels[id(connection)], data)
 
 
 def channel_of(connection: Any) -> Channel:
