@@ -17,6 +17,7 @@ from maplab_py.interop.bags.sensor_messages import (
     CAMERA_INFO,
     CLOUD,
     IMAGE,
+    PATH,
     MessageMaker,
     has_camera_info,
 )
@@ -94,6 +95,7 @@ def export_bag(
     export = _Export(vi_map, map_folder, mission, kind, options)
     parts: dict[str, Callable[[], list[_Stream]]] = {
         "poses": export.poses,
+        "path": export.path,
         "odometry": export.odometry,
         "tf": export.tf,
         "imu": export.imu,
@@ -156,6 +158,14 @@ class _Export:
             is_ros_2=self._is_ros_2,
         )
         return [self._fixed("/pose", "geometry_msgs/msg/PoseStamped", self._times_ns, rows)]
+
+    def path(self) -> list[_Stream]:
+        """All poses T_G_I in a message, at the last time."""
+        if not len(self._times_ns):
+            return []
+        T_G_I = self._map.T_G_I[self._vertices]
+        row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
+        return [self._fixed("/path", PATH, self._times_ns[-1:], [row])]
 
     def odometry(self) -> list[_Stream]:
         """Poses T_M_I with velocities."""

@@ -8,7 +8,7 @@ from typing import ClassVar
 from maplab_py.errors import FlagError
 from maplab_py.options import option
 
-CONTENTS = ("poses", "odometry", "tf", "imu", "images", "depth", "clouds")
+CONTENTS = ("poses", "path", "odometry", "tf", "imu", "images", "depth", "clouds")
 FORMATS = ("ros1", "sqlite3", "mcap")
 _HIGHEST_RATE_HZ = 1e9
 

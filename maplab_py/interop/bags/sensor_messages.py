@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings.bag_files import message_types
@@ -14,6 +15,7 @@ from maplab_py.sensors import Camera, Distortion, Projection
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+PATH = "nav_msgs/msg/Path"
 _S_TO_NS = 1_000_000_000
 _ENCODINGS = {("uint8", 2): "mono8", ("uint8", 3): "bgr8", ("uint16", 2): "16UC1"}
 _DISTORTIONS = {
@@ -36,6 +38,8 @@ _POINT_TYPES = {
 """numpy's names of the data types of sensor_msgs/PointField."""
 _INTENSITIES = ("intensity", "intensities", "i", "reflectivity")
 _MAX_POINTS = 50_000_000
+_FARTHEST_MEDIAN_M = 1000.0
+"""Distances whose median is larger are in millimetres."""
 
 
 class MessageMaker:
@@ -57,6 +61,19 @@ class MessageMaker:
         header = self._header(stamp_ns, frame)
         step = len(data) // height
         return self._bytes(IMAGE, header, height, width, encoding, 0, step, data)
+
+    def path(self, times_ns: I64, T_A_B: F64, frame: str) -> bytes:
+        """Return a nav_msgs/Path of poses T_A_B (N, 7), N > 0; the frame is A, the stamp the last time."""
+        types = self._store.types
+        point, quaternion, pose, stamped = (
+            types[f"geometry_msgs/msg/{name}"]
+            for name in ("Point", "Quaternion", "Pose", "PoseStamped")
+        )
+        poses = [
+            stamped(self._header(time_ns, frame), pose(point(*T[4:]), quaternion(*T[:4])))
+            for time_ns, T in zip(times_ns.tolist(), T_A_B.tolist(), strict=True)
+        ]
+        return self._bytes(PATH, self._header(int(times_ns[-1]), frame), poses)
 
     def camera_info(self, stamp_ns: int, frame: str, camera: Camera) -> bytes:
         """Return the CameraInfo of a pinhole camera; see `has_camera_info`."""
@@ -171,6 +188,11 @@ def cloud_of(message: Any, name: str) -> PlyCloud:
     valid: NDArray[np.bool_] = np.all(np.isfinite(p), axis=1)
     if not valid.any():
         raise MapError(f"{name}: the cloud is empty: leave its time out, or record it again")
+    if float(np.median(np.linalg.norm(p[valid], axis=1))) > _FARTHEST_MEDIAN_M:
+        raise MapError(
+            f"{name}: half of the points are beyond {_FARTHEST_MEDIAN_M:g} m: coordinates are in "
+            "metres; record them so"
+        )
     return PlyCloud(p[valid], _colours(table, valid), _intensity(table, valid))
 
 

@@ -88,7 +88,7 @@ def format_of_path(path: Path, name: str = "") -> BagFormat:
 def format_of_bag(path: Path) -> BagFormat:
     """Return the format of a bag that exists; it is told by its suffix, or those of its files."""
     if path.is_dir():
-        has_mcap = any(file.suffix == ".mcap" for file in path.iterdir())
+        has_mcap = any(".mcap" in file.suffixes for file in path.iterdir())
         return BagFormat.MCAP if has_mcap else BagFormat.SQLITE3
     suffixes = {".bag": BagFormat.ROS1, ".mcap": BagFormat.MCAP}
     return suffixes.get(path.suffix, BagFormat.SQLITE3)

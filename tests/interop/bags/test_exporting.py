@@ -63,6 +63,7 @@ def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
     topics = messages_of(path)
     assert {topic: len(messages) for topic, messages in topics.items()} == {
         "/pose": VERTICES,
+        "/path": 1,
         "/odometry": VERTICES,
         "/tf": VERTICES,
         "/imu0": len(mission_sample_rows(vi_map, 0)),
@@ -73,6 +74,10 @@ def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
     }
     pose = topics["/pose"][2][1].pose
     assert [pose.position.x, pose.orientation.z] == vi_map.T_G_I[2, [4, 2]].tolist()
+    time_ns, path_message = topics["/path"][0]
+    assert time_ns == vi_map.vertices.timestamp_ns[VERTICES - 1]
+    positions = [[p.x, p.y, p.z] for p in (entry.pose.position for entry in path_message.poses)]
+    np.testing.assert_array_equal(positions, vi_map.T_G_I[:VERTICES, 4:])
     tree = topics["/tf"][0][1].transforms
     assert [t.child_frame_id for t in tree] == ["mission", "imu", "cam0"]
     info = topics["/cam0/camera_info"][0][1]

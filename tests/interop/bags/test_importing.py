@@ -242,6 +242,8 @@ def test_damaged_messages_are_refused(tmp_path: Path) -> None:
     cut = [bytes(store.serialize_ros1(message, COMPRESSED))]
     refused("truncated", "png.bag", COMPRESSED, stamps[:1], cut)
     inside = stamps[0] + OFFSET_NS + 10
+    far = ROS1.cloud(inside, "lidar", PlyCloud(2500.0 * np.eye(3)))
+    refused("coordinates are in metres", "far.bag", CLOUD, stamps[:1], [far])
     cloud = ROS1.cloud(inside, "lidar", PlyCloud(np.eye(3)))
     broken = [cloud.replace(b"x\x00\x00\x00\x00\x07", b"q\x00\x00\x00\x00\x07")]
     refused("has no x, y, z", "cloud.bag", CLOUD, stamps[:1], broken)

@@ -18,6 +18,7 @@ from maplab_py.interop.recordings.bag_files import opened_bag
 from maplab_py.interop.recordings.bag_layouts import pose_messages
 from maplab_py.interop.recordings.bag_writing import (
     BagFormat,
+    bag_files,
     messages_of_topic,
 )
 from maplab_py.interop.recordings.bag_writing import write_bag as write_messages_as_bag
@@ -129,6 +130,14 @@ def test_a_bag_with_poses_gets_further_ones_or_loses_them(tmp_path: Path, kind: 
     options = PoseToBagOptions(add_tf=False, add_transform_stamped=False, drop_tf=True)
     add_poses_to_bag(vi_map, once, dropped, options, missions=FIRST)
     assert set(messages_of(once)) - set(messages_of(dropped)) == {"/tf"}
+
+
+@pytest.mark.parametrize("kind", [BagFormat.SQLITE3, BagFormat.MCAP])
+def test_a_single_file_of_a_ros_2_bag(tmp_path: Path, kind: BagFormat) -> None:
+    (file, _) = bag_files(recorded(tmp_path, kind), kind)
+    report = add_poses_to_bag(make_map(), file, tmp_path / "out", VERTEX_RATE, missions=FIRST)
+    assert report.format == kind.value
+    assert len(messages_of(tmp_path / "out")["/T_G_I"]) == VERTICES
 
 
 def test_wrong_bags_are_refused(tmp_path: Path) -> None:
