@@ -70,7 +70,8 @@ def export_bag(
     """Write a mission as a ROS bag: poses, tf, IMU samples, images, depth maps, clouds.
 
     Images, depth maps and clouds are the resources of the map. Topics are those of the sensors, else /imu0,
-    /cam0/image_raw, /points0, ...; rovioli reads the bag with the sensors.yaml of the map.
+    /cam0/image_raw, /points0, ...; rovioli reads the bag with the sensors.yaml of the map, and with
+    --imu_topic and --camera_topics where it has no topics.
 
     Args:
         bag: File .bag of ROS 1, or folder of a ROS 2 bag.
