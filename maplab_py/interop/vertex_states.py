@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.geometry.interpolation import interpolate_vectors, slerp
+from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vectors, slerp
 from maplab_py.interop.text_table import format_rows
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.output_files import write_text
@@ -80,6 +80,26 @@ def vertex_states(
     return VertexStates(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
     )
+
+
+def poses_at(vi_map: VIMap, mission: int, times_ns: I64) -> F64:
+    """Return the poses T_M_I (N, 7) of a mission (row) between its first and its last vertex.
+
+    With an IMU the position is cubic (which uses the velocities), else linear; the rotation is along
+    the great arc. Times outside get the pose of the nearer end.
+    """
+    rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
+    states = _mission_vertices(vi_map, rows)
+    stamps = states.times_ns
+    if len(stamps) < 2 or not vi_map.missions.sensor_id[mission, MissionSensor.IMU].any():
+        return interpolate_poses(stamps, states.T_M_S, times_ns)[0]
+    inside = np.clip(times_ns, stamps[0], stamps[-1])
+    before = np.clip(np.searchsorted(stamps, inside, side="right") - 1, 0, len(stamps) - 2)
+    T_M_I = _between(states, before, inside)
+    vertex = np.searchsorted(stamps, inside)
+    at_vertex = stamps[vertex] == inside
+    T_M_I[at_vertex] = states.T_M_S[vertex[at_vertex]]  # to the last bit
+    return T_M_I
 
 
 def write_asl(vi_map: VIMap, states: VertexStates, path: Path, *, overwrite: bool = False) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
 from maplab_py.interop.ply import PlyCloud, write_ply
+from maplab_py.interop.recordings.bag_writing import BagFormat, BagMessage, Channel, write_bag
 from maplab_py.interop.resources.matching import camera_frames, mission_rig
 from maplab_py.storage.native import save_map
 from maplab_py.storage.resource_types import RESOURCE_TYPES
@@ -77,4 +79,13 @@ def write_stamped_files(vi_map: VIMap, folder: Path) -> None:
         depth = np.full(size, 2500, dtype=np.uint16)
         cv2.imwrite(str(folder / "depth_of_v1_01" / f"{stamp}.png"), depth)
         write_ply(PlyCloud(np.eye(3)), folder / "clouds_of_v1_01" / f"{stamp}.ply")
+    _write_bag(stamps, size, folder / "images_of_v1_01.bag")
     (images / "data.csv").write_text("".join(f"{stamp},{stamp}.png\n" for stamp in stamps))
+
+
+def _write_bag(stamps: list[int], size: tuple[int, int], path: Path) -> None:
+    """Write images as a ROS 1 bag."""
+    maker, channel = MessageMaker(is_ros_2=False), Channel("/cam0/image_raw", IMAGE)
+    pixels = np.full(size, 80, dtype=np.uint8)
+    messages = (BagMessage(t, channel, maker.image(t, "cam0", pixels)) for t in stamps)
+    write_bag(path, BagFormat.ROS1, messages)

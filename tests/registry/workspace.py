@@ -27,7 +27,7 @@ from maplab_py.simulation.scenario import (
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.frontend.simulated import REST_FIRST, replayed
-from tests.interop.recordings.written import make_content, write_folder
+from tests.interop.recordings.written import make_content, write_bag, write_folder
 from tests.registry.resources import save_with_resources, write_stamped_files
 from tests.simulation.small import simulated
 from tests.support.stereo_room import StereoRoom, quarter_size
@@ -174,6 +174,7 @@ def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
     StereoRoom.simulated(folder / "stereo_room", quarter_size(frame_rate_hz=2.0))
     _write_scanned_map(folder / "lidar")
     write_folder(make_content(), folder / "MH_01_easy")
+    write_bag(make_content(), folder / "walk.bag")
     save_map(replayed(REST_FIRST, 1)[0], folder / "walk")  # a recording to replay
     with Session() as session:
         session.run("load", map_folder=folder / "maps" / "v1_01")

@@ -6,7 +6,6 @@ headers' stamps, as messages of one topic are. So some seconds of messages are k
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import heapq
 import itertools
@@ -17,7 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings.bag_files import (
+    header_stamp_ns,
+    imu_sample,
+    listed_topics,
+    opened_bag,
+    topic_types,
+)
 from maplab_py.interop.recordings.images import EncodedImage, RawImage
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
@@ -37,14 +43,6 @@ _LARGEST_BATCH = 200
 _DELAY_MARGIN_NS = 1_000_000_000
 """How much the delay between stamp and arrival may vary beyond that of the first messages."""
 _SEEK_MARGIN_NS = 5_000_000_000
-_REMEDY = "copy the bag again, or repair it with `rosbag reindex` or `ros2 bag reindex`"
-
-
-def is_bag(path: Path) -> bool:
-    """Tell whether a path is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    return path.suffix in (".bag", ".db3", ".mcap")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +93,7 @@ class BagRecording:
             streams.insert(0, _Stream(imu_topic or device.imu.topic, _IMU))
         elif imu_topic:
             raise UserError(f"--imu_topic={imu_topic}: the calibration has no IMU")
-        with self._opened() as reader:
+        with opened_bag(self._path) as reader:
             self.kind = f"ROS {2 if reader.is2 else 1} bag"
             self._streams = [self._examined(reader, stream) for stream in streams]
         if len({stream.topic for stream in self._streams}) < len(self._streams):
@@ -110,11 +108,11 @@ class BagRecording:
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
         times_ns: list[int] = []
-        samples: list[list[float]] = []
+        samples: list[tuple[float, ...]] = []
         for time_ns, stream, message in self._in_order(start_ns, end_ns):
             if stream.camera == _IMU:
                 times_ns.append(time_ns)
-                samples.append(_sample(message))
+                samples.append(message)
             if times_ns and (stream.camera != _IMU or len(times_ns) == _LARGEST_BATCH):
                 yield self._batch(times_ns, samples)
                 times_ns, samples = [], []
@@ -156,12 +154,16 @@ class BagRecording:
         end = None if end_ns is None else end_ns + max(delays_ns) + _SEEK_MARGIN_NS
         streams = {stream.topic: stream for stream in self._streams}
         last_ns = dict.fromkeys(streams, -1)
-        with self._opened() as reader:
+        with opened_bag(self._path) as reader:
             connections = [c for c in reader.connections if c.topic in streams]
             for connection, _, data in reader.messages(connections, begin, end):
                 stream = streams[connection.topic]
-                message = reader.deserialize(data, connection.msgtype)
-                time_ns = _stamp_ns(message) + stream.time_offset_ns
+                time_ns = header_stamp_ns(data, is_ros_2=reader.is2) + stream.time_offset_ns
+                message: Any
+                if stream.camera == _IMU:
+                    message = imu_sample(data, is_ros_2=reader.is2)
+                else:
+                    message = reader.deserialize(data, connection.msgtype)
                 if time_ns <= last_ns[stream.topic]:
                     raise MapError(
                         f"{self._path}: {stream.topic}: the stamp "
@@ -179,8 +181,8 @@ class BagRecording:
         """Return the stream with the bag's name of its topic and the times of its first message."""
         sensor = "IMU" if stream.camera == _IMU else f"camera {stream.camera}"
         flag = "--imu_topic" if stream.camera == _IMU else "--camera_topics"
-        types = {c.topic: c.msgtype for c in reader.connections}
-        present = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())) or "none"
+        types = topic_types(reader)
+        present = listed_topics(types)
         if not stream.topic:
             raise UserError(
                 f"{self._path}: the calibration names no topic of {sensor}: give {flag}; the bag "
@@ -199,14 +201,13 @@ class BagRecording:
                 f"{' or '.join(wanted)}: give {flag}; the bag has {present}"
             )
         connections = [c for c in reader.connections if c.topic == topic]
-        for connection, arrival_ns, data in reader.messages(connections):
-            message = reader.deserialize(data, connection.msgtype)
-            first_ns = _stamp_ns(message) + stream.time_offset_ns
+        for _, arrival_ns, data in reader.messages(connections):
+            first_ns = header_stamp_ns(data, is_ros_2=reader.is2) + stream.time_offset_ns
             delay_ns = arrival_ns - first_ns
             return dataclasses.replace(stream, topic=topic, first_ns=first_ns, delay_ns=delay_ns)
         raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
 
-    def _batch(self, times_ns: list[int], samples: list[list[float]]) -> ImuBatch:
+    def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> ImuBatch:
         assert self.device.imu is not None  # its topic is read
         values: F64 = np.array(samples, dtype=np.float64)
         if not np.isfinite(values).all():
@@ -236,35 +237,3 @@ class BagRecording:
         else:
             data = EncodedImage(name, camera, message.data.tobytes)
         return CameraImage(stream.camera, time_ns, stamp_ns, data)
-
-    @contextlib.contextmanager
-    def _opened(self) -> Iterator[AnyReader]:
-        """Open the bag; whatever its parser says of damage becomes a MapError."""
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise UserError(
-                f"{self._path}: bags are read with the library rosbags: install it with "
-                "`pip install 'maplab-py[bags]'`"
-            ) from error
-        try:
-            # files of ROS 2 before Iron hold no definitions of their messages
-            store = get_typestore(Stores.ROS2_HUMBLE)
-            with AnyReader([self._path], default_typestore=store) as reader:
-                yield reader
-        except MaplabError:
-            raise
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise MapError(f"{self._path}: the bag cannot be read ({reason}): {_REMEDY}") from error
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _sample(message: Any) -> list[float]:
-    a, w = message.linear_acceleration, message.angular_velocity
-    return [a.x, a.y, a.z, w.x, w.y, w.z]

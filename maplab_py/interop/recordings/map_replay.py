@@ -22,6 +22,27 @@ from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import MissionSensor
 
 
+def mission_sample_rows(vi_map: VIMap, mission: int) -> I64:
+    """Return the rows (N,) of the IMU samples of a mission in the order of time, each time once.
+
+    Raises:
+        MapError: The samples run backwards.
+    """
+    edges = np.flatnonzero(vi_map.vertices.mission[vi_map.imu_edges.from_vertex] == mission)
+    edges = edges[np.argsort(vi_map.imu_edges.from_vertex[edges], kind="stable")]
+    rows = ragged_rows(vi_map.sample_start, edges)
+    step_ns = np.diff(vi_map.imu_samples.timestamp_ns[rows])
+    if np.any(step_ns < 0):
+        at = rows[np.flatnonzero(step_ns < 0)[0] + 1]
+        edge = int(np.searchsorted(vi_map.sample_start, at, side="right")) - 1
+        raise MapError(
+            f"mission {to_hex(vi_map.missions.id[mission])}: samples of IMU edge "
+            f"{to_hex(vi_map.imu_edges.id[edge])} run backwards: check_map_consistency tells more"
+        )
+    is_new = np.concatenate([np.ones(min(len(rows), 1), dtype=np.bool_), step_ns > 0])
+    return np.asarray(rows[is_new], dtype=np.int64)
+
+
 class MapRecording:
     """Replays a mission: frame sets are its vertices, IMU samples those of its edges.
 
@@ -50,7 +71,9 @@ class MapRecording:
         imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
         self.device = RecordedSensors(vi_map.sensors, rig_id, imu_id)
         self._times_ns = vi_map.vertices.timestamp_ns[self._vertices]
-        self._samples = self._sample_rows(mission) if imu_id else np.zeros(0, dtype=np.int64)
+        self._samples = (
+            mission_sample_rows(vi_map, mission) if imu_id else np.zeros(0, dtype=np.int64)
+        )
         self._sample_times_ns = vi_map.imu_samples.timestamp_ns[self._samples]
 
     @property
@@ -80,23 +103,6 @@ class MapRecording:
             yield self._frame_set(vertex, time_ns)
         if row < last:
             yield self._batch(row, last)
-
-    def _sample_rows(self, mission: int) -> I64:
-        """Return the rows of the samples of the mission in the order of time, each time once."""
-        vi_map = self._map
-        edges = np.flatnonzero(vi_map.vertices.mission[vi_map.imu_edges.from_vertex] == mission)
-        edges = edges[np.argsort(vi_map.imu_edges.from_vertex[edges], kind="stable")]
-        rows = ragged_rows(vi_map.sample_start, edges)
-        step_ns = np.diff(vi_map.imu_samples.timestamp_ns[rows])
-        if np.any(step_ns < 0):
-            at = rows[np.flatnonzero(step_ns < 0)[0] + 1]
-            edge = int(np.searchsorted(vi_map.sample_start, at, side="right")) - 1
-            raise MapError(
-                f"{self.name}: samples of IMU edge {to_hex(vi_map.imu_edges.id[edge])} run "
-                "backwards: check_map_consistency tells more"
-            )
-        is_new = np.concatenate([np.ones(min(len(rows), 1), dtype=np.bool_), step_ns > 0])
-        return np.asarray(rows[is_new], dtype=np.int64)
 
     def _batch(self, first: int, end: int) -> ImuBatch:
         imu = self.device.imu

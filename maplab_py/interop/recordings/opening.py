@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_py.errors import UserError
-from maplab_py.interop.recordings.bags import BagRecording, is_bag
+from maplab_py.interop.recordings.bag_files import is_bag
+from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.calibration import (
     HOW_TO_CALIBRATE,
     read_calibration,

@@ -94,7 +94,7 @@ def import_images(
         for done, (frame, match) in enumerate(zip(wanted.tolist(), matches.tolist(), strict=True)):
             progress.step(done, len(wanted), f"images of camera {camera}")
             if match >= 0:
-                rows.append(_add_image(new, of_camera[match], link=options.link))
+                rows.append(add_image(new, of_camera[match], link=options.link))
                 owners.append(frame)
     if not rows and not skipped:
         raise UserError(
@@ -109,8 +109,12 @@ def import_images(
     return attached, report
 
 
-def _add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
-    """Add an image of a recording to the new resources; return its row."""
+def add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
+    """Add an image of a recording to the new resources, of 16 bits the upper eight; return its row.
+
+    Raises:
+        MapError: The image is missing, damaged, or of another size than the camera's.
+    """
     pixels = image.decode()
     kind = RAW_GREY if pixels.ndim == 2 else RAW_COLOUR
     if link and isinstance(image.data, EncodedImage):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.array_types import I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.pcd import parse_pcd
@@ -48,7 +49,7 @@ def import_point_clouds(
         UserError: There are no files, no such sensor, or no file is of a time of the mission.
         MapError: A file is damaged or has no points.
     """
-    sensor = _sensor(vi_map, mission, sensor_id)
+    sensor = chosen_sensor(vi_map, mission, sensor_id)
     times, files = stamped_files(folder, (".ply", ".pcd"), "--point_cloud_folder")
     first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
     inside = (times >= first_ns) & (times <= last_ns)
@@ -57,10 +58,7 @@ def import_point_clouds(
             f"--point_cloud_folder={folder}: no stamp is within the mission, which goes from "
             f"{first_ns} to {last_ns} ns"
         )
-    table = vi_map.resources
-    known = (table.owner_kind == ResourceOwner.SENSOR) & np.isin(table.type, (XYZ, XYZRGB, XYZI))
-    known &= np.all(table.sensor_id == from_hex(sensor), axis=1)
-    chosen = np.flatnonzero(inside & ~np.isin(times, table.timestamp_ns[known]))
+    chosen = np.flatnonzero(inside & ~np.isin(times, cloud_times_ns(vi_map, sensor)))
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
     for done, row in enumerate(chosen.tolist()):
         progress.step(done, len(chosen), "point clouds")
@@ -89,6 +87,15 @@ def import_point_clouds(
     )
 
 
+def cloud_times_ns(vi_map: VIMap, sensor_id: str) -> I64:
+    """Return the times (N,) of the clouds that a sensor has."""
+    table = vi_map.resources
+    known = (table.owner_kind == ResourceOwner.SENSOR) & np.isin(table.type, (XYZ, XYZRGB, XYZI))
+    known &= np.all(table.sensor_id == from_hex(sensor_id), axis=1)
+    times_ns: I64 = table.timestamp_ns[known]
+    return times_ns
+
+
 def read_cloud(path: Path) -> PlyCloud:
     """Read a PLY or PCD file.
 
@@ -114,8 +121,12 @@ def cloud_type(cloud: PlyCloud) -> int:
     return XYZI if cloud.intensity is not None else XYZ
 
 
-def _sensor(vi_map: VIMap, mission: int, prefix: str) -> str:
-    """Return the id of the sensor that a prefix names; without a prefix of the mission's lidar."""
+def chosen_sensor(vi_map: VIMap, mission: int, prefix: str) -> str:
+    """Return the id of the sensor that a prefix names; without a prefix of the mission's lidar.
+
+    Raises:
+        UserError: The prefix names none or several, or the mission has no lidar.
+    """
     if not prefix:
         lidar = mission_sensor_id(vi_map, mission, MissionSensor.LIDAR)
         if not lidar:

@@ -1,0 +1,285 @@
+"""A mission of a map as a bag: poses, IMU samples, and the images and clouds among its resources."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import UserError
+from maplab_py.interop.bags.options import BagExportOptions
+from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
+from maplab_py.interop.bags.reports import BagReport, written_topics
+from maplab_py.interop.bags.sensor_messages import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    PATH,
+    MessageMaker,
+    has_camera_info,
+)
+from maplab_py.interop.ply import parse_ply
+from maplab_py.interop.recordings.bag_layouts import (
+    imu_messages,
+    odometry_messages,
+    pose_messages,
+    tf_messages,
+)
+from maplab_py.interop.recordings.bag_writing import (
+    BagFormat,
+    BagMessage,
+    Channel,
+    check_bag_writable,
+    format_of_path,
+    in_order,
+    messages_of_topic,
+    watched,
+    write_bag,
+)
+from maplab_py.interop.recordings.map_replay import mission_sample_rows
+from maplab_py.progress import SILENT, Progress
+from maplab_py.storage.resources import ResourceStore
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.queries import mission_labels, mission_sensor_id
+from maplab_py.vimap.resource_queries import resources_of
+
+_IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
+"""Numbers of the resource types."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Stream:
+    """Messages of a topic in the order of time."""
+
+    topic: str
+    count: int
+    messages: Iterator[BagMessage]
+
+
+def export_bag(
+    vi_map: VIMap,
+    map_folder: Path,
+    mission: int,
+    path: Path,
+    options: BagExportOptions | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> BagReport:
+    """Write a mission as a bag.
+
+    Stamps of images are those of their camera's clock, so that a reader with the same calibration gets
+    the map's times; all others are of the IMU's clock.
+
+    Args:
+        vi_map: Map.
+        map_folder: Folder of the map, where its resources are.
+        mission: Row of the mission.
+        path: File of a ROS 1 bag, or folder of a ROS 2 bag.
+        options: Parts and format.
+        overwrite: Replace a bag that exists.
+        progress: Told of the progress.
+
+    Raises:
+        UserError: The bag cannot be written, or the mission has none of the parts.
+        MapError: A resource is missing or damaged, or IMU samples run backwards.
+    """
+    options = options or BagExportOptions()
+    contents = options.contents
+    kind = format_of_path(path, options.format)
+    check_bag_writable(path, kind, overwrite=overwrite)
+    export = _Export(vi_map, map_folder, mission, kind, options)
+    parts: dict[str, Callable[[], list[_Stream]]] = {
+        "poses": export.poses,
+        "path": export.path,
+        "odometry": export.odometry,
+        "tf": export.tf,
+        "imu": export.imu,
+        "images": lambda: export.images(_IMAGES, "image_raw"),
+        "depth": lambda: export.images(_DEPTH, "depth"),
+        "clouds": export.clouds,
+    }
+    streams = [stream for part in contents for stream in parts[part]() if stream.count]
+    topics = [stream.topic for stream in streams]
+    twice = next((topic for topic in topics if topics.count(topic) > 1), None)
+    if twice is not None:
+        raise UserError(
+            f"two sensors of the mission have the topic {twice}: give them different ones in sensors.yaml"
+        )
+    if not streams:
+        raise UserError(f"the mission has none of {', '.join(contents)}: choose by --bag_content")
+    total = sum(stream.count for stream in streams)
+    messages = watched(in_order(*(stream.messages for stream in streams)), total, progress)
+    counts = write_bag(path, kind, messages, overwrite=overwrite)
+    return BagReport(
+        bag=path,
+        format=kind.value,
+        missions=(mission_labels(vi_map)[mission],),
+        messages=total,
+        copied_messages=0,
+        topics=written_topics(counts),
+        notes=tuple(export.notes),
+    )
+
+
+class _Export:
+    """The parts of a mission as streams of messages."""
+
+    def __init__(
+        self,
+        vi_map: VIMap,
+        map_folder: Path,
+        mission: int,
+        kind: BagFormat,
+        options: BagExportOptions,
+    ) -> None:
+        self._map, self._mission, self._options = vi_map, mission, options
+        self._is_ros_2 = kind.is_ros_2
+        self._store = ResourceStore(vi_map, map_folder)
+        self._maker = MessageMaker(is_ros_2=kind.is_ros_2)
+        start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
+        self._vertices = slice(start, stop)
+        self._times_ns: I64 = vi_map.vertices.timestamp_ns[start:stop]
+        rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+        self._cameras = vi_map.sensors.camera_rig(rig_id).cameras if rig_id else ()
+        self._imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+        self.notes: list[str] = []
+
+    def poses(self) -> list[_Stream]:
+        """Poses T_G_I."""
+        rows = pose_messages(
+            self._times_ns,
+            self._map.T_G_I[self._vertices],
+            self._options.world_frame,
+            is_ros_2=self._is_ros_2,
+        )
+        return [self._fixed("/pose", "geometry_msgs/msg/PoseStamped", self._times_ns, rows)]
+
+    def path(self) -> list[_Stream]:
+        """All poses T_G_I in a message, at the last time."""
+        if not len(self._times_ns):
+            return []
+        T_G_I = self._map.T_G_I[self._vertices]
+        row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
+        return [self._fixed("/path", PATH, self._times_ns[-1:], [row])]
+
+    def odometry(self) -> list[_Stream]:
+        """Poses T_M_I with velocities."""
+        table = self._map.vertices
+        rows = odometry_messages(
+            self._times_ns,
+            table.T_M_I[self._vertices],
+            table.v_M[self._vertices],
+            (self._options.odom_frame, self._options.base_frame),
+            is_ros_2=self._is_ros_2,
+        )
+        return [self._fixed("/odometry", "nav_msgs/msg/Odometry", self._times_ns, rows)]
+
+    def tf(self) -> list[_Stream]:
+        """The tree G, M, I and cameras at the time of each vertex."""
+        names, count = self._options, len(self._times_ns)
+        tree: list[tuple[F64, tuple[str, str]]] = [
+            (
+                _repeated(self._map.T_G_M[self._mission], count),
+                (names.world_frame, names.odom_frame),
+            ),
+            (self._map.vertices.T_M_I[self._vertices], (names.odom_frame, names.base_frame)),
+        ]
+        for camera in range(len(self._cameras)):
+            T_I_C = self._map.sensors.T_I_S(self._imu_id, self._cameras[camera].id)
+            tree.append((_repeated(T_I_C, count), (names.base_frame, f"cam{camera}")))
+        rows = tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
+        return [self._fixed(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
+
+    def imu(self) -> list[_Stream]:
+        """IMU samples, each once."""
+        if not self._imu_id:
+            return []
+        rows = mission_sample_rows(self._map, self._mission)
+        times_ns = self._map.imu_samples.timestamp_ns[rows]
+        samples = self._map.imu_samples.accel_gyro[rows]
+        messages = imu_messages(
+            times_ns, samples, self._options.base_frame, is_ros_2=self._is_ros_2
+        )
+        topic = _absolute(self._map.sensors.imu(self._imu_id).topic or "imu0")
+        return [self._fixed(topic, "sensor_msgs/msg/Imu", times_ns, messages)]
+
+    def images(self, kinds: tuple[int, ...], name: str) -> list[_Stream]:
+        """Images of frames, of some types of resources, and the calibration of their cameras."""
+        vi_map, streams = self._map, list[_Stream]()
+        chosen = resources_of(vi_map, kinds, np.array([self._mission]))
+        chosen &= vi_map.resources.owner_kind == ResourceOwner.FRAME
+        resources = np.flatnonzero(chosen)
+        frames = vi_map.resources.owner[resources]
+        for index, camera in enumerate(self._cameras):
+            of_camera = np.flatnonzero(vi_map.frames.camera_index[frames] == index)
+            times_ns = vi_map.frames.timestamp_ns[frames[of_camera]]
+            order = np.argsort(times_ns, kind="stable")
+            rows, times_ns = resources[of_camera[order]], times_ns[order]
+            is_raw = kinds == _IMAGES
+            topic = _absolute((is_raw and camera.topic) or f"cam{index}/{name}")
+            stamps = times_ns - camera.time_offset_ns
+            images = self._resource_messages(rows, times_ns, stamps, Channel(topic, IMAGE), index)
+            streams.append(_Stream(topic, len(rows), images))
+            if is_raw and has_camera_info(camera):
+                info = f"/cam{index}/camera_info"
+                channel = Channel(info, CAMERA_INFO)
+                infos = self._camera_infos(times_ns, stamps, channel, index)
+                streams.append(_Stream(info, len(rows), infos))
+            elif is_raw and len(rows):
+                self.notes.append(f"camera {index} has a model that CameraInfo does not have")
+        return streams
+
+    def clouds(self) -> list[_Stream]:
+        """Clouds of sensors."""
+        vi_map, table, streams = self._map, self._map.resources, list[_Stream]()
+        chosen = resources_of(vi_map, _CLOUDS, np.array([self._mission]))
+        chosen &= table.owner_kind == ResourceOwner.SENSOR
+        rows = np.flatnonzero(chosen)
+        for number, sensor_id in enumerate(np.unique(table.sensor_id[rows], axis=0)):
+            mine = rows[np.all(table.sensor_id[rows] == sensor_id, axis=1)]
+            mine = mine[np.argsort(table.timestamp_ns[mine], kind="stable")]
+            sensor = vi_map.sensors.sensors.get(to_hex(sensor_id))
+            topic = _absolute(getattr(sensor, "topic", "") or f"points{number}")
+            messages = self._clouds_of(mine, Channel(topic, CLOUD), f"lidar{number}")
+            streams.append(_Stream(topic, len(mine), messages))
+        return streams
+
+    def _clouds_of(self, rows: I64, channel: Channel, frame: str) -> Iterator[BagMessage]:
+        times = self._map.resources.timestamp_ns[rows]
+        for row, time_ns in zip(rows.tolist(), times.tolist(), strict=True):
+            name = f"resource {to_hex(self._map.resources.id[row])}"
+            cloud = parse_ply(self._store.load(row), name)
+            yield BagMessage(time_ns, channel, self._maker.cloud(time_ns, frame, cloud))
+
+    def _resource_messages(
+        self, rows: I64, times_ns: I64, stamps_ns: I64, channel: Channel, camera: int
+    ) -> Iterator[BagMessage]:
+        for row, time_ns, stamp_ns in zip(
+            rows.tolist(), times_ns.tolist(), stamps_ns.tolist(), strict=True
+        ):
+            data = self._maker.image(stamp_ns, f"cam{camera}", self._store.load(row))
+            yield BagMessage(time_ns, channel, data)
+
+    def _camera_infos(
+        self, times_ns: I64, stamps_ns: I64, channel: Channel, camera: int
+    ) -> Iterator[BagMessage]:
+        for time_ns, stamp_ns in zip(times_ns.tolist(), stamps_ns.tolist(), strict=True):
+            model = self._cameras[camera]
+            data = self._maker.camera_info(stamp_ns, f"cam{camera}", model)
+            yield BagMessage(time_ns, channel, data)
+
+    def _fixed(self, topic: str, kind: str, times_ns: I64, rows: list[bytes]) -> _Stream:
+        return _Stream(topic, len(rows), messages_of_topic(times_ns, topic, kind, rows))
+
+
+def _repeated(T_A_B: F64, count: int) -> F64:
+    return np.broadcast_to(T_A_B, (count, 7))
+
+
+def _absolute(topic: str) -> str:
+    return f"/{topic.strip('/')}"

@@ -1,0 +1,339 @@
+"""Images, depth maps and clouds of a bag's topic as resources of a map (maplab's resource importer)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from maplab_py.array_types import F32, I64
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.bags.camera_info import check_camera_info
+from maplab_py.interop.bags.options import BagImportOptions
+from maplab_py.interop.bags.reports import BagImport
+from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
+from maplab_py.interop.ply import encode_ply
+from maplab_py.interop.recordings.bag_files import (
+    all_messages,
+    check_bag,
+    header_stamp_ns,
+    listed_topics,
+    opened_bag,
+    topic_types,
+)
+from maplab_py.interop.recordings.images import EncodedImage, RawImage, check_size
+from maplab_py.interop.recordings.protocol import CameraImage
+from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
+from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
+from maplab_py.interop.resources.matching import (
+    MS_TO_NS,
+    camera_frames,
+    frames_without,
+    matched_files,
+    mission_rig,
+)
+from maplab_py.interop.resources.point_clouds import chosen_sensor, cloud_times_ns, cloud_type
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors import Camera
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap.ids import from_hex
+from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
+
+if TYPE_CHECKING:
+    from maplab_py.interop.recordings.bag_files import BagReader
+
+_DEPTH_ENCODINGS = ("16UC1", "32FC1")
+_COMPRESSED_DEPTH_HEADER = 12
+"""Bytes before the PNG file in messages of compressed_depth_image_transport."""
+_FARTHEST_MEDIAN_M = 500.0
+"""Depths in metres whose median is larger are in millimetres."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Topic:
+    """An open topic."""
+
+    path: Path
+    reader: BagReader
+    topic: str
+    type: str
+    stamps_ns: I64  # (N,) as recorded, increasing
+
+    @property
+    def name(self) -> str:
+        """Bag and topic, for messages."""
+        return f"{self.path}: {self.topic}"
+
+    def chosen(self, numbers: I64) -> Iterator[tuple[int, Any]]:
+        """Yield the number and the content of some messages (numbers, sorted)."""
+        if not len(numbers):
+            return
+        wanted, last = set(numbers.tolist()), int(numbers[-1])
+        for number, (type_, data) in enumerate(_messages(self.path, self.reader, self.topic)):
+            if number in wanted:
+                yield number, self.reader.deserialize(data, type_)
+            if number == last:
+                return
+
+
+def import_bag_resources(
+    vi_map: VIMap,
+    mission: int,
+    path: Path,
+    options: BagImportOptions,
+    *,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, BagImport]:
+    """Attach the images or depth images of a topic to frames, or its clouds to a sensor.
+
+    A frame gets the message that is nearest in time, if it is the nearest frame of that message, too.
+    Images of the encodings 16UC1 (millimetres) and 32FC1 (metres) are depth maps.
+
+    Args:
+        vi_map: Map.
+        mission: Row of the mission.
+        path: Bag.
+        options: Topic, sensor and times.
+        progress: Told of the progress.
+
+    Raises:
+        UserError: It is no bag, a topic is missing or of another type, the calibration is of another
+            camera, or no message belongs to the mission.
+        MapError: The bag or a message is damaged, or stamps run backwards.
+    """
+    check_bag(path, "--rosbag_path")
+    with opened_bag(path) as reader:
+        topic = _opened_topic(path, reader, options.resource_topic)
+        if topic.type == CLOUD:
+            if options.camera_calibration_topic:
+                raise UserError(
+                    f"{topic.name} has point clouds: --camera_calibration_topic is for images"
+                )
+            return _import_clouds(vi_map, mission, topic, options, progress)
+        return _import_images(vi_map, mission, topic, options, progress)
+
+
+def _opened_topic(path: Path, reader: BagReader, asked: str) -> _Topic:
+    types = topic_types(reader)
+    topic = _name_in_bag(path, types, asked, "--resource_topic", (IMAGE, COMPRESSED, CLOUD))
+    stamps = [
+        header_stamp_ns(data, is_ros_2=reader.is2) for _, data in _messages(path, reader, topic)
+    ]
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    if not len(stamps_ns):
+        raise MapError(f"{path}: {topic} has no messages: give another --resource_topic")
+    late = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if len(late):
+        raise MapError(
+            f"{path}: {topic}: the stamp {stamps_ns[late[0] + 1]} does not come after that of the "
+            "message before it: correct it, or leave the message out with `rosbag filter`"
+        )
+    return _Topic(path, reader, topic, types[topic], stamps_ns)
+
+
+def _name_in_bag(
+    path: Path, types: dict[str, str], asked: str, flag: str, wanted: tuple[str, ...]
+) -> str:
+    """Return the bag's name of a topic.
+
+    Raises:
+        UserError: It is not given, not there, or of another type.
+    """
+    usable = listed_topics({topic: kind for topic, kind in types.items() if kind in wanted})
+    topic = next((t for t in types if asked and t.strip("/") == asked.strip("/")), None)
+    if topic is None:
+        problem = f"there is no topic {asked}" if asked else "no topic is given"
+        raise UserError(f"{path}: {problem}: give {flag}; the bag has {usable}")
+    if types[topic] not in wanted:
+        raise UserError(
+            f"{path}: {topic} has messages of type {types[topic]}: give another {flag}; the bag has "
+            f"{usable}"
+        )
+    return topic
+
+
+def _messages(path: Path, reader: BagReader, topic: str) -> Iterator[tuple[str, bytes]]:
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection, _, data in all_messages(path, reader, connections):
+        yield connection.msgtype, data
+
+
+def _import_images(
+    vi_map: VIMap, mission: int, topic: _Topic, options: BagImportOptions, progress: Progress
+) -> tuple[VIMap, BagImport]:
+    cameras = mission_rig(vi_map, mission).cameras
+    index = _camera_index(cameras, topic, options.camera)
+    camera = cameras[index]
+    difference_px = _calibration_difference(topic, options, camera)
+    _, first = next(topic.chosen(np.array([0])))
+    is_depth = _is_depth(first)
+    frames = camera_frames(vi_map, mission, index)
+    kinds = (RAW_DEPTH_MAPS,) if is_depth else (RAW_GREY, RAW_COLOUR)
+    wanted = frames_without(vi_map, frames, kinds)
+    matches = matched_files(
+        vi_map.frames.timestamp_ns[wanted],
+        topic.stamps_ns + camera.time_offset_ns + options.resource_time_offset_ns,
+        round(options.image_tolerance_ms * MS_TO_NS),
+    )
+    owners, numbers = wanted[matches >= 0], matches[matches >= 0]
+    if not len(owners) and len(wanted) == len(frames):
+        raise UserError(
+            f"{topic.name}: no message is within --image_tolerance_ms={options.image_tolerance_ms:g} "
+            f"of a frame of camera {index}: check --resource_time_offset_ns and --map_mission"
+        )
+    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
+    for done, (number, message) in enumerate(topic.chosen(numbers)):
+        progress.step(done, len(numbers), "images")
+        name = f"{topic.name} at {topic.stamps_ns[number]}"
+        if is_depth:
+            new.add(RAW_DEPTH_MAPS, encoded_depth(_depth_m(message, name, camera)))
+        else:
+            add_image(new, _image(message, name, camera, int(topic.stamps_ns[number])), link=False)
+    attached = new.attached(vi_map, np.arange(len(owners)), owners) if len(owners) else vi_map
+    return attached, BagImport(
+        mission=mission_labels(vi_map)[mission],
+        topic=topic.topic,
+        type=topic.type,
+        messages=len(topic.stamps_ns),
+        resource_types=_types_of(new),
+        attached=len(owners),
+        had_some=len(frames) - len(wanted),
+        frames_without_message=len(wanted) - len(owners),
+        camera=index,
+        calibration_difference_px=difference_px,
+    )
+
+
+def _camera_index(cameras: tuple[Camera, ...], topic: _Topic, asked: int) -> int:
+    if asked >= len(cameras):
+        raise UserError(f"--camera={asked}: the mission has cameras 0 to {len(cameras) - 1}")
+    if asked >= 0:
+        return asked
+    same = [
+        k for k, camera in enumerate(cameras) if camera.topic.strip("/") == topic.topic.strip("/")
+    ]
+    if len(same) == 1 or len(cameras) == 1:
+        return same[0] if same else 0
+    raise UserError(
+        f"{topic.name}: it is not known which of the {len(cameras)} cameras it is of: give --camera"
+    )
+
+
+def _calibration_difference(
+    topic: _Topic, options: BagImportOptions, camera: Camera
+) -> float | None:
+    """Compare the first CameraInfo with the camera; return the difference [px]."""
+    asked, flag = options.camera_calibration_topic, "--camera_calibration_topic"
+    if not asked:
+        return None
+    types = topic_types(topic.reader)
+    name = _name_in_bag(topic.path, types, asked, flag, (CAMERA_INFO,))
+    for type_, data in _messages(topic.path, topic.reader, name):
+        message = topic.reader.deserialize(data, type_)
+        full_name = f"{topic.path}: {name}"
+        return check_camera_info(message, full_name, camera, options.calibration_tolerance_px)
+    raise MapError(f"{topic.path}: {name} has no messages: give another {flag}")
+
+
+def _is_depth(message: Any) -> bool:
+    if hasattr(message, "encoding"):
+        return message.encoding in _DEPTH_ENCODINGS
+    return "compressedDepth" in message.format
+
+
+def _image(message: Any, name: str, camera: Camera, stamp_ns: int) -> CameraImage:
+    data = _raw(message, name, camera) if hasattr(message, "encoding") else None
+    encoded = data or EncodedImage(name, camera, message.data.tobytes)
+    return CameraImage(0, stamp_ns, stamp_ns, encoded)
+
+
+def _raw(message: Any, name: str, camera: Camera) -> RawImage:
+    return RawImage(
+        name,
+        camera,
+        message.encoding,
+        int(message.width),
+        int(message.height),
+        int(message.step),
+        bool(message.is_bigendian),
+        message.data,
+    )
+
+
+def _depth_m(message: Any, name: str, camera: Camera) -> F32:
+    """Return depths (H, W) [m] of an image message."""
+    if not hasattr(message, "encoding"):
+        if not message.format.startswith("16UC1"):
+            raise MapError(f"{name}: compressed depth {message.format} is not supported: use 16UC1")
+        data = message.data.tobytes()[_COMPRESSED_DEPTH_HEADER:]
+        pixels = EncodedImage(name, camera, lambda: data).decode()
+        return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
+    if message.encoding == "16UC1":
+        pixels = _raw(message, name, camera).decode()
+        return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
+    if message.encoding != "32FC1":
+        raise MapError(f"{name}: encoding '{message.encoding}' in a topic of depth: record 16UC1")
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    check_size(name, camera, width, height)
+    row_bytes = width * np.dtype(np.float32).itemsize
+    if step < row_bytes or len(message.data) < step * height:
+        raise MapError(f"{name}: the image is truncated: copy the bag again")
+    rows = np.asarray(message.data, dtype=np.uint8)[: step * height].reshape(height, step)
+    order = ">" if message.is_bigendian else "<"
+    depth_m = np.ascontiguousarray(rows[:, :row_bytes]).view(f"{order}f4").astype(np.float32)
+    known = depth_m[np.isfinite(depth_m) & (depth_m > 0.0)]
+    if len(known) and float(np.median(known)) > _FARTHEST_MEDIAN_M:
+        raise MapError(
+            f"{name}: half of the depths are beyond {_FARTHEST_MEDIAN_M:g} m: 32FC1 is in metres; "
+            "record millimetres as 16UC1"
+        )
+    return depth_m
+
+
+def _import_clouds(
+    vi_map: VIMap, mission: int, topic: _Topic, options: BagImportOptions, progress: Progress
+) -> tuple[VIMap, BagImport]:
+    sensor = chosen_sensor(vi_map, mission, options.sensor_id)
+    times_ns = topic.stamps_ns + options.resource_time_offset_ns
+    first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
+    inside = (times_ns >= first_ns) & (times_ns <= last_ns)
+    if not inside.any():
+        raise UserError(
+            f"{topic.name}: no stamp is within the mission, which goes from {first_ns} to {last_ns} ns:"
+            " check --resource_time_offset_ns and --map_mission"
+        )
+    chosen = np.flatnonzero(inside & ~np.isin(times_ns, cloud_times_ns(vi_map, sensor)))
+    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
+    for done, (number, message) in enumerate(topic.chosen(chosen)):
+        progress.step(done, len(chosen), "point clouds")
+        cloud = cloud_of(message, f"{topic.name} at {topic.stamps_ns[number]}")
+        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+    attached = vi_map
+    if len(chosen):
+        attached = new.attached(
+            vi_map,
+            np.arange(len(chosen)),
+            np.full(len(chosen), mission),
+            ResourceOwner.SENSOR,
+            sensor_id=from_hex(sensor),
+            timestamp_ns=times_ns[chosen],
+        )
+    return attached, BagImport(
+        mission=mission_labels(vi_map)[mission],
+        topic=topic.topic,
+        type=topic.type,
+        messages=len(topic.stamps_ns),
+        resource_types=_types_of(new),
+        attached=len(chosen),
+        had_some=int(np.count_nonzero(inside)) - len(chosen),
+        messages_outside_mission=int(np.count_nonzero(~inside)),
+    )
+
+
+def _types_of(new: NewResources) -> tuple[str, ...]:
+    return tuple(sorted({resource_type(new.type_of(row)).name for row in range(len(new))}))

@@ -1,0 +1,221 @@
+"""Poses of a map as messages, and a bag copied with them (maplab's pose_to_bag)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.bags.options import PoseToBagOptions
+from maplab_py.interop.bags.reports import BagReport, written_topics
+from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
+from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages
+from maplab_py.interop.recordings.bag_writing import (
+    BagFormat,
+    BagMessage,
+    Channel,
+    channel_of,
+    check_bag_writable,
+    format_of_bag,
+    format_of_path,
+    in_order,
+    messages_of_bag,
+    watched,
+    write_bag,
+)
+from maplab_py.interop.vertex_states import poses_at
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
+
+TF_TOPIC, TF_TYPE = "/tf", "tf2_msgs/msg/TFMessage"
+_TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
+_S_TO_NS = 1e9
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MissionPoses:
+    """Poses of a mission, and the names of its frames."""
+
+    times_ns: I64  # (N,)
+    T_M_I: F64  # (N, 7)
+    T_G_M: F64  # (7,)
+    frames: tuple[str, str, str]  # G, M, I
+    suffix: str  # of topics
+
+    @property
+    def T_G_Ms(self) -> F64:
+        """The pose of the mission, once for each time (N, 7)."""
+        return np.broadcast_to(self.T_G_M, self.T_M_I.shape)
+
+
+def add_poses_to_bag(
+    vi_map: VIMap,
+    source: Path,
+    target: Path,
+    options: PoseToBagOptions | None = None,
+    *,
+    missions: I64 | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> BagReport:
+    """Copy a bag and add the poses of missions, each at its time.
+
+    Messages of the bag are copied byte by byte, and the format stays. With several missions the names of
+    frames and topics end in _0, _1, ... by the time of their beginning.
+
+    Args:
+        vi_map: Map.
+        source: Bag to copy.
+        target: Bag to write.
+        options: What is added.
+        missions: Rows; None = all.
+        overwrite: Replace a bag that exists.
+        progress: Told of the progress.
+
+    Raises:
+        UserError: The source is no bag, the target exists, or there is nothing to add.
+        MapError: The source is damaged.
+    """
+    options = options or PoseToBagOptions()
+    check_bag(source, "--rosbag_plugin_input_bag")
+    if target.exists() and target.resolve() == source.resolve():
+        raise UserError(f"--rosbag_plugin_output_bag={target} is the input: name another bag")
+    kind = format_of_bag(source)
+    format_of_path(target, kind.value)
+    check_bag_writable(target, kind, overwrite=overwrite)
+    poses = [*_mission_poses(vi_map, missions, options)]
+    if not poses:
+        raise UserError("the missions have no vertices: there are no poses to add")
+    dropped = (TF_TOPIC,) if options.drop_tf else ()
+    with opened_bag(source) as reader:
+        present = {(c.topic, c.msgtype): channel_of(c) for c in reader.connections}
+        _check_types(source, present, poses, options, kind)
+        added = [_added(entry, options, kind, present) for entry in poses]
+        total = reader.message_count + sum(len(entry.times_ns) for entry in poses)
+        copied = Counter[str]()
+        counts = write_bag(
+            target,
+            kind,
+            watched(
+                in_order(
+                    _counted(messages_of_bag(source, reader, without=dropped), copied),
+                    *(stream for streams in added for stream in streams),
+                ),
+                total,
+                progress,
+            ),
+            overwrite=overwrite,
+        )
+    labels = mission_labels(vi_map)
+    rows = range(len(labels)) if missions is None else missions.tolist()
+    return BagReport(
+        bag=target,
+        format=kind.value,
+        missions=tuple(labels[row] for row in rows),
+        topics=written_topics(counts),
+        copied_messages=copied.total(),
+        messages=sum(counts.values()),
+    )
+
+
+def pose_times(stamps_ns: I64, period_ns: int) -> I64:
+    """Return the stamps (N,), and times every period behind each of them up to the next one."""
+    extra = np.maximum((np.diff(stamps_ns) - 1) // period_ns, 0)
+    start = np.repeat(np.cumsum(extra) - extra, extra)
+    step = np.arange(int(extra.sum())) - start + 1
+    between = np.repeat(stamps_ns[:-1], extra) + step * period_ns
+    return np.sort(np.concatenate([stamps_ns, between]))
+
+
+def _mission_poses(
+    vi_map: VIMap, missions: I64 | None, options: PoseToBagOptions
+) -> Iterator[MissionPoses]:
+    """Yield the poses of missions (rows) that have vertices, by the time of their beginning."""
+    rows = np.arange(len(vi_map.missions)) if missions is None else missions
+    rows = rows[np.diff(vi_map.vertex_start)[rows] > 0]
+    rows = rows[np.argsort(mission_time_spans_ns(vi_map)[rows, 0], kind="stable")]
+    period_ns = round(_S_TO_NS / options.interpolate_to_frequency_hz)
+    for number, row in enumerate(rows.tolist()):
+        suffix = f"_{number}" if len(rows) > 1 else ""
+        start, stop = vi_map.vertex_start[row : row + 2].tolist()
+        times_ns = pose_times(vi_map.vertices.timestamp_ns[start:stop], period_ns)
+        yield MissionPoses(
+            times_ns,
+            poses_at(vi_map, row, times_ns),
+            vi_map.T_G_M[row],
+            (options.world_frame, options.odom_frame + suffix, options.base_frame + suffix),
+            suffix,
+        )
+
+
+def _added(
+    poses: MissionPoses,
+    options: PoseToBagOptions,
+    kind: BagFormat,
+    present: dict[tuple[str, str], Channel],
+) -> list[Iterator[BagMessage]]:
+    """Return the streams of messages of a mission; topics that the bag has go on in their channel."""
+    world, odom, base = poses.frames
+    T_G_M, T_M_I = poses.T_G_Ms, poses.T_M_I
+    streams: list[tuple[str, str, list[bytes]]] = []
+    if options.add_transform_stamped:
+        for name, T, frames in (
+            ("T_G_I", se3.compose(T_G_M, T_M_I), (world, base)),
+            ("T_M_I", T_M_I, (odom, base)),
+            ("T_G_M", T_G_M, (world, odom)),
+        ):
+            rows = transform_messages(poses.times_ns, T, frames, is_ros_2=kind.is_ros_2)
+            streams.append((f"/{name}{poses.suffix}", _TRANSFORM_TYPE, rows))
+    if options.add_tf:
+        tree = [(T_G_M, (world, odom)), (T_M_I, (odom, base))]
+        rows = tf_messages(poses.times_ns, tree, is_ros_2=kind.is_ros_2)
+        streams.append((TF_TOPIC, TF_TYPE, rows))
+    times = poses.times_ns.tolist()
+    return [
+        _in_channel(times, present.get((topic, type_), Channel(topic, type_)), rows)
+        for topic, type_, rows in streams
+    ]
+
+
+def _in_channel(times_ns: list[int], channel: Channel, rows: list[bytes]) -> Iterator[BagMessage]:
+    for time_ns, data in zip(times_ns, rows, strict=True):
+        yield BagMessage(time_ns, channel, data)
+
+
+def _check_types(
+    source: Path,
+    present: dict[tuple[str, str], Channel],
+    poses: list[MissionPoses],
+    options: PoseToBagOptions,
+    kind: BagFormat,
+) -> None:
+    """Refuse a bag whose topics of the same names have other types.
+
+    ROS 1 knows the transforms of /tf under an older name of their type, too.
+    """
+    added = {TF_TOPIC: {TF_TYPE}} if options.add_tf and not options.drop_tf else {}
+    if kind is BagFormat.ROS1 and added:
+        added[TF_TOPIC].add("tf/msg/tfMessage")
+    if options.add_transform_stamped:
+        names = ("T_G_I", "T_M_I", "T_G_M")
+        added |= {f"/{name}{entry.suffix}": {_TRANSFORM_TYPE} for name in names for entry in poses}
+    for topic, type_ in present:
+        if topic in added and type_ not in added[topic]:
+            remedy = "--rosbag_plugin_pose_to_bag_drop_tf or " if topic == TF_TOPIC else ""
+            raise MapError(
+                f"{source}: {topic} has messages of type {type_}, not {sorted(added[topic])[0]}: "
+                f"give {remedy}another bag"
+            )
+
+
+def _counted(messages: Iterator[BagMessage], counts: Counter[str]) -> Iterator[BagMessage]:
+    for message in messages:
+        counts[message.channel.topic] += 1
+        yield message

@@ -1,0 +1,249 @@
+"""import_bag_resources: images, depth maps and clouds of bags come to their frames and sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.bags.exporting import export_bag
+from maplab_py.interop.bags.importing import import_bag_resources
+from maplab_py.interop.bags.options import BagExportOptions, BagImportOptions
+from maplab_py.interop.bags.sensor_messages import CLOUD, COMPRESSED, IMAGE, MessageMaker
+from maplab_py.interop.ply import PlyCloud
+from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.bag_writing import BagFormat, BagMessage, Channel, write_bag
+from maplab_py.storage.resources import ResourceStore
+from maplab_py.vimap import VIMap
+from tests.interop.bags.small_bags import (
+    FORMATS,
+    OFFSET_NS,
+    map_with_resources,
+    named,
+    with_camera,
+    with_time_offset,
+)
+from tests.interop.recordings.written import image_message
+from tests.interop.small_map import IMU_ID, VERTICES, make_map
+
+pytest.importorskip("rosbags")
+
+LEFT = BagImportOptions(resource_topic="/left/image_raw")
+ROS1 = MessageMaker(is_ros_2=False)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_what_was_exported_comes_back(tmp_path: Path, kind: BagFormat) -> None:
+    before, _, _ = map_with_resources()
+    path = named(tmp_path, kind)
+    export_bag(before, tmp_path, 0, path, BagExportOptions(format=kind.value))
+    bare = with_time_offset(make_map())
+    vi_map = bare
+    for options in (
+        BagImportOptions("left/image_raw", camera_calibration_topic="/cam0/camera_info"),
+        BagImportOptions("/cam0/depth"),
+        BagImportOptions("/points0", sensor_id=IMU_ID[:6]),
+    ):
+        vi_map, report = import_bag_resources(vi_map, 0, path, options)
+        assert report.attached == report.messages
+        if options.camera_calibration_topic:
+            assert report.calibration_difference_px is not None
+            assert report.calibration_difference_px < 1e-6
+    assert len(bare.resources) == 0
+    table, expected = vi_map.resources, before.resources
+    for name in ("type", "owner", "owner_kind", "sensor_id", "timestamp_ns"):
+        np.testing.assert_array_equal(getattr(table, name), getattr(expected, name))
+    stores = ResourceStore(vi_map, tmp_path), ResourceStore(before, tmp_path)
+    for row in range(len(table)):
+        read, written = (store.load(row) for store in stores)
+        np.testing.assert_array_equal(np.asarray(read), np.asarray(written))
+
+
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    vi_map, _, _ = map_with_resources()
+    export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
+    for options in (LEFT, BagImportOptions("/points0", sensor_id=IMU_ID)):
+        again, report = import_bag_resources(vi_map, 0, tmp_path / "walk.bag", options)
+        assert again is vi_map
+        assert (report.attached, report.had_some) == (0, report.messages)
+
+
+def write_images(
+    path: Path,
+    stamps: list[int],
+    messages: list[bytes],
+    kind: str = IMAGE,
+    topic: str = "/left/image_raw",
+) -> Path:
+    channel = Channel(topic, kind)
+    arrivals = range(10**9, 10**9 + len(stamps))
+    write_bag(
+        path,
+        BagFormat.ROS1,
+        (BagMessage(t, channel, data) for t, data in zip(arrivals, messages, strict=True)),
+    )
+    return path
+
+
+def image_bag(path: Path, vi_map: VIMap, shift_ns: int = 0, **changes: Any) -> Path:
+    """Write grey images of the first mission at the times of the camera's clock."""
+    stamps = (vi_map.vertices.timestamp_ns[:VERTICES] - OFFSET_NS + shift_ns).tolist()
+    pixels = changes.get("pixels", np.full((480, 640), 80, dtype=np.uint8))
+    return write_images(path, stamps, [ROS1.image(t, "left", pixels) for t in stamps])
+
+
+def test_the_time_offset_is_added(tmp_path: Path) -> None:
+    vi_map = with_time_offset(make_map())
+    path = image_bag(tmp_path / "late.bag", vi_map, shift_ns=40_000_000)
+    with pytest.raises(UserError, match=r"no message is within --image_tolerance_ms=1 .*offset_ns"):
+        import_bag_resources(vi_map, 0, path, LEFT)
+    options = BagImportOptions("/left/image_raw", resource_time_offset_ns=-40_000_000)
+    attached, report = import_bag_resources(vi_map, 0, path, options)
+    assert report.attached == VERTICES
+    np.testing.assert_array_equal(attached.resources.owner, np.arange(VERTICES))
+    clouds = tmp_path / "clouds.bag"
+    with_clouds, _, _ = map_with_resources()
+    export_bag(with_clouds, tmp_path, 0, clouds)
+    options = BagImportOptions("/points0", resource_time_offset_ns=1000, sensor_id=IMU_ID)
+    attached, _ = import_bag_resources(vi_map, 0, clouds, options)
+    expected = vi_map.vertices.timestamp_ns[:3] + 1007
+    np.testing.assert_array_equal(attached.resources.timestamp_ns, expected)
+
+
+def test_colours_and_sixteen_bits(tmp_path: Path) -> None:
+    vi_map = with_time_offset(make_map())
+    colours = np.random.default_rng(1).integers(0, 256, (480, 640, 3)).astype(np.uint8)
+    path = image_bag(tmp_path / "colour.bag", vi_map, pixels=colours)
+    attached, report = import_bag_resources(vi_map, 0, path, LEFT)
+    assert report.resource_types == ("raw_color_images",)
+    np.testing.assert_array_equal(ResourceStore(attached, tmp_path).load(0), colours)
+
+
+def depth_message(stamp: int, depth_m: np.ndarray, form: str) -> tuple[str, bytes]:
+    """Return type and bytes of a depth image of ROS 1."""
+    store = message_types(is_ros_2=False)
+    if form == "16UC1":
+        return IMAGE, ROS1.image(stamp, "left", np.round(1000 * depth_m).astype(np.uint16))
+    if form == "compressedDepth":
+        message = image_message(store, stamp, np.round(1000 * depth_m).astype(np.uint16), "png", 1)
+        message.format = "16UC1; compressedDepth png"
+        message.data = np.concatenate([np.zeros(12, dtype=np.uint8), message.data])
+        return COMPRESSED, bytes(store.serialize_ros1(message, COMPRESSED))
+    message = image_message(store, stamp, depth_m.astype(np.float32), "32FC1", 1, padding=8)
+    return IMAGE, bytes(store.serialize_ros1(message, IMAGE))
+
+
+@pytest.mark.parametrize("form", ["16UC1", "32FC1", "compressedDepth"])
+def test_depth_in_millimetres_and_metres(tmp_path: Path, form: str) -> None:
+    vi_map = with_time_offset(make_map())
+    depth_m = np.linspace(0.0, 9.0, 480 * 640).reshape(480, 640)
+    if form == "32FC1":
+        depth_m[0, :5] = np.nan
+    stamp = int(vi_map.vertices.timestamp_ns[1]) - OFFSET_NS
+    kind, data = depth_message(stamp, depth_m, form)
+    path = write_images(tmp_path / "depth.bag", [stamp], [data], kind)
+    attached, report = import_bag_resources(vi_map, 0, path, LEFT)
+    assert (report.resource_types, report.attached) == (("raw_depth_maps",), 1)
+    assert attached.resources.owner.tolist() == [1]
+    expected = np.round(1000 * np.nan_to_num(depth_m.astype(np.float32))).astype(np.uint16)
+    read = ResourceStore(attached, tmp_path).load(0)
+    assert np.abs(read.astype(np.int64) - expected).max() <= 1
+
+
+def test_wrong_units_of_depth_are_refused(tmp_path: Path) -> None:
+    vi_map = with_time_offset(make_map())
+    stamp = int(vi_map.vertices.timestamp_ns[1]) - OFFSET_NS
+    kind, data = depth_message(stamp, np.full((480, 640), 2500.0), "32FC1")
+    path = write_images(tmp_path / "depth.bag", [stamp], [data], kind)
+    with pytest.raises(MapError, match=r"depth\.bag.* 32FC1 is in metres; record millimetres"):
+        import_bag_resources(vi_map, 0, path, LEFT)
+
+
+def other_size(vi_map: VIMap) -> VIMap:
+    return with_camera(vi_map, width_px=600)
+
+
+def other_focal_length(vi_map: VIMap) -> VIMap:
+    return with_camera(vi_map, intrinsics=np.array([260.0, 251.0, 320.0, 240.0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (other_size, "600 x 480"),
+        (other_focal_length, "differs from that of the map's camera by up"),
+    ],
+)
+def test_a_calibration_of_another_camera_is_refused(
+    tmp_path: Path, change: Callable[[VIMap], VIMap], problem: str
+) -> None:
+    export_bag(map_with_resources()[0], tmp_path, 0, tmp_path / "walk.bag")
+    vi_map = change(with_time_offset(make_map()))
+    options = BagImportOptions("/left/image_raw", camera_calibration_topic="/cam0/camera_info")
+    with pytest.raises(UserError, match=f"walk.bag: /cam0/camera_info: .*{problem}.*--camera"):
+        import_bag_resources(vi_map, 0, tmp_path / "walk.bag", options)
+
+
+def test_wrong_topics_and_bags_are_refused(tmp_path: Path) -> None:
+    vi_map, _, _ = map_with_resources()
+    path = tmp_path / "walk.bag"
+    export_bag(vi_map, tmp_path, 0, path)
+
+    def refused(problem: str, kind: type[Exception] = UserError, **options: Any) -> None:
+        bag = options.pop("path", path)
+        with pytest.raises(kind, match=problem) as error:
+            import_bag_resources(vi_map, 0, bag, BagImportOptions(**options))
+        assert "\n" not in str(error.value)
+        assert str(bag) in str(error.value) or "--" in str(error.value)
+
+    refused("no topic is given: give --resource_topic; the bag has /cam0/depth .sensor_msgs")
+    refused("there is no topic /none", resource_topic="/none")
+    refused("/pose has messages of type geometry_msgs/msg/PoseStamped", resource_topic="/pose")
+    refused("--camera=3: the mission has cameras 0 to 0", resource_topic="/cam0/depth", camera=3)
+    refused("the mission has no lidar", resource_topic="/points0")
+    calibration = {"camera_calibration_topic": "/cam0/camera_info"}
+    refused("is for images", resource_topic="/points0", **calibration)
+    calibration = {"camera_calibration_topic": "/pose"}
+    refused("another --camera_calibration_topic", resource_topic="/cam0/depth", **calibration)
+    refused("gone.bag does not exist", path=tmp_path / "gone.bag", resource_topic="/a")
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes(path.read_bytes()[:-3000])
+    refused(r"cut\.bag: the bag cannot be read", MapError, path=cut, resource_topic="/cam0/depth")
+
+
+def test_damaged_messages_are_refused(tmp_path: Path) -> None:
+    vi_map = with_time_offset(make_map())
+    stamps = (vi_map.vertices.timestamp_ns[:2] - OFFSET_NS).tolist()
+    pixels = np.zeros((480, 640), dtype=np.uint8)
+    images = [ROS1.image(t, "left", pixels) for t in stamps]
+
+    def refused(problem: str, name: str, kind: str, stamps: list[int], data: list[bytes]) -> None:
+        path = write_images(tmp_path / name, stamps, data, kind)
+        options = BagImportOptions("/left/image_raw", sensor_id=IMU_ID)
+        with pytest.raises(MapError, match=problem) as error:
+            import_bag_resources(vi_map, 0, path, options)
+        assert str(path) in str(error.value)
+
+    refused("does not come after", "unsorted.bag", IMAGE, stamps[::-1], images[::-1])
+    refused("the bag cannot be read", "short.bag", IMAGE, stamps, [i[:5000] for i in images])
+    refused("the bag cannot be read", "empty.bag", IMAGE, stamps, [b"", b""])
+    small = [ROS1.image(t, "left", pixels[:100]) for t in stamps]
+    refused("640 x 100|100", "small.bag", IMAGE, stamps, small)
+    store = message_types(is_ros_2=False)
+    done, data = cv2.imencode(".png", pixels)
+    assert done
+    message = image_message(store, stamps[0], pixels, "png", 1)
+    message.data = data.reshape(-1)[:300]
+    cut = [bytes(store.serialize_ros1(message, COMPRESSED))]
+    refused("truncated", "png.bag", COMPRESSED, stamps[:1], cut)
+    inside = stamps[0] + OFFSET_NS + 10
+    far = ROS1.cloud(inside, "lidar", PlyCloud(2500.0 * np.eye(3)))
+    refused("coordinates are in metres", "far.bag", CLOUD, stamps[:1], [far])
+    cloud = ROS1.cloud(inside, "lidar", PlyCloud(np.eye(3)))
+    broken = [cloud.replace(b"x\x00\x00\x00\x00\x07", b"q\x00\x00\x00\x00\x07")]
+    refused("has no x, y, z", "cloud.bag", CLOUD, stamps[:1], broken)

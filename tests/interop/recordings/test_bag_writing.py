@@ -1,0 +1,254 @@
+"""Bags that are written: messages equal those of rosbags, bags read back to the last bit."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings.bag_files import message_types, opened_bag
+from maplab_py.interop.recordings.bag_layouts import (
+    imu_messages,
+    odometry_messages,
+    pose_messages,
+    tf_messages,
+    transform_messages,
+)
+from maplab_py.interop.recordings.bag_writing import (
+    BagFormat,
+    BagMessage,
+    Channel,
+    bag_files,
+    format_of_bag,
+    format_of_path,
+    in_order,
+    messages_of_topic,
+    write_bag,
+)
+from maplab_py.output_files import planning
+from tests.interop.recordings.written import header, imu_message
+
+pytest.importorskip("rosbags")
+
+IMU = "sensor_msgs/msg/Imu"
+FORMATS = list(BagFormat)
+ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)
+FRAMES = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=9)
+
+
+def named(folder: Path, kind: BagFormat) -> Path:
+    return folder / ("walk" if kind.is_ros_2 else "walk.bag")
+
+
+@st.composite
+def samples(draw: Any, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    count = draw(st.integers(1, 5))
+    stamps = st.integers(0, 2_147_483_647_999_999_999)
+    times_ns = np.array(sorted(draw(st.lists(stamps, min_size=count, max_size=count))))
+    return times_ns, draw(arrays(np.float64, (count, columns), elements=ANY_FLOAT))
+
+
+def serialised(store: Any, message: Any, is_ros_2: bool) -> bytes:
+    write = store.serialize_cdr if is_ros_2 else store.serialize_ros1
+    return bytes(write(message, message.__msgtype__))
+
+
+@pytest.mark.parametrize("is_ros_2", [False, True])
+@given(data=samples(6), frame=FRAMES)
+def test_imu_messages_are_those_of_rosbags(
+    is_ros_2: bool, data: tuple[np.ndarray, np.ndarray], frame: str
+) -> None:
+    store = message_types(is_ros_2=is_ros_2)
+    times_ns, values = data
+    rows = imu_messages(times_ns, values, frame, is_ros_2=is_ros_2)
+    for row, time_ns, sample in zip(rows, times_ns.tolist(), values, strict=True):
+        message = imu_message(store, time_ns, sample, 2 if is_ros_2 else 1)
+        message.header.frame_id = frame
+        message.orientation_covariance = np.array([-1.0, *[0.0] * 8])
+        assert row == serialised(store, message, is_ros_2)
+
+
+@pytest.mark.parametrize("is_ros_2", [False, True])
+@given(data=samples(7), frames=st.tuples(FRAMES, FRAMES))
+def test_poses_are_those_of_rosbags(
+    is_ros_2: bool, data: tuple[np.ndarray, np.ndarray], frames: tuple[str, str]
+) -> None:
+    store, (times_ns, T_A_B) = message_types(is_ros_2=is_ros_2), data
+    types = store.types
+    poses = pose_messages(times_ns, T_A_B, frames[0], is_ros_2=is_ros_2)
+    transforms = transform_messages(times_ns, T_A_B, frames, is_ros_2=is_ros_2)
+    both = [(T_A_B, frames), (T_A_B[::-1], (frames[1], frames[0]))]
+    trees = tf_messages(times_ns, both, is_ros_2=is_ros_2)
+
+    def stamped(row: int, T: np.ndarray, parent: str, child: str) -> Any:
+        turn = types["geometry_msgs/msg/Quaternion"](*T[:4].tolist())
+        shift = types["geometry_msgs/msg/Vector3"](*T[4:].tolist())
+        head = header(store, int(times_ns[row]), 2 if is_ros_2 else 1)
+        head.frame_id = parent
+        transform = types["geometry_msgs/msg/Transform"](shift, turn)
+        return types["geometry_msgs/msg/TransformStamped"](head, child, transform)
+
+    for row in range(len(times_ns)):
+        first = stamped(row, T_A_B[row], *frames)
+        second = stamped(row, T_A_B[::-1][row], frames[1], frames[0])
+        assert transforms[row] == serialised(store, first, is_ros_2)
+        tree = types["tf2_msgs/msg/TFMessage"]([first, second])
+        assert trees[row] == serialised(store, tree, is_ros_2)
+        transform = first.transform
+        point = types["geometry_msgs/msg/Point"](*T_A_B[row, 4:].tolist())
+        pose = types["geometry_msgs/msg/Pose"](point, transform.rotation)
+        message = types["geometry_msgs/msg/PoseStamped"](first.header, pose)
+        assert poses[row] == serialised(store, message, is_ros_2)
+
+
+@pytest.mark.parametrize("is_ros_2", [False, True])
+def test_odometry_has_the_velocity_of_the_body(is_ros_2: bool) -> None:
+    store = message_types(is_ros_2=is_ros_2)
+    half = np.sqrt(0.5)
+    T_M_I = np.array([[0.0, 0.0, half, half, 1.0, 2.0, 3.0]])  # turned left by 90 degrees
+    v_M = np.array([[0.0, 2.0, 0.5]])
+    (row,) = odometry_messages(
+        np.array([3_000_000_001]), T_M_I, v_M, ("mission", "imu"), is_ros_2=is_ros_2
+    )
+    read = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
+    message = read(row, "nav_msgs/msg/Odometry")
+    assert (message.header.frame_id, message.child_frame_id) == ("mission", "imu")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 1)
+    assert (message.pose.pose.position.y, message.pose.pose.orientation.w) == (2.0, half)
+    v_I = message.twist.twist.linear
+    np.testing.assert_allclose([v_I.x, v_I.y, v_I.z], [2.0, 0.0, 0.5], atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_20_000_imu_messages_read_back_to_the_last_bit(tmp_path: Path, kind: BagFormat) -> None:
+    rng = np.random.default_rng(3)
+    times_ns = 1_403_715_273_262_142_976 + np.cumsum(rng.integers(1, 10_000_000, 20_000))
+    values = rng.normal(size=(20_000, 6)) * 10.0 ** rng.integers(-300, 300, (20_000, 6))
+    rows = imu_messages(times_ns, values, "imu", is_ros_2=kind.is_ros_2)
+    path = named(tmp_path, kind)
+    counts = write_bag(path, kind, messages_of_topic(times_ns, "/imu0", IMU, rows))
+    assert counts == {"/imu0": 20_000}
+    assert format_of_bag(path) is kind
+    with opened_bag(path) as reader:
+        read = list(reader.messages())
+        assert [data for _, _, data in read] == rows
+        assert [arrival for _, arrival, _ in read] == times_ns.tolist()
+        last = reader.deserialize(read[-1][2], IMU)
+    a, w = last.linear_acceleration, last.angular_velocity
+    assert [a.x, a.y, a.z, w.x, w.y, w.z] == values[-1].tolist()
+
+
+def few(kind: BagFormat, topic: str = "/imu0", start: int = 10) -> Iterator[BagMessage]:
+    times_ns = np.arange(start, start + 40, 10)
+    rows = imu_messages(times_ns, np.ones((4, 6)), "imu", is_ros_2=kind.is_ros_2)
+    return messages_of_topic(times_ns, topic, IMU, rows)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_streams_are_merged_in_the_order_of_time(tmp_path: Path, kind: BagFormat) -> None:
+    path = named(tmp_path, kind)
+    assert write_bag(path, kind, in_order(few(kind), few(kind, "/b", 15))) == {"/imu0": 4, "/b": 4}
+    with opened_bag(path) as reader:
+        assert [time for _, time, _ in reader.messages()] == list(range(10, 50, 5))
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_it_replaces_only_on_request(tmp_path: Path, kind: BagFormat) -> None:
+    path = named(tmp_path, kind)
+    write_bag(path, kind, few(kind))
+    before = [file.read_bytes() for file in bag_files(path, kind)]
+    with pytest.raises(UserError, match="exists already: give --overwrite"):
+        write_bag(path, kind, few(kind, "/other"))
+    assert [file.read_bytes() for file in bag_files(path, kind)] == before
+    write_bag(path, kind, few(kind, "/other"), overwrite=True)
+    with opened_bag(path) as reader:
+        assert {c.topic for c in reader.connections} == {"/other"}
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_failure_leaves_nothing(tmp_path: Path, kind: BagFormat) -> None:
+    def failing() -> Iterator[BagMessage]:
+        yield from few(kind)
+        raise MapError("the images are damaged")
+
+    with pytest.raises(MapError, match="the images are damaged"):
+        write_bag(named(tmp_path, kind), kind, failing())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_planning_writes_nothing(tmp_path: Path, kind: BagFormat) -> None:
+    path = named(tmp_path, kind)
+    with planning() as planned:
+        write_bag(path, kind, few(kind))
+    assert [file.path for file in planned] == list(bag_files(path, kind))
+    assert min(file.size_bytes for file in planned) > 100
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sqlite_agrees(tmp_path: Path) -> None:
+    write_bag(tmp_path / "walk", BagFormat.SQLITE3, few(BagFormat.SQLITE3))
+    with sqlite3.connect(tmp_path / "walk" / "walk.db3") as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        rows = database.execute("SELECT timestamp FROM messages ORDER BY id").fetchall()
+    assert rows == [(10,), (20,), (30,), (40,)]
+
+
+def test_names_and_formats_fit(tmp_path: Path) -> None:
+    assert format_of_path(tmp_path / "walk.bag") is BagFormat.ROS1
+    assert format_of_path(tmp_path / "walk") is BagFormat.MCAP
+    assert format_of_path(tmp_path / "walk", "sqlite3") is BagFormat.SQLITE3
+    for name, kind in (("walk.bag", "mcap"), ("walk", "ros1")):
+        with pytest.raises(UserError, match=f"--bag_format={kind} is a "):
+            format_of_path(tmp_path / name, kind)
+    with pytest.raises(UserError, match=r"leave \.mcap away"):
+        format_of_path(tmp_path / "walk.mcap")
+
+
+def test_foreign_files_are_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "notes.txt").write_text("keep")
+    with pytest.raises(UserError, match=r"has other files \(notes.txt\)"):
+        write_bag(tmp_path / "walk", BagFormat.MCAP, few(BagFormat.MCAP), overwrite=True)
+    (tmp_path / "file").write_text("keep")
+    with pytest.raises(UserError, match="is a file: name a folder"):
+        write_bag(tmp_path / "file", BagFormat.MCAP, few(BagFormat.MCAP), overwrite=True)
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    unknown = [BagMessage(1, Channel("/odd", "my_msgs/msg/Odd"), b"")]
+    with pytest.raises(MapError, match="/odd have the type my_msgs/msg/Odd, which has no definit"):
+        write_bag(tmp_path / "walk", BagFormat.SQLITE3, unknown)
+    for time_ns in (-1, 2**31 * 1_000_000_000):
+        with pytest.raises(UserError, match="cannot be written into a bag"):
+            imu_messages(np.array([time_ns]), np.ones((1, 6)), "imu", is_ros_2=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_extra_is_named_where_it_is_missing(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['rosbags'] = None; from pathlib import Path\n"
+        "from maplab_py.interop.recordings.bag_writing import BagFormat, write_bag\n"
+        "write_bag(Path('walk.bag'), BagFormat.ROS1, [])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=os.environ,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "pip install 'maplab-py[bags]'" in done.stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
