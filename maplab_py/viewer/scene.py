@@ -103,6 +103,7 @@ class Layer:
     entity: Entity = Entity.NONE
     is_visible: bool = True
     legend: tuple[LegendEntry, ...] = ()
+    notes: tuple[str, ...] = ()  # why parts draw fewer
 
     @property
     def drawn(self) -> int:

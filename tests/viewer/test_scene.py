@@ -188,6 +188,29 @@ def test_flags_leave_landmarks_out() -> None:
     assert "landmarks" not in _scene(vi_map, options={"show_only_landmark_type": "9"}).names
 
 
+def test_every_landmark_that_is_left_out_has_its_reason(two_missions: VIMap) -> None:
+    few = {"landmarks_min_observers": 10, "max_points": 10}
+    scene = _scene(two_missions, options=few, other=two_missions)
+    bad = int(np.count_nonzero(two_missions.landmarks.quality == 1))
+    total = len(two_missions.landmarks)
+    counts = np.diff(two_missions.observation_start)
+    unseen = int(np.count_nonzero((counts < 10) & (two_missions.landmarks.quality != 1)))
+    notes = {note.partition(":")[0]: note for note in scene.notes}
+    assert notes["Landmarks"] == (
+        f"Landmarks: 10 of {total - bad} are drawn (left out: {unseen} by "
+        f"--vis_landmarks_min_observers, {total - bad - unseen - 10} by --vis_max_points)"
+    )
+    assert notes["Reference landmarks"] == (
+        f"Reference landmarks: 10 of {total} are drawn (left out: {bad} of bad quality, "
+        f"{total - bad - 10} by --vis_max_points)"
+    )
+    everything = _scene(two_missions, other=two_missions).notes
+    assert everything == (
+        "in grey: before",
+        f"Reference landmarks: {total - bad} of {total} are drawn (left out: {bad} of bad quality)",
+    )
+
+
 def test_missions_can_be_drawn_apart(two_missions: VIMap) -> None:
     apart = {"spatially_distribute_missions_meters": 20.0, "offset_z_m": 3.0}
     p, _, rows = _points(_scene(two_missions, options=apart), "vertices")
@@ -287,7 +310,7 @@ def test_clouds_and_meshes() -> None:
     assert len(rows) == 100
     np.testing.assert_allclose(drawn, p[rows], atol=1e-6)
     np.testing.assert_array_equal(colour, own[rows])
-    assert scene.notes == ("cloud: 100 of 500 are drawn (--vis_max_points)",)
+    assert scene.notes == ("cloud: 100 of 500 are drawn (left out: 400 by --vis_max_points)",)
     mesh = scene.layer("mesh_0").parts[""]
     assert isinstance(mesh, Mesh)
     np.testing.assert_array_equal(mesh.faces, faces)
