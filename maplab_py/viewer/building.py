@@ -71,7 +71,11 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     if subject.shows_sensors:
         layer = cameras.sensor_axes(subject.vi_map.sensors)
         return Scene(subject.title, (layer,), (), drawing.extent, drawing.origin_G)
-    layers: list[Layer] = [paths.trajectories(drawing), paths.vertices(drawing)]
+    layers: list[Layer] = [
+        paths.trajectories(drawing),
+        paths.vertices(drawing),
+        paths.path_ends(drawing),
+    ]
     layers += landmarks.landmarks(drawing)
     layers += [paths.loop_closures(drawing), paths.absolute_poses(drawing)]
     layers += [cameras.frusta(drawing), paths.imu_edges(drawing)]

@@ -37,6 +37,7 @@ class Points:
     colours: U8  # (N, 3)
     rows: I64  # (N,) rows of the map's table
     size_m: float
+    labels: tuple[str, ...] = ()  # one for each of the first points; empty = no label
 
     def __len__(self) -> int:
         return len(self.p)

@@ -70,6 +70,26 @@ def test_trajectories_join_the_vertices_of_one_mission(two_missions: VIMap) -> N
     assert list(scene.layer("trajectories").parts) == to_hex_list(two_missions.missions.id)
 
 
+def test_ends_of_paths_are_marked(two_missions: VIMap) -> None:
+    scene = _scene(two_missions)
+    parts = scene.layer("path_ends").parts
+    ids = to_hex_list(two_missions.missions.id)
+    assert list(parts) == ids
+    for mission_id, rows in zip(ids, ([0, 11], [12, 20]), strict=True):
+        dots = parts[mission_id]
+        assert isinstance(dots, Points)
+        np.testing.assert_array_equal(dots.rows, rows)
+        np.testing.assert_allclose(dots.p, two_missions.T_G_I[rows, 4:], atol=1e-5)
+        assert dots.labels == (f"start {mission_id[:8]}", f"end {mission_id[:8]}")
+    closed = np.array(walk_map().vertices.T_M_I)
+    closed[-1] = closed[0]
+    vi_map = walk_map()
+    loop = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=closed))
+    (dots,) = _scene(loop).layer("path_ends").parts.values()
+    assert isinstance(dots, Points)
+    assert dots.labels == ("start and end",)
+
+
 def test_landmarks_good_and_bad(two_missions: VIMap) -> None:
     scene = _scene(two_missions)
     good, _, good_rows = _points(scene, "landmarks")

@@ -27,6 +27,7 @@ from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.live import moved_scene
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.picking import Pick, pick
@@ -332,12 +333,16 @@ class Viewer:
             if self._panel.dark.value != is_dark:
                 self._panel.dark.value = is_dark
             if self.scene is not None:
-                self._nodes.show_ground(self.scene.extent, is_dark=is_dark)
+                self._show_ground(self.scene)
 
     def set_ground(self, is_visible: bool) -> None:
         """Show or hide the grid."""
         with self._lock:
             self._nodes.set_ground_visible(is_visible)
+
+    def _show_ground(self, scene: Scene) -> None:
+        ground = make_ground(scene.extent, scene.origin_G)
+        self._nodes.show_ground(ground, is_dark=self._is_dark)
 
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""
@@ -469,7 +474,7 @@ class Viewer:
             self._selection.clear()
         self._stop_playback()
         if is_new_place:
-            self._nodes.show_ground(scene.extent, is_dark=self._is_dark)
+            self._show_ground(scene)
         self._panel.show_colouring(subject.options.landmark_colouring)
         self._redraw()
 

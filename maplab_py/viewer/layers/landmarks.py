@@ -56,7 +56,8 @@ def point_size(drawing: Drawing) -> float:
 def _selection_steps(drawing: Drawing) -> list[tuple[NDArray[np.bool_], str]]:
     """Return for each condition on landmarks which of them (L,) meet it, and its words."""
     options, vi_map = drawing.options, drawing.vi_map
-    steps = [(np.isfinite(drawing.p_landmarks).all(axis=1), NO_POSITION)]
+    is_finite = np.asarray(np.isfinite(drawing.p_landmarks).all(axis=1))
+    steps: list[tuple[NDArray[np.bool_], str]] = [(is_finite, NO_POSITION)]
     if options.landmarks_min_observers > 0:
         keep = observer_counts(vi_map) >= options.landmarks_min_observers
         steps.append((keep, "by --vis_landmarks_min_observers"))

@@ -146,10 +146,10 @@ def test_following_sends_only_what_changed(viewer: Viewer, two_missions: VIMap) 
     first = f"{first_ids[0, 0]:016x}{first_ids[0, 1]:016x}"
     names = [str(message.get("name", "")) for message in messages]
     sent = {tuple(name.split("/")[2:4]) for name in names if name.startswith("/map/")}
-    for layer in ("trajectories", "vertices"):
+    for layer in ("trajectories", "vertices", "path_ends"):
         assert (layer, first) not in sent
     layers = {layer for layer, *_ in sent}
-    assert layers == {"trajectories", "vertices", "landmarks", "loop_closures"}
+    assert layers == {"trajectories", "vertices", "path_ends", "landmarks", "loop_closures"}
 
 
 def test_only_the_latest_wish_counts(viewer: Viewer, two_missions: VIMap) -> None:
