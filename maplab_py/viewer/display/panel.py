@@ -59,6 +59,9 @@ class Actions(Protocol):
     def set_measuring(self, is_measuring: bool) -> None:
         """Measure between picks."""
 
+    def jump_to_id(self, client: Any, text: str) -> None:
+        """Select what an id means, and move the camera of one page there."""
+
     def clear_pick(self) -> None:
         """Forget what was picked."""
 
@@ -119,8 +122,16 @@ class Panel:
         with self._gui.add_folder("Selection", order=4):
             self.facts = self._gui.add_html(text.hint(_HINT))
             self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
-            self.measuring: Any = self._gui.add_checkbox("measure between picks", False)
+            self.jump: Any = self._gui.add_text(
+                "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
+            )
+            self.measuring: Any = self._gui.add_checkbox(
+                "measure", False, hint="measure the distance between two picks"
+            )
             self.clear = self._gui.add_button("clear", visible=False)
+        self._bind(
+            self.jump, lambda event: self._actions.jump_to_id(event.client, event.target.value)
+        )
         self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
         self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
 
@@ -238,6 +249,10 @@ class Panel:
         self.facts.content = table + (text.hint(note) if note else "")
         self.clear.visible = bool(facts)
         self.show_image(image)
+
+    def show_hint(self, message: str) -> None:
+        """Say in the place of the facts why nothing was selected."""
+        self.facts.content = text.hint(message)
 
     def show_image(self, image: NDArray[np.uint8] | None) -> None:
         """Show the image (H, W, 3) of a vertex, or none."""

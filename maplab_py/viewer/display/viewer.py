@@ -8,7 +8,6 @@ under one lock; maps are values, so what is being drawn cannot change underneath
 from __future__ import annotations
 
 import atexit
-import dataclasses
 import logging
 import threading
 import time
@@ -18,7 +17,7 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
-from maplab_py.viewer.display.camera import aim, aim_initially
+from maplab_py.viewer.display.camera import aim, aim_initially, approach
 from maplab_py.viewer.display.export import export_html
 from maplab_py.viewer.display.panel import Panel, by_user
 from maplab_py.viewer.display.parts import Nodes
@@ -29,15 +28,15 @@ from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.live import moved_scene
+from maplab_py.viewer.lookup import MIN_DIGITS, find_by_id
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.picking import Pick, pick
-from maplab_py.viewer.scene import Scene
+from maplab_py.viewer.playback import without_played
+from maplab_py.viewer.scene import Scene, is_elsewhere
 from maplab_py.vimap import VIMap
 
 _MAX_SHARE = 0.02
 """Part of the time that following a running command may take."""
-
-_PLAYED_LAYERS = {"trajectories", "vertices", "landmarks", "bad_landmarks", "observers"}
 
 logger = logging.getLogger(__name__)
 
@@ -152,9 +151,9 @@ class Viewer:
             self._playback = playback or PlaybackOptions()
             self._image_of = image_of
             self._choices = {}
-            is_elsewhere = self.scene is None or _is_elsewhere(self.scene, scene)
+            moves_view = self.scene is None or is_elsewhere(self.scene, scene)
             self._show(subject, drawing, scene)
-            if is_elsewhere:
+            if moves_view:
                 self.look_at_everything()
         return scene
 
@@ -364,7 +363,7 @@ class Viewer:
                 return
             if self._player is None:
                 self._nodes.show(
-                    _without_played(self.scene), self.visible_layers, self.visible_missions
+                    without_played(self.scene), self.visible_layers, self.visible_missions
                 )
                 clouds = self.subject.clouds if self.subject is not None else ()
                 self._player = Player(
@@ -421,6 +420,21 @@ class Viewer:
         """Mark a thing and show its facts, as if it had been clicked."""
         with self._lock:
             self._selection.pick(self.drawing, picked, self._image_of)
+
+    def jump_to_id(self, client: Any, text: str) -> None:
+        """Select what an id means, and move the camera of one page there."""
+        if len(text.strip()) < MIN_DIGITS:
+            return  # the page sends every key
+        with self._lock:
+            try:
+                picked = find_by_id(self.drawing, text)
+            except UserError as error:
+                self._panel.show_hint(str(error))
+                return
+            self.select(picked)
+            if client is not None:
+                with client.atomic():
+                    approach(client.camera, picked.p, 0.25 * self.drawing.extent.radius_m)
 
     def _clicked(self, event: Any) -> None:
         if self.scene is None:
@@ -482,22 +496,6 @@ class Viewer:
         if self.scene is None:
             return
         layers, missions = self.visible_layers, self.visible_missions
-        shown = self.scene if self._player is None else _without_played(self.scene)
+        shown = self.scene if self._player is None else without_played(self.scene)
         self._nodes.show(shown, layers, missions)
         self._panel.show(self.scene, layers, missions)
-
-
-def _is_elsewhere(before: Scene, after: Scene) -> bool:
-    """Tell whether the view shall move: another map, or one that now takes more room."""
-    larger = after.extent.radius_m > 1.2 * before.extent.radius_m
-    return before.title != after.title or larger
-
-
-def _without_played(scene: Scene) -> Scene:
-    """Return the scene without the layers that playback draws itself."""
-    kept = tuple(
-        layer
-        for layer in scene.layers
-        if layer.name not in _PLAYED_LAYERS and not layer.name.startswith("cloud_")
-    )
-    return dataclasses.replace(scene, layers=kept)

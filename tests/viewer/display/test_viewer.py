@@ -20,6 +20,7 @@ from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
 from tests.support.waiting import wait_until
 from tests.viewer.display.page_messages import (
@@ -188,6 +189,28 @@ def test_layers_and_missions_can_be_hidden(viewer: Viewer, two_missions: VIMap) 
     assert "landmarks" not in page.layers
     assert first not in {mission for _, mission in page.drawn}
     assert second in {mission for _, mission in page.drawn}
+
+
+def test_an_id_selects_what_it_names(viewer: Viewer, two_missions: VIMap) -> None:
+    camera = SimpleNamespace(position=np.array([0.0, -8.0, 6.0]), look_at=np.zeros(3))
+    page = SimpleNamespace(camera=camera, atomic=threading.Lock)
+    viewer.jump_to_id(page, to_hex(two_missions.landmarks.id[4]))
+    picked = viewer.selection.picked
+    assert picked is not None
+    assert picked.row == 4
+    np.testing.assert_allclose(camera.look_at, two_missions.p_G[4])
+    back = camera.position - camera.look_at
+    np.testing.assert_allclose(back / np.linalg.norm(back), [0.0, -0.8, 0.6], atol=1e-9)
+    viewer.jump_to_id(page, "f" * 32)
+    assert viewer.selection.picked is picked
+    contents = [
+        str(c.get("content", "")) for c in map(_properties, page_state(viewer).controls.values())
+    ]
+    assert any("no vertex, landmark" in content for content in contents)
+
+
+def _properties(control: Message) -> Message:
+    return {**control, **control.get("props", {})}
 
 
 def test_colouring_changes_the_legend(viewer: Viewer) -> None:
