@@ -70,11 +70,11 @@ class Axes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh of one colour."""
+    """A triangle mesh, in one colour or with a colour at each corner."""
 
     p: F32  # (N, 3) [m]
     faces: NDArray[np.int32]  # (F, 3)
-    colour: U8  # (3,)
+    colours: U8  # (N, 3), or (3,) of the whole mesh
 
     def __len__(self) -> int:
         return len(self.faces)

@@ -334,6 +334,11 @@ def test_clouds_and_meshes() -> None:
     mesh = scene.layer("mesh_0").parts[""]
     assert isinstance(mesh, Mesh)
     np.testing.assert_array_equal(mesh.faces, faces)
+    assert mesh.colours.shape == (3,)
+    coloured = _scene(walk_map(), clouds=(Cloud("surface", p[:5], own[:5], faces=faces),))
+    mesh = coloured.layer("mesh_0").parts[""]
+    assert isinstance(mesh, Mesh)
+    np.testing.assert_array_equal(mesh.colours, own[:5])
 
 
 def test_missions_in_the_panel(two_missions: VIMap) -> None:

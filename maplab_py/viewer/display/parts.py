@@ -9,7 +9,9 @@ import numpy as np
 import viser
 
 from maplab_py.array_types import F32, F64, U8
+from maplab_py.viewer.colours import linear_light
 from maplab_py.viewer.drawing import axis_lines
+from maplab_py.viewer.glb import coloured_glb, is_coloured
 from maplab_py.viewer.ground import Ground
 from maplab_py.viewer.scene import (
     WHOLE_MAP,
@@ -166,7 +168,9 @@ def add_part(
                 thickness_units="screen",
             )
         ]
-    colour = (int(part.colour[0]), int(part.colour[1]), int(part.colour[2]))
+    if is_coloured(part):
+        return [scene.add_glb(name, coloured_glb(part))]
+    colour = (int(part.colours[0]), int(part.colours[1]), int(part.colours[2]))
     return [scene.add_mesh_simple(name, part.p, part.faces, color=colour, side="double")]
 
 
@@ -191,11 +195,10 @@ def _add_labels(
 def _line_colours(colours: U8) -> U8:
     """Return colours (N, 2, 3) of both ends of lines (N,).
 
-    viser takes the colours of lines for linear light and those of all else for sRGB (IEC 61966-2-1).
+    viser takes the colours of lines for linear light and those of all else for sRGB.
     """
-    s = colours / 255.0
-    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.repeat(np.round(255.0 * linear).astype(np.uint8)[:, None], 2, axis=1)
+    linear = np.round(255.0 * linear_light(colours)).astype(np.uint8)
+    return np.repeat(linear[:, None], 2, axis=1)
 
 
 def _moved_in_place(node: _Node, part: Part) -> bool:

@@ -23,7 +23,7 @@ from maplab_py.viewer.display.panel import Panel, by_user
 from maplab_py.viewer.display.parts import Nodes
 from maplab_py.viewer.display.picture import save_picture, take_picture
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.display.selection import ImageOf, Selection
+from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
@@ -39,11 +39,6 @@ _MAX_SHARE = 0.02
 """Part of the time that following a running command may take."""
 
 logger = logging.getLogger(__name__)
-
-
-def no_image(row: int) -> None:  # noqa: ARG001
-    """Say that a vertex has no image."""
-    return
 
 
 class Viewer:

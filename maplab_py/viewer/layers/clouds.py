@@ -52,10 +52,12 @@ def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) ->
 
 
 def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
-    """Return a triangle mesh as a layer."""
+    """Return a triangle mesh as a layer, in its own colours if it has any."""
     faces = np.zeros((0, 3), dtype=np.int32) if cloud.faces is None else cloud.faces
     p = np.ascontiguousarray(cloud.p_G - drawing.origin_G, dtype=np.float32)
-    colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
+    colour = cloud.colours
+    if colour is None:
+        colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
     parts: dict[str, Part] = {cloud.mission_id: Mesh(p, faces, colour)}
     return Layer(f"mesh_{number}", cloud.title, parts, len(faces))
 
