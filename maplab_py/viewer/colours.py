@@ -40,6 +40,7 @@ QUALITY = from_hex("#8a93a0", "#d2455a", "#3fa372")
 """By `LandmarkQuality`: unknown, bad, good."""
 
 REFERENCE = from_hex("#8a93a0")[0]
+HIDDEN = from_hex("#c3c8d0")[0]
 TRUTH = from_hex("#c9a227")[0]
 PICKED = from_hex("#ffb000")[0]
 SECOND_PICK = from_hex("#ff5d8f")[0]

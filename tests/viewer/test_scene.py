@@ -190,6 +190,23 @@ def test_height_colours_rise_and_repeat() -> None:
     np.testing.assert_array_equal(colour, colours.ramp(np.mod(z[rows], 1.0), colours.SEQUENTIAL))
 
 
+def test_a_single_mission_is_coloured_by_height(two_missions: VIMap) -> None:
+    first, second = to_hex_list(two_missions.missions.id)
+    only = {"color_landmarks_by_height": True, "color_only_missions": f"{second[:8]}, abcdabcd"}
+    scene = _scene(two_missions, options=only)
+    by_mission, by_height = (
+        _scene(two_missions, options=options).layer("landmarks").parts
+        for options in ({}, {"color_landmarks_by_height": True})
+    )
+    parts = scene.layer("landmarks").parts
+    np.testing.assert_array_equal(parts[first].colours, by_mission[first].colours)
+    assert (parts[second].colours != by_mission[second].colours).any()
+    order = np.argsort(parts[second].p[:, 2])
+    assert (parts[second].colours[order[-1]] == colours.SEQUENTIAL[-1]).all()
+    assert scene.notes == ("--vis_color_only_missions: no mission has the id abcdabcd",)
+    assert by_height.keys() == parts.keys()
+
+
 def test_observation_counts_are_on_a_scale_from_one() -> None:
     vi_map = walk_map()
     options = {"color_landmarks_by_number_of_observations": True, "landmarks_max_observers": 5}

@@ -302,12 +302,12 @@ class Viewer:
             self._stop_playback()
             self._redraw()
 
-    def set_colouring(self, colouring: str) -> None:
-        """Colour landmarks by another rule."""
+    def set_colouring(self, colouring: str, only_mission: str = "") -> None:
+        """Colour landmarks by another rule, all or those of a mission (id) alone."""
         with self._lock:
             if self.subject is None:
                 return
-            options = self.subject.options.with_colouring(colouring)
+            options = self.subject.options.with_colouring(colouring, only_mission)
             self.follow(self.subject.replace(options=options))
 
     def set_point_scale(self, factor: float) -> None:
@@ -484,7 +484,10 @@ class Viewer:
         self._stop_playback()
         if is_new_place:
             self._show_ground(scene)
-        self._panel.show_colouring(subject.options.landmark_colouring)
+        options = subject.options
+        self._panel.show_colouring(
+            options.landmark_colouring, scene.missions, options.color_only_missions
+        )
         self._redraw()
 
     def _redraw(self) -> None:

@@ -42,6 +42,8 @@ def landmarks(drawing: Drawing) -> list[Layer]:
         is_visible = name == "landmarks" or not drawing.options.check_landmark_constrained
         thinned = (len(rows) - len(shown), MAX_POINTS)
         notes = omission_notes(title, len(shown), *_losses(steps, members_of), thinned)
+        if name == "landmarks":
+            notes += chosen_missions(drawing)[1]
         layers.append(
             Layer(name, title, parts, len(rows), Entity.LANDMARK, is_visible, legend, notes)
         )
@@ -119,10 +121,36 @@ def first_observer(vi_map: VIMap) -> I64:
 
 def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Return a colour (L, 3) for each landmark by the rule of the options, and the legend."""
+    every, legend = _rule_colours(drawing)
+    if drawing.options.color_only_missions:
+        chosen, _ = chosen_missions(drawing)
+        is_other = ~chosen[drawing.landmark_mission]
+        every = np.where(is_other[:, None], _colours_by_mission(drawing), every)
+    return every, legend
+
+
+def chosen_missions(drawing: Drawing) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Return which missions (M,) the rule of colours is for, and a line for each unknown id."""
+    chosen = np.zeros(len(drawing.mission_ids), dtype=np.bool_)
+    problems = []
+    for prefix in drawing.options.color_only_missions.replace(",", " ").lower().split():
+        matches = [mission_id.startswith(prefix) for mission_id in drawing.mission_ids]
+        chosen |= np.array(matches, dtype=np.bool_)
+        if not any(matches):
+            problems.append(f"--vis_color_only_missions: no mission has the id {prefix}")
+    return chosen, tuple(problems)
+
+
+def _colours_by_mission(drawing: Drawing) -> U8:
+    pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.45)
+    return pale[drawing.landmark_mission]
+
+
+def _rule_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour all landmarks by the rule."""
     rule = drawing.options.landmark_colouring
     if rule == "mission":
-        pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.45)
-        return pale[drawing.landmark_mission], ()
+        return _colours_by_mission(drawing), ()
     if rule == "quality":
         entries = ("not judged", "bad", "good")
         legend = zip(entries, colours.hex_codes(colours.QUALITY), strict=True)
@@ -145,8 +173,11 @@ def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, 
     """Colour by height or by time."""
     options, vi_map = drawing.options, drawing.vi_map
     if rule == "height":
+        height = vi_map.p_G[:, 2]
+        if options.color_only_missions:
+            height = np.where(chosen_missions(drawing)[0][drawing.landmark_mission], height, np.nan)
         part, low, high = colours.normalised(
-            vi_map.p_G[:, 2], options.color_by_height_period_m, options.color_by_height_offset_m
+            height, options.color_by_height_period_m, options.color_by_height_offset_m
         )
         title, unit = "height", "m"
     else:
