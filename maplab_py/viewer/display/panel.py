@@ -16,7 +16,7 @@ from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display import text
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.facts import Facts
-from maplab_py.viewer.options import COLOURINGS
+from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
 from maplab_py.viewer.scene import MissionEntry, Scene
 
 MAX_SWITCHES = 24
@@ -122,15 +122,19 @@ class Panel:
         mission_id = self._mission_of_label.get(self.coloured_mission.value, "")
         self._actions.set_colouring(self.colouring.value, mission_id)
 
-    def show_colouring(self, colouring: str, missions: tuple[MissionEntry, ...], only: str) -> None:
+    def show_colouring(
+        self, options: VisualizationOptions, missions: tuple[MissionEntry, ...]
+    ) -> None:
         """Show by which rule landmarks are coloured, and which mission the rule is for."""
+        colouring, only = options.landmark_colouring, options.color_only_missions.strip().lower()
         if self.colouring.value != colouring:
             self.colouring.value = colouring
         self._mission_of_label = {text.mission_label(m): m.id for m in missions}
         labels = (_ALL, *self._mission_of_label)
         if tuple(self.coloured_mission.options) != labels:
             self.coloured_mission.options = labels
-        chosen = next((label for label, key in self._mission_of_label.items() if key == only), _ALL)
+        keys = self._mission_of_label.items()
+        chosen = next((label for label, key in keys if only and key.startswith(only)), _ALL)
         if self.coloured_mission.value != chosen:
             self.coloured_mission.value = chosen
         if self.coloured_mission.visible != (len(missions) > 1):
@@ -191,7 +195,7 @@ class Panel:
 
     def show(self, scene: Scene, layers: set[str], missions: set[str]) -> None:
         """Say what the scene has: its counts, legend, layers and missions."""
-        self.header.content = text.header(scene)
+        self._say_what_is_shown(scene)
         entries = [
             entry for layer in scene.layers if layer.name in layers for entry in layer.legend
         ]
@@ -207,6 +211,14 @@ class Panel:
                 box.label = text.layer_label(layer)
             if box.value != (layer.name in layers):
                 box.value = layer.name in layers
+
+    def _say_what_is_shown(self, scene: Scene) -> None:
+        """Fill the header; a map's only mission is named there and needs no folder."""
+        is_single = len(scene.missions) == 1
+        legend = text.mission_legend(scene.missions) if is_single else ""
+        self.header.content = text.header(scene) + legend
+        if self._missions.visible == is_single:
+            self._missions.visible = not is_single
 
     def say(self, message: str) -> None:
         """Show a message in the place of the header."""
@@ -235,8 +247,9 @@ class Panel:
             if 1 < len(scene.missions) <= MAX_SWITCHES:
                 self._add_mission_switches(scene, missions)
                 return
-            self._mission_widgets.append(self._gui.add_html(text.mission_legend(scene.missions)))
             if len(scene.missions) > MAX_SWITCHES:
+                legend = text.mission_legend(scene.missions)
+                self._mission_widgets.append(self._gui.add_html(legend))
                 names = (_ALL, *(text.mission_label(m) for m in scene.missions))
                 self._add_mission_list(scene, names)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -81,6 +83,22 @@ class Nodes:
                         self._remove(key)
                     self._nodes[key] = _Node(part, self._add(_node_name(*key), part))
         return sent
+
+    @contextmanager
+    def with_hidden(self, scene: Scene, layers: set[str], missions: set[str]) -> Iterator[None]:
+        """Send hidden layers too, as nodes that are not visible, for as long as this lasts."""
+        with self._server.atomic():
+            self.show(scene, set(scene.names), missions)
+            self._set_visible(set(scene.names) - layers, is_visible=False)
+        try:
+            yield
+        finally:
+            self.show(scene, layers, missions)
+
+    def _set_visible(self, layers: set[str], *, is_visible: bool) -> None:
+        handles = (h for key, node in self._nodes.items() if key[0] in layers for h in node.handles)
+        for handle in handles:
+            handle.visible = is_visible
 
     def scale_points(self, factor: float) -> None:
         """Draw all points larger or smaller."""

@@ -217,17 +217,16 @@ class Viewer:
         return pages
 
     def export(self, path: Path) -> int:
-        """Write what is visible to one HTML file; return its size in bytes.
+        """Write all layers to one HTML file with switches; return its size in bytes.
 
         Raises:
             UserError: Nothing is shown, or the file cannot be written.
         """
         scene = self._shown()
         self.wait()
-        with self._lock:
-            return export_html(
-                self._server, scene, self.visible_layers, path, is_dark=self._is_dark
-            )
+        layers = self.visible_layers
+        with self._lock, self._nodes.with_hidden(self._drawn(scene), layers, self.visible_missions):
+            return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
 
     def _shown(self) -> Scene:
         if self.scene is None:
@@ -484,16 +483,15 @@ class Viewer:
         self._stop_playback()
         if is_new_place:
             self._show_ground(scene)
-        options = subject.options
-        self._panel.show_colouring(
-            options.landmark_colouring, scene.missions, options.color_only_missions
-        )
+        self._panel.show_colouring(subject.options, scene.missions)
         self._redraw()
 
     def _redraw(self) -> None:
         if self.scene is None:
             return
         layers, missions = self.visible_layers, self.visible_missions
-        shown = self.scene if self._player is None else without_played(self.scene)
-        self._nodes.show(shown, layers, missions)
+        self._nodes.show(self._drawn(self.scene), layers, missions)
         self._panel.show(self.scene, layers, missions)
+
+    def _drawn(self, scene: Scene) -> Scene:
+        return scene if self._player is None else without_played(scene)

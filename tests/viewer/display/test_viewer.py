@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -207,6 +208,19 @@ def test_an_id_selects_what_it_names(viewer: Viewer, two_missions: VIMap) -> Non
         str(c.get("content", "")) for c in map(_properties, page_state(viewer).controls.values())
     ]
     assert any("no vertex, landmark" in content for content in contents)
+
+
+def test_an_export_has_all_layers_and_leaves_the_page_as_it_was(
+    viewer: Viewer, two_missions: VIMap, tmp_path: Path
+) -> None:
+    before = page_state(viewer).drawn
+    viewer.export(tmp_path / "view.html")
+    assert page_state(viewer).drawn == before
+    text = (tmp_path / "view.html").read_text()
+    assert viewer.scene is not None
+    for layer in viewer.scene.layers:
+        box = f"data-layer='{layer.name}'" + (" checked" if layer.is_visible else "")
+        assert f"{box}>" in text
 
 
 def _properties(control: Message) -> Message:
