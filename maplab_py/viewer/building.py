@@ -79,7 +79,11 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     if subject.shows_sensors:
         layer = cameras.sensor_axes(subject.vi_map.sensors)
         return Scene(subject.title, (layer,), (), drawing.extent, drawing.origin_G)
-    layers: list[Layer] = [paths.trajectories(drawing), paths.vertices(drawing)]
+    layers: list[Layer] = [
+        paths.trajectories(drawing),
+        paths.vertices(drawing),
+        paths.path_ends(drawing),
+    ]
     layers += landmarks.landmarks(drawing)
     layers += [paths.loop_closures(drawing), paths.absolute_poses(drawing)]
     layers += covariances.covariance_layers(drawing)
@@ -101,7 +105,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers += added
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
     extent = drawing.extent
-    notes = _notes(layers) + unreadable + problems
+    notes = [note for layer in layers for note in layer.notes] + unreadable + problems
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
         notes.insert(0, f"in grey: {subject.other_name}")
@@ -162,17 +166,3 @@ def _sensor_drawing(subject: Subject) -> Drawing:
 def _good_landmarks(drawing: Drawing) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
     table = drawing.vi_map.landmarks
     return np.flatnonzero((table.quality != 1) & np.isfinite(drawing.p_landmarks).all(axis=1))
-
-
-def _notes(layers: list[Layer]) -> list[str]:
-    """Say where not everything is drawn."""
-    partial = [
-        layer
-        for layer in layers
-        if layer.name.startswith(("landmarks", "bad_landmarks", "cloud", "reference_landmarks"))
-        and layer.drawn < layer.total
-    ]
-    return [
-        f"{layer.title}: {layer.drawn:,} of {layer.total:,} are drawn (--vis_max_points)"
-        for layer in partial
-    ]

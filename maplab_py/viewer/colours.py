@@ -40,6 +40,7 @@ QUALITY = from_hex("#8a93a0", "#d2455a", "#3fa372")
 """By `LandmarkQuality`: unknown, bad, good."""
 
 REFERENCE = from_hex("#8a93a0")[0]
+HIDDEN = from_hex("#c3c8d0")[0]
 TRUTH = from_hex("#c9a227")[0]
 PICKED = from_hex("#ffb000")[0]
 SECOND_PICK = from_hex("#ff5d8f")[0]
@@ -94,3 +95,9 @@ def normalised(values: F64, period: float = 0.0, offset: float = 0.0) -> tuple[F
 def hex_codes(colours: U8) -> Sequence[str]:
     """Return the codes of colours (N, 3)."""
     return [to_hex(colour) for colour in colours]
+
+
+def linear_light(colours: U8) -> F64:
+    """Return the linear light (..., 3), 0 to 1, of colours in sRGB (IEC 61966-2-1)."""
+    s = colours / 255.0
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)

@@ -11,7 +11,7 @@ from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.scene import Layer, Part, Points, Scene, Segments
 from maplab_py.vimap import VIMap
 
-_VERTEX_LAYERS = ("vertices",)
+_VERTEX_LAYERS = ("vertices", "path_ends")
 _PATH_LAYERS = ("trajectories",)
 _LANDMARK_LAYERS = ("landmarks", "bad_landmarks")
 

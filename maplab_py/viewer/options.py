@@ -42,6 +42,11 @@ class VisualizationOptions:
     color_landmarks_by_first_observer_frame: bool = option(
         False, help="Colour landmarks by the camera of the frame that observed them first."
     )
+    color_only_missions: str = option(
+        "",
+        help="Colour the landmarks of these missions alone by the rule, the others by mission: "
+        "ids or their beginnings, separated by commas; empty = all.",
+    )
     color_by_height_offset_m: float = option(0.0, help="Height of the first colour.", unit="m")
     color_by_height_period_m: float = option(
         0.0, help="Height after which colours repeat; 0 = over the height of the map.", unit="m"
@@ -127,10 +132,11 @@ class VisualizationOptions:
         )
         return next((name for is_wanted, name in rules if is_wanted), "grey")
 
-    def with_colouring(self, colouring: str) -> VisualizationOptions:
+    def with_colouring(self, colouring: str, only_missions: str = "") -> VisualizationOptions:
         """Return the options with another rule (one of `COLOURINGS`) for landmarks."""
         return dataclasses.replace(
             self,
+            color_only_missions=only_missions,
             color_landmarks_by_height=colouring == "height",
             color_landmarks_by_number_of_observations=colouring == "observations",
             color_landmarks_by_observer_datasets=colouring == "missions",

@@ -10,9 +10,12 @@ from maplab_py.array_types import F64, I64
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.first_sightings import first_observer
 from maplab_py.viewer.options import PlaybackOptions
+from maplab_py.viewer.scene import Scene
 from maplab_py.viewer.subsampling import spread_rows
 
 _RECENT_STEPS = 8
+
+_PLAYED_LAYERS = {"trajectories", "vertices", "landmarks", "bad_landmarks", "observers"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,3 +84,13 @@ def _progress(drawing: Drawing, options: PlaybackOptions) -> tuple[F64, F64]:
         longest = max(longest, float(travelled[-1]))
     seconds = np.linspace(0.0, duration, options.steps + 1)
     return value / max(longest, 1e-12), seconds
+
+
+def without_played(scene: Scene) -> Scene:
+    """Return the scene without the layers that playback draws itself."""
+    kept = tuple(
+        layer
+        for layer in scene.layers
+        if layer.name not in _PLAYED_LAYERS and not layer.name.startswith("cloud_")
+    )
+    return dataclasses.replace(scene, layers=kept)

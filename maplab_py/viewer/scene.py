@@ -37,6 +37,7 @@ class Points:
     colours: U8  # (N, 3)
     rows: I64  # (N,) rows of the map's table
     size_m: float
+    labels: tuple[str, ...] = ()  # one for each of the first points; empty = no label
 
     def __len__(self) -> int:
         return len(self.p)
@@ -69,11 +70,11 @@ class Axes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh of one colour."""
+    """A triangle mesh, in one colour or with a colour at each corner."""
 
     p: F32  # (N, 3) [m]
     faces: NDArray[np.int32]  # (F, 3)
-    colour: U8  # (3,)
+    colours: U8  # (N, 3), or (3,) of the whole mesh
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -103,6 +104,7 @@ class Layer:
     entity: Entity = Entity.NONE
     is_visible: bool = True
     legend: tuple[LegendEntry, ...] = ()
+    notes: tuple[str, ...] = ()  # why parts draw fewer
 
     @property
     def drawn(self) -> int:
@@ -163,3 +165,9 @@ def is_same_part(a: Part | None, b: Part | None) -> bool:
     return all(
         np.array_equal(x, y) if isinstance(x, np.ndarray) else bool(x == y) for x, y in pairs
     )
+
+
+def is_elsewhere(before: Scene, after: Scene) -> bool:
+    """Tell whether the view shall move: another map, or one that now takes more room."""
+    larger = after.extent.radius_m > 1.2 * before.extent.radius_m
+    return before.title != after.title or larger

@@ -1,4 +1,4 @@
-"""How long big maps take to open in a browser, and what following costs the optimiser.
+"""How long big maps take to open in a browser, how smoothly they turn, and what following costs.
 
 python -m tests.benchmarks.viewer
 """
@@ -91,6 +91,30 @@ def opening(subject: Subject, layer: str) -> dict[str, float]:
     }  # fmt: skip
 
 
+def frame_rate(landmarks: int, seconds: float = 10.0) -> dict[str, float]:
+    """Return the frames a second while the view is turned with the mouse, all landmarks drawn."""
+    options = VisualizationOptions(max_points=landmarks)
+    subject = Subject(big_map(2_000, landmarks, 3 * landmarks), "turned", options)
+    counter = "() => window.__viserTestpoints.rendererInfo.render.frame"
+    with chromium() as browser:
+        viewer = Viewer(0)
+        viewer.show(subject)
+        page = Page(browser, viewer.url, frame_ms=0)
+        page.wait_until(lambda: not is_blank(page.picture()), 120.0)
+        page.settle(3000)
+        page.page.mouse.move(300.0, 400.0)
+        page.page.mouse.down()
+        before, began = page.page.evaluate(counter), time.perf_counter()
+        step = 0
+        while time.perf_counter() - began < seconds:
+            step += 1
+            page.page.mouse.move(300.0 + 4.0 * (step % 60), 400.0)
+        frames = page.page.evaluate(counter) - before
+        took = time.perf_counter() - began
+        viewer.stop()
+    return {"landmarks": landmarks, "frames_per_s": frames / took}
+
+
 def picking(subject: Subject) -> float:
     """Return the seconds that one click takes to be understood."""
     scene = build_scene(subject)
@@ -154,6 +178,8 @@ def main() -> None:
         options = VisualizationOptions(max_points=limit)
         subject = Subject(small, "dense", options, clouds=(dense,))
         print(json.dumps({f"2M points, {limit} drawn": opening(subject, "cloud_0")}))
+    for landmarks in (200_000, 1_000_000):
+        print(json.dumps({"turning the view, in software": frame_rate(landmarks)}))
     print(json.dumps({"picking among 150k landmarks [s]": picking(keyframes)}))
     for folder in sys.argv[1:]:
         print(json.dumps({f"optvi on {Path(folder).name}": following(Path(folder))}))

@@ -72,6 +72,26 @@ def test_trajectories_join_the_vertices_of_one_mission(two_missions: VIMap) -> N
     assert list(scene.layer("trajectories").parts) == to_hex_list(two_missions.missions.id)
 
 
+def test_ends_of_paths_are_marked(two_missions: VIMap) -> None:
+    scene = _scene(two_missions)
+    parts = scene.layer("path_ends").parts
+    ids = to_hex_list(two_missions.missions.id)
+    assert list(parts) == ids
+    for mission_id, rows in zip(ids, ([0, 11], [12, 20]), strict=True):
+        dots = parts[mission_id]
+        assert isinstance(dots, Points)
+        np.testing.assert_array_equal(dots.rows, rows)
+        np.testing.assert_allclose(dots.p, two_missions.T_G_I[rows, 4:], atol=1e-5)
+        assert dots.labels == (f"start {mission_id[:8]}", f"end {mission_id[:8]}")
+    closed = np.array(walk_map().vertices.T_M_I)
+    closed[-1] = closed[0]
+    vi_map = walk_map()
+    loop = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=closed))
+    (dots,) = _scene(loop).layer("path_ends").parts.values()
+    assert isinstance(dots, Points)
+    assert dots.labels == ("start and end",)
+
+
 def test_landmarks_good_and_bad(two_missions: VIMap) -> None:
     scene = _scene(two_missions)
     good, _, good_rows = _points(scene, "landmarks")
@@ -172,6 +192,23 @@ def test_height_colours_rise_and_repeat() -> None:
     np.testing.assert_array_equal(colour, colours.ramp(np.mod(z[rows], 1.0), colours.SEQUENTIAL))
 
 
+def test_a_single_mission_is_coloured_by_height(two_missions: VIMap) -> None:
+    first, second = to_hex_list(two_missions.missions.id)
+    only = {"color_landmarks_by_height": True, "color_only_missions": f"{second[:8]}, abcdabcd"}
+    scene = _scene(two_missions, options=only)
+    by_mission, by_height = (
+        _scene(two_missions, options=options).layer("landmarks").parts
+        for options in ({}, {"color_landmarks_by_height": True})
+    )
+    parts = scene.layer("landmarks").parts
+    np.testing.assert_array_equal(parts[first].colours, by_mission[first].colours)
+    assert (parts[second].colours != by_mission[second].colours).any()
+    order = np.argsort(parts[second].p[:, 2])
+    assert (parts[second].colours[order[-1]] == colours.SEQUENTIAL[-1]).all()
+    assert scene.notes == ("--vis_color_only_missions: no mission has the id abcdabcd",)
+    assert by_height.keys() == parts.keys()
+
+
 def test_observation_counts_are_on_a_scale_from_one() -> None:
     vi_map = walk_map()
     options = {"color_landmarks_by_number_of_observations": True, "landmarks_max_observers": 5}
@@ -188,6 +225,29 @@ def test_flags_leave_landmarks_out() -> None:
     many = {"landmarks_min_number_of_observer_missions": 2}
     assert "landmarks" not in _scene(vi_map, options=many).names
     assert "landmarks" not in _scene(vi_map, options={"show_only_landmark_type": "9"}).names
+
+
+def test_every_landmark_that_is_left_out_has_its_reason(two_missions: VIMap) -> None:
+    few = {"landmarks_min_observers": 10, "max_points": 10}
+    scene = _scene(two_missions, options=few, other=two_missions)
+    bad = int(np.count_nonzero(two_missions.landmarks.quality == 1))
+    total = len(two_missions.landmarks)
+    counts = np.diff(two_missions.observation_start)
+    unseen = int(np.count_nonzero((counts < 10) & (two_missions.landmarks.quality != 1)))
+    notes = {note.partition(":")[0]: note for note in scene.notes}
+    assert notes["Landmarks"] == (
+        f"Landmarks: 10 of {total - bad} are drawn (left out: {unseen} by "
+        f"--vis_landmarks_min_observers, {total - bad - unseen - 10} by --vis_max_points)"
+    )
+    assert notes["Reference landmarks"] == (
+        f"Reference landmarks: 10 of {total} are drawn (left out: {bad} of bad quality, "
+        f"{total - bad - 10} by --vis_max_points)"
+    )
+    everything = _scene(two_missions, other=two_missions).notes
+    assert everything == (
+        "in grey: before",
+        f"Reference landmarks: {total - bad} of {total} are drawn (left out: {bad} of bad quality)",
+    )
 
 
 def test_missions_can_be_drawn_apart(two_missions: VIMap) -> None:
@@ -289,10 +349,15 @@ def test_clouds_and_meshes() -> None:
     assert len(rows) == 100
     np.testing.assert_allclose(drawn, p[rows], atol=1e-6)
     np.testing.assert_array_equal(colour, own[rows])
-    assert scene.notes == ("cloud: 100 of 500 are drawn (--vis_max_points)",)
+    assert scene.notes == ("cloud: 100 of 500 are drawn (left out: 400 by --vis_max_points)",)
     mesh = scene.layer("mesh_0").parts[""]
     assert isinstance(mesh, Mesh)
     np.testing.assert_array_equal(mesh.faces, faces)
+    assert mesh.colours.shape == (3,)
+    coloured = _scene(walk_map(), clouds=(Cloud("surface", p[:5], own[:5], faces=faces),))
+    mesh = coloured.layer("mesh_0").parts[""]
+    assert isinstance(mesh, Mesh)
+    np.testing.assert_array_equal(mesh.colours, own[:5])
 
 
 def test_missions_in_the_panel(two_missions: VIMap) -> None:

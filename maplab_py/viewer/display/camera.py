@@ -85,6 +85,15 @@ def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bo
     camera.far = 100.0 * extent.radius_m
 
 
+def approach(camera: Any, p: F64, distance_m: float) -> None:
+    """Look at a point (3,) of the scene from a distance, in the direction of the present view."""
+    back = np.asarray(camera.position) - np.asarray(camera.look_at)
+    length = float(np.linalg.norm(back))
+    back = back / length if length > 1e-9 else np.array([0.0, -0.8, 0.6])
+    camera.position = p + distance_m * back
+    camera.look_at = p
+
+
 def aim_initially(camera: Any, extent: Extent, *, beside_panel: bool = True) -> None:
     """Set what new pages begin with (its field for the up direction has another name)."""
     position, target = view_of(extent, beside_panel=beside_panel)

@@ -13,17 +13,32 @@ from maplab_py.viewer.scene import Scene
 _OVERLAY = """
 <div style="position:fixed;left:14px;bottom:14px;max-width:19em;padding:4px 2px;border-radius:8px;
 font-family:system-ui,sans-serif;font-size:15px;z-index:10;pointer-events:none;
-background:{ground};color:{ink}">{header}{missions}{legend}</div>
+background:{ground};color:{ink};max-height:calc(100vh - 40px);overflow:auto">{header}{missions}
+{switches}{legend}</div>
 """
+
+_SCRIPT = """
+<script>
+document.querySelectorAll("input[data-layer]").forEach(box => box.addEventListener("change", () => {
+  const nodes = window.__viserSceneTree.getState();
+  const paths = ["/map/" + box.dataset.layer + "/", "/labels/map/" + box.dataset.layer + "/"];
+  for (const name in nodes)
+    if (nodes[name] && paths.some(path => name.startsWith(path)))
+      nodes[name].overrideVisibility = nodes[name].effectiveVisibility = box.checked;
+  window.dispatchEvent(new Event("resize"));
+}));
+</script>
+"""
+"""Switches layers by the scene tree that viser's page offers to its tests."""
 
 
 def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_dark: bool) -> int:
-    """Write what is visible to a file; return its size in bytes.
+    """Write what the server shows to a file, with a switch per layer; return its size in bytes.
 
     Args:
         server: The viser server that shows the scene.
         scene: What it shows.
-        layers: Names of the visible layers, for the legend.
+        layers: Names of the layers that are visible at first; the others have nodes that are hidden.
         path: The file.
         is_dark: Theme.
 
@@ -39,9 +54,10 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
         ink="#d8dbe0" if is_dark else "#2a2d33",
         header=text.header(scene),
         missions=text.mission_legend(scene.missions),
+        switches=text.layer_switches(scene.layers, layers),
         legend=text.legend(dict.fromkeys(entries)),
     )
     end = page.rindex("</body>")
-    page = f"{page[:end]}{overlay}{page[end:]}"
+    page = f"{page[:end]}{overlay}{_SCRIPT}{page[end:]}"
     write_text(path, [page], overwrite=True)
     return len(page.encode())

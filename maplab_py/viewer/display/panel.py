@@ -5,20 +5,22 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display import text
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.facts import Facts
-from maplab_py.viewer.options import COLOURINGS
-from maplab_py.viewer.scene import Scene
+from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
+from maplab_py.viewer.scene import MissionEntry, Scene
 
-MAX_CHECKBOXES = 24
-"""Beyond this many missions the panel offers a list instead of a checkbox each."""
+MAX_SWITCHES = 24
+"""Beyond this many missions the panel offers a list instead of a switch each."""
 
 _ALL = "all missions"
 _HINT = "Click a vertex, a landmark or a loop closure."
@@ -35,8 +37,8 @@ class Actions(Protocol):
     def set_missions(self, visible: set[str]) -> None:
         """Show these missions and no others."""
 
-    def set_colouring(self, colouring: str) -> None:
-        """Colour landmarks by another rule."""
+    def set_colouring(self, colouring: str, only_mission: str = "") -> None:
+        """Colour landmarks by another rule, all or those of a mission (id) alone."""
 
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
@@ -58,6 +60,9 @@ class Actions(Protocol):
 
     def set_measuring(self, is_measuring: bool) -> None:
         """Measure between picks."""
+
+    def jump_to_id(self, client: Any, text: str) -> None:
+        """Select what an id means, and move the camera of one page there."""
 
     def clear_pick(self) -> None:
         """Forget what was picked."""
@@ -91,6 +96,7 @@ class Panel:
         self._actions = actions
         self._lock = lock
         self._checkboxes: dict[str, Any] = {}
+        self._mission_of_label: dict[str, str] = {}
         self._mission_widgets: list[Any] = []
         self._signature: tuple[Any, ...] = ()
         self._steps = 0
@@ -100,8 +106,10 @@ class Panel:
         self._missions = self._gui.add_folder("Missions", order=2)
         with self._gui.add_folder("Colours", order=3):
             self.colouring: Any = self._gui.add_dropdown("landmarks by", COLOURINGS)
+            self.coloured_mission: Any = self._gui.add_dropdown("of", (_ALL,), visible=False)
             self.legend = self._gui.add_html("")
-        self._bind(self.colouring, lambda event: actions.set_colouring(event.target.value))
+        self._bind(self.colouring, lambda _: self._choose_colouring())
+        self._bind(self.coloured_mission, lambda _: self._choose_colouring())
         self._add_selection()
         self._playback = self._gui.add_folder("Playback", order=5, expand_by_default=False)
         self._add_playback(200)
@@ -110,17 +118,42 @@ class Panel:
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
         widget.on_update(by_user(self._lock, action, self.say))
 
-    def show_colouring(self, colouring: str) -> None:
-        """Show by which rule landmarks are coloured."""
+    def _choose_colouring(self) -> None:
+        mission_id = self._mission_of_label.get(self.coloured_mission.value, "")
+        self._actions.set_colouring(self.colouring.value, mission_id)
+
+    def show_colouring(
+        self, options: VisualizationOptions, missions: tuple[MissionEntry, ...]
+    ) -> None:
+        """Show by which rule landmarks are coloured, and which mission the rule is for."""
+        colouring, only = options.landmark_colouring, options.color_only_missions.strip().lower()
         if self.colouring.value != colouring:
             self.colouring.value = colouring
+        self._mission_of_label = {text.mission_label(m): m.id for m in missions}
+        labels = (_ALL, *self._mission_of_label)
+        if tuple(self.coloured_mission.options) != labels:
+            self.coloured_mission.options = labels
+        keys = self._mission_of_label.items()
+        chosen = next((label for label, key in keys if only and key.startswith(only)), _ALL)
+        if self.coloured_mission.value != chosen:
+            self.coloured_mission.value = chosen
+        if self.coloured_mission.visible != (len(missions) > 1):
+            self.coloured_mission.visible = len(missions) > 1
 
     def _add_selection(self) -> None:
         with self._gui.add_folder("Selection", order=4):
             self.facts = self._gui.add_html(text.hint(_HINT))
             self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
-            self.measuring: Any = self._gui.add_checkbox("measure between picks", False)
+            self.jump: Any = self._gui.add_text(
+                "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
+            )
+            self.measuring: Any = self._gui.add_checkbox(
+                "measure", False, hint="measure the distance between two picks"
+            )
             self.clear = self._gui.add_button("clear", visible=False)
+        self._bind(
+            self.jump, lambda event: self._actions.jump_to_id(event.client, event.target.value)
+        )
         self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
         self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
 
@@ -162,7 +195,7 @@ class Panel:
 
     def show(self, scene: Scene, layers: set[str], missions: set[str]) -> None:
         """Say what the scene has: its counts, legend, layers and missions."""
-        self.header.content = text.header(scene)
+        self._say_what_is_shown(scene)
         entries = [
             entry for layer in scene.layers if layer.name in layers for entry in layer.legend
         ]
@@ -178,6 +211,14 @@ class Panel:
                 box.label = text.layer_label(layer)
             if box.value != (layer.name in layers):
                 box.value = layer.name in layers
+
+    def _say_what_is_shown(self, scene: Scene) -> None:
+        """Fill the header; a map's only mission is named there and needs no folder."""
+        is_single = len(scene.missions) == 1
+        legend = text.mission_legend(scene.missions) if is_single else ""
+        self.header.content = text.header(scene) + legend
+        if self._missions.visible == is_single:
+            self._missions.visible = not is_single
 
     def say(self, message: str) -> None:
         """Show a message in the place of the header."""
@@ -203,12 +244,14 @@ class Panel:
             widget.remove()
         self._mission_widgets = []
         with self._missions:
-            self._mission_widgets.append(self._gui.add_html(text.mission_legend(scene.missions)))
-            if len(scene.missions) > MAX_CHECKBOXES:
+            if 1 < len(scene.missions) <= MAX_SWITCHES:
+                self._add_mission_switches(scene, missions)
+                return
+            if len(scene.missions) > MAX_SWITCHES:
+                legend = text.mission_legend(scene.missions)
+                self._mission_widgets.append(self._gui.add_html(legend))
                 names = (_ALL, *(text.mission_label(m) for m in scene.missions))
                 self._add_mission_list(scene, names)
-            elif len(scene.missions) > 1:
-                self._add_mission_boxes(scene, missions)
 
     def _add_mission_list(self, scene: Scene, names: tuple[str, ...]) -> None:
         chooser = self._gui.add_dropdown("show", names)
@@ -220,17 +263,24 @@ class Panel:
         )
         self._mission_widgets.append(chooser)
 
-    def _add_mission_boxes(self, scene: Scene, missions: set[str]) -> None:
-        boxes: dict[str, Any] = {}
+    def _add_mission_switches(self, scene: Scene, missions: set[str]) -> None:
+        """Add a button per mission in its colour; grey = hidden."""
+        shown = {mission.id: mission.id in missions for mission in scene.missions}
 
-        def choose(_: Any) -> None:
-            self._actions.set_missions({key for key, box in boxes.items() if box.value})
+        def toggle(mission: MissionEntry, button: Any) -> None:
+            shown[mission.id] = not shown[mission.id]
+            button.color = _switch_colour(mission, is_shown=shown[mission.id])
+            self._actions.set_missions({key for key, is_shown in shown.items() if is_shown})
 
         for mission in scene.missions:
-            box = self._gui.add_checkbox(mission.id[:8], mission.id in missions)
-            self._bind(box, choose)
-            boxes[mission.id] = box
-        self._mission_widgets += boxes.values()
+            button: Any = self._gui.add_button(
+                text.mission_label(mission),
+                color=_switch_colour(mission, is_shown=shown[mission.id]),
+                hint=f"show or hide mission {mission.id}",
+            )
+            press = partial(lambda m, b, _: toggle(m, b), mission, button)
+            button.on_click(by_user(self._lock, press, self.say))
+            self._mission_widgets.append(button)
 
     def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
         """Show what was picked; without facts the hint."""
@@ -238,6 +288,10 @@ class Panel:
         self.facts.content = table + (text.hint(note) if note else "")
         self.clear.visible = bool(facts)
         self.show_image(image)
+
+    def show_hint(self, message: str) -> None:
+        """Say in the place of the facts why nothing was selected."""
+        self.facts.content = text.hint(message)
 
     def show_image(self, image: NDArray[np.uint8] | None) -> None:
         """Show the image (H, W, 3) of a vertex, or none."""
@@ -254,3 +308,9 @@ class Panel:
         if not self._is_sliding and int(self.slider.value) != step:
             self.slider.value = step
         self.time.content = text.hint(note)
+
+
+def _switch_colour(mission: MissionEntry, *, is_shown: bool) -> tuple[int, int, int]:
+    """Return the colour of a mission's button."""
+    red, green, blue = (from_hex(mission.colour)[0] if is_shown else HIDDEN).tolist()
+    return red, green, blue

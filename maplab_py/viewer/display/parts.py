@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import viser
 
-from maplab_py.array_types import U8
+from maplab_py.array_types import F32, F64, U8
+from maplab_py.viewer.colours import linear_light
 from maplab_py.viewer.drawing import axis_lines
+from maplab_py.viewer.glb import coloured_glb, is_coloured
+from maplab_py.viewer.ground import Ground
 from maplab_py.viewer.scene import (
     WHOLE_MAP,
     Axes,
-    Extent,
     Part,
     Points,
     Scene,
@@ -44,7 +48,8 @@ class Nodes:
         """Start with an empty scene."""
         self._server = server
         self._nodes: dict[_NodeKey, _Node] = {}
-        self._ground: Any = None
+        self._ground: list[Any] = []
+        self._is_ground_visible = True
         self.point_scale = 1.0
 
     def show(self, scene: Scene, layers: set[str], missions: set[str]) -> int:
@@ -79,6 +84,22 @@ class Nodes:
                     self._nodes[key] = _Node(part, self._add(_node_name(*key), part))
         return sent
 
+    @contextmanager
+    def with_hidden(self, scene: Scene, layers: set[str], missions: set[str]) -> Iterator[None]:
+        """Send hidden layers too, as nodes that are not visible, for as long as this lasts."""
+        with self._server.atomic():
+            self.show(scene, set(scene.names), missions)
+            self._set_visible(set(scene.names) - layers, is_visible=False)
+        try:
+            yield
+        finally:
+            self.show(scene, layers, missions)
+
+    def _set_visible(self, layers: set[str], *, is_visible: bool) -> None:
+        handles = (h for key, node in self._nodes.items() if key[0] in layers for h in node.handles)
+        for handle in handles:
+            handle.visible = is_visible
+
     def scale_points(self, factor: float) -> None:
         """Draw all points larger or smaller."""
         self.point_scale = factor
@@ -91,34 +112,44 @@ class Nodes:
         for key in list(self._nodes):
             self._remove(key)
 
-    def show_ground(self, extent: Extent, *, is_dark: bool) -> None:
-        """Draw a grid at the floor of the map, with squares of a round number of metres."""
-        cell = 10.0 ** np.floor(np.log10(max(extent.radius_m, 0.1)))
-        cell = cell / 5.0 if extent.radius_m < 2.5 * cell else cell / 2.0
+    def show_ground(self, ground: Ground, *, is_dark: bool) -> None:
+        """Draw a grid at the floor of the map, its axes with coordinates, and the scale bar."""
+        for handle in self._ground:
+            handle.remove()
         grey, strong = (
             ((42, 44, 48), (58, 61, 66)) if is_dark else ((236, 238, 241), (218, 221, 226))
         )
-        self._ground = self._server.scene.add_grid(
+        scene = self._server.scene
+        grid = scene.add_grid(
             "/ground",
             infinite_grid=True,
             plane="xy",
-            cell_size=float(cell),
-            section_size=float(5.0 * cell),
+            cell_size=ground.cell_m,
+            section_size=ground.section_m,
             cell_color=grey,
             section_color=strong,
             cell_thickness=0.6,
             section_thickness=0.9,
-            fade_distance=float(7.0 * extent.radius_m),
+            fade_distance=ground.reach_m,
             fade_strength=1.5,
             fade_from="origin",
             shadow_opacity=0.0,
-            position=(float(extent.centre[0]), float(extent.centre[1]), extent.floor_m),
+            position=ground.position,
         )
+        self._ground = [
+            grid,
+            *add_part(self._server, "/scale/axes", ground.axes),
+            *add_part(self._server, "/scale/bar", ground.bar),
+            *_add_labels(self._server, "/scale", ground.labels, ground.p_labels),
+        ]
+        if not self._is_ground_visible:
+            self.set_ground_visible(False)
 
     def set_ground_visible(self, is_visible: bool) -> None:
-        """Show or hide the grid."""
-        if self._ground is not None:
-            self._ground.visible = is_visible
+        """Show or hide the grid and what is written on it."""
+        self._is_ground_visible = is_visible
+        for handle in self._ground:
+            handle.visible = is_visible
 
     def _add(self, name: str, part: Part) -> list[Any]:
         return add_part(self._server, name, part, self.point_scale)
@@ -142,7 +173,8 @@ def add_part(
             scene.add_point_cloud(
                 name, part.p, part.colours, point_size=part.size_m * point_scale,
                 point_shape="circle", point_shading="flat", precision="float32",
-            )
+            ),
+            *_add_labels(server, name, part.labels, part.p),
         ]  # fmt: skip
     if isinstance(part, Segments):
         return [
@@ -154,30 +186,37 @@ def add_part(
                 thickness_units="screen",
             )
         ]
-    colour = (int(part.colour[0]), int(part.colour[1]), int(part.colour[2]))
+    if is_coloured(part):
+        return [scene.add_glb(name, coloured_glb(part))]
+    colour = (int(part.colours[0]), int(part.colours[1]), int(part.colours[2]))
     return [scene.add_mesh_simple(name, part.p, part.faces, color=colour, side="double")]
 
 
 def _add_axes(server: viser.ViserServer, name: str, part: Axes) -> list[Any]:
     lines = axis_lines(part.T, np.arange(len(part)), part.length_m, 3.0)
     handles = add_part(server, f"{name}/axes", lines)
-    for row, label in enumerate(part.labels):
-        handles.append(
-            server.scene.add_label(
-                f"{name}/{row}", label, position=part.T[row, 4:], font_screen_scale=0.8
-            )
+    return handles + _add_labels(server, name, part.labels, part.T[:, 4:])
+
+
+def _add_labels(
+    server: viser.ViserServer, name: str, labels: tuple[str, ...], p: F64 | F32
+) -> list[Any]:
+    """Write labels at the first of some points (N, 3)."""
+    return [
+        server.scene.add_label(
+            f"/labels{name}/{row}", label, position=p[row].astype(np.float64), font_screen_scale=0.8
         )
-    return handles
+        for row, label in enumerate(labels)
+    ]
 
 
 def _line_colours(colours: U8) -> U8:
     """Return colours (N, 2, 3) of both ends of lines (N,).
 
-    viser takes the colours of lines for linear light and those of all else for sRGB (IEC 61966-2-1).
+    viser takes the colours of lines for linear light and those of all else for sRGB.
     """
-    s = colours / 255.0
-    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.repeat(np.round(255.0 * linear).astype(np.uint8)[:, None], 2, axis=1)
+    linear = np.round(255.0 * linear_light(colours)).astype(np.uint8)
+    return np.repeat(linear[:, None], 2, axis=1)
 
 
 def _moved_in_place(node: _Node, part: Part) -> bool:
@@ -185,9 +224,15 @@ def _moved_in_place(node: _Node, part: Part) -> bool:
     before = node.part
     if not node.handles or len(before) != len(part):
         return False
-    if isinstance(before, Points) and isinstance(part, Points) and before.size_m == part.size_m:
+    if (
+        isinstance(before, Points)
+        and isinstance(part, Points)
+        and (before.size_m, before.labels) == (part.size_m, part.labels)
+    ):
         if not np.array_equal(before.p, part.p):
             node.handles[0].points = part.p
+            for label, p in zip(node.handles[1:], part.p, strict=False):
+                label.position = p.astype(np.float64)
         if not np.array_equal(before.colours, part.colours):
             node.handles[0].colors = part.colours
     elif (

@@ -37,6 +37,11 @@ _MAX_FRUSTA = 16
 logger = logging.getLogger(__name__)
 
 
+def no_image(row: int) -> None:  # noqa: ARG001
+    """Say that a vertex has no image."""
+    return
+
+
 class Selection:
     """The picked thing and its marks in the scene."""
 

@@ -31,6 +31,17 @@ def layer_label(layer: Layer) -> str:
     return f"{layer.title} {short_count(layer.total)}"
 
 
+def layer_switches(layers: Iterable[Layer], visible: set[str]) -> str:
+    """Return a checkbox for each layer of an exported page."""
+    lines = "".join(
+        f"<label style='display:block;pointer-events:auto;cursor:pointer'>"
+        f"<input type='checkbox' data-layer='{escape(layer.name)}'"
+        f"{' checked' if layer.name in visible else ''}> {escape(layer_label(layer))}</label>"
+        for layer in layers
+    )
+    return f"<div style='{_SMALL}{_PADDED}'>{lines}</div>" if lines else ""
+
+
 def short_count(count: int) -> str:
     """Return a count in at most five characters."""
     if count < 10_000:

@@ -8,7 +8,6 @@ under one lock; maps are values, so what is being drawn cannot change underneath
 from __future__ import annotations
 
 import atexit
-import dataclasses
 import logging
 import threading
 import time
@@ -18,32 +17,28 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
-from maplab_py.viewer.display.camera import aim, aim_initially
+from maplab_py.viewer.display.camera import aim, aim_initially, approach
 from maplab_py.viewer.display.export import export_html
 from maplab_py.viewer.display.panel import Panel, by_user
 from maplab_py.viewer.display.parts import Nodes
 from maplab_py.viewer.display.picture import save_picture, take_picture
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.display.selection import ImageOf, Selection
+from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.live import moved_scene
+from maplab_py.viewer.lookup import MIN_DIGITS, find_by_id
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.picking import Pick, pick
-from maplab_py.viewer.scene import Scene
+from maplab_py.viewer.playback import without_played
+from maplab_py.viewer.scene import Scene, is_elsewhere
 from maplab_py.vimap import VIMap
 
 _MAX_SHARE = 0.02
 """Part of the time that following a running command may take."""
 
-_PLAYED_LAYERS = {"trajectories", "vertices", "landmarks", "bad_landmarks", "observers"}
-
 logger = logging.getLogger(__name__)
-
-
-def no_image(row: int) -> None:  # noqa: ARG001
-    """Say that a vertex has no image."""
-    return
 
 
 class Viewer:
@@ -151,9 +146,9 @@ class Viewer:
             self._playback = playback or PlaybackOptions()
             self._image_of = image_of
             self._choices = {}
-            is_elsewhere = self.scene is None or _is_elsewhere(self.scene, scene)
+            moves_view = self.scene is None or is_elsewhere(self.scene, scene)
             self._show(subject, drawing, scene)
-            if is_elsewhere:
+            if moves_view:
                 self.look_at_everything()
         return scene
 
@@ -222,17 +217,16 @@ class Viewer:
         return pages
 
     def export(self, path: Path) -> int:
-        """Write what is visible to one HTML file; return its size in bytes.
+        """Write all layers to one HTML file with switches; return its size in bytes.
 
         Raises:
             UserError: Nothing is shown, or the file cannot be written.
         """
         scene = self._shown()
         self.wait()
-        with self._lock:
-            return export_html(
-                self._server, scene, self.visible_layers, path, is_dark=self._is_dark
-            )
+        layers = self.visible_layers
+        with self._lock, self._nodes.with_hidden(self._drawn(scene), layers, self.visible_missions):
+            return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
 
     def _shown(self) -> Scene:
         if self.scene is None:
@@ -307,12 +301,12 @@ class Viewer:
             self._stop_playback()
             self._redraw()
 
-    def set_colouring(self, colouring: str) -> None:
-        """Colour landmarks by another rule."""
+    def set_colouring(self, colouring: str, only_mission: str = "") -> None:
+        """Colour landmarks by another rule, all or those of a mission (id) alone."""
         with self._lock:
             if self.subject is None:
                 return
-            options = self.subject.options.with_colouring(colouring)
+            options = self.subject.options.with_colouring(colouring, only_mission)
             self.follow(self.subject.replace(options=options))
 
     def set_point_scale(self, factor: float) -> None:
@@ -332,12 +326,16 @@ class Viewer:
             if self._panel.dark.value != is_dark:
                 self._panel.dark.value = is_dark
             if self.scene is not None:
-                self._nodes.show_ground(self.scene.extent, is_dark=is_dark)
+                self._show_ground(self.scene)
 
     def set_ground(self, is_visible: bool) -> None:
         """Show or hide the grid."""
         with self._lock:
             self._nodes.set_ground_visible(is_visible)
+
+    def _show_ground(self, scene: Scene) -> None:
+        ground = make_ground(scene.extent, scene.origin_G)
+        self._nodes.show_ground(ground, is_dark=self._is_dark)
 
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""
@@ -359,7 +357,7 @@ class Viewer:
                 return
             if self._player is None:
                 self._nodes.show(
-                    _without_played(self.scene), self.visible_layers, self.visible_missions
+                    without_played(self.scene), self.visible_layers, self.visible_missions
                 )
                 clouds = self.subject.clouds if self.subject is not None else ()
                 self._player = Player(
@@ -417,6 +415,21 @@ class Viewer:
         with self._lock:
             self._selection.pick(self.drawing, picked, self._image_of)
 
+    def jump_to_id(self, client: Any, text: str) -> None:
+        """Select what an id means, and move the camera of one page there."""
+        if len(text.strip()) < MIN_DIGITS:
+            return  # the page sends every key
+        with self._lock:
+            try:
+                picked = find_by_id(self.drawing, text)
+            except UserError as error:
+                self._panel.show_hint(str(error))
+                return
+            self.select(picked)
+            if client is not None:
+                with client.atomic():
+                    approach(client.camera, picked.p, 0.25 * self.drawing.extent.radius_m)
+
     def _clicked(self, event: Any) -> None:
         if self.scene is None:
             return
@@ -469,30 +482,16 @@ class Viewer:
             self._selection.clear()
         self._stop_playback()
         if is_new_place:
-            self._nodes.show_ground(scene.extent, is_dark=self._is_dark)
-        self._panel.show_colouring(subject.options.landmark_colouring)
+            self._show_ground(scene)
+        self._panel.show_colouring(subject.options, scene.missions)
         self._redraw()
 
     def _redraw(self) -> None:
         if self.scene is None:
             return
         layers, missions = self.visible_layers, self.visible_missions
-        shown = self.scene if self._player is None else _without_played(self.scene)
-        self._nodes.show(shown, layers, missions)
+        self._nodes.show(self._drawn(self.scene), layers, missions)
         self._panel.show(self.scene, layers, missions)
 
-
-def _is_elsewhere(before: Scene, after: Scene) -> bool:
-    """Tell whether the view shall move: another map, or one that now takes more room."""
-    larger = after.extent.radius_m > 1.2 * before.extent.radius_m
-    return before.title != after.title or larger
-
-
-def _without_played(scene: Scene) -> Scene:
-    """Return the scene without the layers that playback draws itself."""
-    kept = tuple(
-        layer
-        for layer in scene.layers
-        if layer.name not in _PLAYED_LAYERS and not layer.name.startswith("cloud_")
-    )
-    return dataclasses.replace(scene, layers=kept)
+    def _drawn(self, scene: Scene) -> Scene:
+        return scene if self._player is None else without_played(scene)

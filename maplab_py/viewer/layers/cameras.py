@@ -13,6 +13,7 @@ from maplab_py.sensors import Camera, CameraRig, SensorSet
 from maplab_py.sensors.projection import back_project
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments
+from maplab_py.viewer.omissions import omission_notes
 from maplab_py.viewer.scene import Axes, Layer, Part
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
@@ -141,7 +142,10 @@ def landmark_observers(drawing: Drawing, landmarks: I64, limit: int) -> Layer:
             landmark[members],
             0.75,
         )
-    return Layer("observers", "Landmark observers", parts, int(counts[landmarks].sum()))
+    total, title = int(counts[landmarks].sum()), "Landmark observers"
+    drawn = sum(len(part) for part in parts.values())
+    notes = omission_notes(title, drawn, (total - drawn, f"as at most {limit:,} rays are drawn"))
+    return Layer("observers", title, parts, total, notes=notes)
 
 
 def sensor_axes(sensors: SensorSet) -> Layer:

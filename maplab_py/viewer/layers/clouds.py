@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
+from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, Mesh, Part
 from maplab_py.viewer.subsampling import spread_rows
 
@@ -31,24 +32,32 @@ def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) ->
     """Return one layer of clouds of the same title, with no more points than the options allow."""
     total = sum(len(cloud.p_G) for cloud in clouds)
     parts: dict[str, Part] = {}
+    thinned = 0
     for mission_id in dict.fromkeys(cloud.mission_id for cloud in clouds):
         mission_clouds = [cloud for cloud in clouds if cloud.mission_id == mission_id]
         p = np.concatenate([cloud.p_G for cloud in mission_clouds]) - drawing.origin_G
         colour = np.concatenate([cloud_colours(cloud) for cloud in mission_clouds])
         limit = max(1, drawing.options.max_points * len(p) // max(total, 1))
-        rows = spread_rows(p, limit)
+        finite = np.flatnonzero(np.isfinite(p).all(axis=1))
+        rows = finite[spread_rows(p[finite], limit)]
+        thinned += len(finite) - len(rows)
         # the width of a square that each point has for itself on the surface of the map's ball
         size = 0.9 * drawing.unit_m / np.sqrt(max(len(rows), 1_000))
         parts[mission_id] = make_points(p[rows], colour[rows], rows, size)
     title = clouds[0].title if clouds else "Dense cloud"
-    return Layer(f"cloud_{number}", title, parts, total)
+    drawn = sum(len(part) for part in parts.values())
+    losses = (total - drawn - thinned, NO_POSITION), (thinned, MAX_POINTS)
+    notes = omission_notes(title, drawn, *losses)
+    return Layer(f"cloud_{number}", title, parts, total, notes=notes)
 
 
 def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
-    """Return a triangle mesh as a layer."""
+    """Return a triangle mesh as a layer, in its own colours if it has any."""
     faces = np.zeros((0, 3), dtype=np.int32) if cloud.faces is None else cloud.faces
     p = np.ascontiguousarray(cloud.p_G - drawing.origin_G, dtype=np.float32)
-    colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
+    colour = cloud.colours
+    if colour is None:
+        colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
     parts: dict[str, Part] = {cloud.mission_id: Mesh(p, faces, colour)}
     return Layer(f"mesh_{number}", cloud.title, parts, len(faces))
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
 from maplab_py.viewer.first_sightings import first_camera, first_observer
+from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -16,15 +18,17 @@ from maplab_py.vimap.queries import observation_counts, observer_counts
 
 def landmarks(drawing: Drawing) -> list[Layer]:
     """The landmarks, and those of bad quality as a separate layer."""
-    chosen = _chosen(drawing)
-    is_bad = drawing.vi_map.landmarks.quality[chosen] == LandmarkQuality.BAD
+    steps = _selection_steps(drawing)
+    chosen = np.flatnonzero(np.all([keep for keep, _ in steps], axis=0))
+    is_bad = drawing.vi_map.landmarks.quality == LandmarkQuality.BAD
     limit = drawing.options.max_points
     every, legend = landmark_colours(drawing)
     layers = []
-    for name, title, rows in (
-        ("landmarks", "Landmarks", chosen[~is_bad]),
-        ("bad_landmarks", "Bad landmarks", chosen[is_bad]),
+    for name, title, members_of in (
+        ("landmarks", "Landmarks", ~is_bad),
+        ("bad_landmarks", "Bad landmarks", is_bad),
     ):
+        rows = chosen[members_of[chosen]]
         if not len(rows) and name != "landmarks":
             continue
         shown = rows[spread_rows(drawing.p_landmarks[rows], limit)]
@@ -37,7 +41,13 @@ def landmarks(drawing: Drawing) -> list[Layer]:
                 point_size(drawing),
             )
         is_visible = name == "landmarks" or not drawing.options.check_landmark_constrained
-        layers.append(Layer(name, title, parts, len(rows), Entity.LANDMARK, is_visible, legend))
+        thinned = (len(rows) - len(shown), MAX_POINTS)
+        notes = omission_notes(title, len(shown), *_losses(steps, members_of), thinned)
+        if name == "landmarks":
+            notes += chosen_missions(drawing)[1]
+        layers.append(
+            Layer(name, title, parts, len(rows), Entity.LANDMARK, is_visible, legend, notes)
+        )
     return layers
 
 
@@ -46,18 +56,33 @@ def point_size(drawing: Drawing) -> float:
     return 0.0024 * drawing.unit_m
 
 
-def _chosen(drawing: Drawing) -> I64:
-    """Return the rows that the flags let through and that have a place."""
+def _selection_steps(drawing: Drawing) -> list[tuple[NDArray[np.bool_], str]]:
+    """Return for each condition on landmarks which of them (L,) meet it, and its words."""
     options, vi_map = drawing.options, drawing.vi_map
-    keep = np.isfinite(drawing.p_landmarks).all(axis=1)
+    is_finite = np.asarray(np.isfinite(drawing.p_landmarks).all(axis=1))
+    steps: list[tuple[NDArray[np.bool_], str]] = [(is_finite, NO_POSITION)]
     if options.landmarks_min_observers > 0:
-        keep &= observer_counts(vi_map) >= options.landmarks_min_observers
+        keep = observer_counts(vi_map) >= options.landmarks_min_observers
+        steps.append((keep, "by --vis_landmarks_min_observers"))
     if options.landmarks_min_number_of_observer_missions > 0:
         wanted = options.landmarks_min_number_of_observer_missions
-        keep &= observer_mission_counts(vi_map) >= wanted
+        keep = observer_mission_counts(vi_map) >= wanted
+        steps.append((keep, "by --vis_landmarks_min_number_of_observer_missions"))
     if options.show_only_landmark_type:
-        keep &= vi_map.landmarks.feature_type == int(options.show_only_landmark_type)
-    return np.flatnonzero(keep)
+        keep = vi_map.landmarks.feature_type == int(options.show_only_landmark_type)
+        steps.append((keep, "by --vis_show_only_landmark_type"))
+    return steps
+
+
+def _losses(
+    steps: list[tuple[NDArray[np.bool_], str]], members: NDArray[np.bool_]
+) -> list[tuple[int, str]]:
+    """Return how many members (L,) each condition leaves out of those that the earlier ones keep."""
+    losses, kept = [], members
+    for keep, words in steps:
+        losses.append((int(np.count_nonzero(kept & ~keep)), words))
+        kept = kept & keep
+    return losses
 
 
 def observer_mission_counts(vi_map: VIMap) -> I64:
@@ -85,10 +110,36 @@ def first_observation_s(vi_map: VIMap) -> F64:
 
 def landmark_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Return a colour (L, 3) for each landmark by the rule of the options, and the legend."""
+    every, legend = _rule_colours(drawing)
+    if drawing.options.color_only_missions:
+        chosen, _ = chosen_missions(drawing)
+        is_other = ~chosen[drawing.landmark_mission]
+        every = np.where(is_other[:, None], _colours_by_mission(drawing), every)
+    return every, legend
+
+
+def chosen_missions(drawing: Drawing) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Return which missions (M,) the rule of colours is for, and a line for each unknown id."""
+    chosen = np.zeros(len(drawing.mission_ids), dtype=np.bool_)
+    problems = []
+    for prefix in drawing.options.color_only_missions.replace(",", " ").lower().split():
+        matches = [mission_id.startswith(prefix) for mission_id in drawing.mission_ids]
+        chosen |= np.array(matches, dtype=np.bool_)
+        if not any(matches):
+            problems.append(f"--vis_color_only_missions: no mission has the id {prefix}")
+    return chosen, tuple(problems)
+
+
+def _colours_by_mission(drawing: Drawing) -> U8:
+    pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.45)
+    return pale[drawing.landmark_mission]
+
+
+def _rule_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour all landmarks by the rule."""
     rule = drawing.options.landmark_colouring
     if rule == "mission":
-        pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.45)
-        return pale[drawing.landmark_mission], ()
+        return _colours_by_mission(drawing), ()
     if rule == "quality":
         entries = ("not judged", "bad", "good")
         legend = zip(entries, colours.hex_codes(colours.QUALITY), strict=True)
@@ -127,8 +178,11 @@ def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, 
     """Colour by height or by time."""
     options, vi_map = drawing.options, drawing.vi_map
     if rule == "height":
+        height = vi_map.p_G[:, 2]
+        if options.color_only_missions:
+            height = np.where(chosen_missions(drawing)[0][drawing.landmark_mission], height, np.nan)
         part, low, high = colours.normalised(
-            vi_map.p_G[:, 2], options.color_by_height_period_m, options.color_by_height_offset_m
+            height, options.color_by_height_period_m, options.color_by_height_offset_m
         )
         title, unit = "height", "m"
     else:

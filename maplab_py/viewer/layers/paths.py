@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from maplab_py.array_types import I32
@@ -11,6 +13,9 @@ from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, 
 from maplab_py.vimap import TransformationKind
 
 _EDGE_COLOURS = colours.from_hex("#7f9cc0", "#5fa39a", "#b08a5a", "#9a86b8")
+_END_COLOURS = colours.from_hex("#3fa372", "#d2455a")  # start, end
+_MAX_LABELLED_MISSIONS = 8
+"""The labels of more missions would hide the map."""
 
 
 def trajectories(drawing: Drawing) -> Layer:
@@ -36,6 +41,26 @@ def vertices(drawing: Drawing) -> Layer:
             drawing.p_vertices[rows], colour, rows, 0.0045 * drawing.unit_m
         )
     return Layer("vertices", "Vertices", parts, len(mission), Entity.VERTEX)
+
+
+def path_ends(drawing: Drawing) -> Layer:
+    """A dot and a label where each mission starts and where it ends."""
+    start = drawing.vi_map.vertex_start
+    p = drawing.p_vertices
+    has_vertices = np.flatnonzero(np.diff(start) > 0)
+    parts: dict[str, Part] = {}
+    for mission in has_vertices.tolist():
+        rows = np.array([start[mission], start[mission + 1] - 1], dtype=np.int64)
+        dots = make_points(p[rows], _END_COLOURS, rows, 0.018 * drawing.unit_m)
+        labels: tuple[str, ...] = ()
+        if len(has_vertices) <= _MAX_LABELLED_MISSIONS and len(dots) == 2:
+            name = f" {drawing.mission_ids[mission][:8]}" if len(has_vertices) > 1 else ""
+            is_closed = np.linalg.norm(p[rows[1]] - p[rows[0]]) < 0.05 * drawing.unit_m
+            labels = ("start" + name, "end" + name)
+            if is_closed:
+                labels = (f"start and end{name}",)
+        parts[drawing.mission_ids[mission]] = dataclasses.replace(dots, labels=labels)
+    return Layer("path_ends", "Start and end", parts, 2 * len(has_vertices), Entity.VERTEX)
 
 
 def imu_edges(drawing: Drawing) -> Layer:

@@ -16,9 +16,15 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.layers.landmarks import point_size
+from maplab_py.viewer.omissions import (
+    BAD_QUALITY,
+    MAX_POINTS,
+    NO_POSITION,
+    omission_notes,
+)
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,18 +54,27 @@ def compared(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> list[Laye
     lines: dict[str, Part] = {WHOLE_MAP: path}
     layers = [Layer("reference_trajectories", "Reference paths", lines, len(other.missions))]
     p_L = other.p_G + shift
-    rows = np.flatnonzero(np.isfinite(p_L).all(axis=1) & (other.landmarks.quality != 1))
-    rows = rows[spread_rows(p_L[rows], drawing.options.max_points)]
-    cloud = make_points(p_L[rows], colours.REFERENCE, rows, point_size(drawing))
-    points: dict[str, Part] = {WHOLE_MAP: cloud}
-    layers.append(
-        Layer(
-            "reference_landmarks", "Reference landmarks", points, len(p_L), is_visible=side_by_side
-        )
-    )
+    layers.append(_reference_landmarks(drawing, other, p_L, is_visible=side_by_side))
     if not side_by_side:
         layers.append(_displacements(drawing, other))
     return layers
+
+
+def _reference_landmarks(drawing: Drawing, other: VIMap, p_L: F64, *, is_visible: bool) -> Layer:
+    """Return the landmarks (L, 3) of the other state that are not of bad quality."""
+    is_good = other.landmarks.quality != LandmarkQuality.BAD
+    good = np.flatnonzero(np.isfinite(p_L).all(axis=1) & is_good)
+    rows = good[spread_rows(p_L[good], drawing.options.max_points)]
+    cloud = make_points(p_L[rows], colours.REFERENCE, rows, point_size(drawing))
+    title, points = "Reference landmarks", {WHOLE_MAP: cloud}
+    bad = int(np.count_nonzero(~is_good))
+    losses = (
+        (bad, BAD_QUALITY),
+        (len(p_L) - bad - len(good), NO_POSITION),
+        (len(good) - len(rows), MAX_POINTS),
+    )
+    notes = omission_notes(title, len(rows), *losses)
+    return Layer("reference_landmarks", title, points, len(p_L), is_visible=is_visible, notes=notes)
 
 
 def reference_shift(drawing: Drawing, *, side_by_side: bool) -> F64:

@@ -6,7 +6,8 @@ import dataclasses
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, ClassVar
 
 from maplab_py.cancellation import check_cancelled, lasting_effect
@@ -101,6 +102,28 @@ def running_viewer(context: CommandContext) -> Viewer:
     return following.viewer
 
 
+@contextmanager
+def viewer_for_output(context: CommandContext) -> Iterator[Viewer]:
+    """Give the viewer of the session; without one a viewer of the selected map that lasts as long.
+
+    Raises:
+        UserError: None is running, and the selected map cannot be shown.
+    """
+    following = context.session.watchers.find(NAME, Following)
+    if following is not None and not following.viewer.is_stopped:
+        yield following.viewer
+        return
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.display.viewer import Viewer
+
+    viewer = Viewer(0)
+    try:
+        viewer.show(Subject(context.vi_map, context.map_key))
+        yield viewer
+    finally:
+        viewer.stop()
+
+
 def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
     """Return the session's viewer; start one when none is running or another port is wanted."""
     from maplab_py.viewer.display.viewer import Viewer
@@ -159,7 +182,7 @@ def show(
 
 def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:
     """Return the images that the map keeps as resources; none when it was never loaded."""
-    from maplab_py.viewer.display.viewer import no_image
+    from maplab_py.viewer.display.selection import no_image
     from maplab_py.viewer.resource_clouds import VertexImages
 
     if context.map_folder is None or not len(vi_map.resources):

@@ -26,6 +26,7 @@ def visualize_mesh(
     mesh_file: Path | None = None,
     missions: MissionChoice = ALL_MISSIONS,
     dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    dense_result_mesh_colours: bool = False,
     options: VisualizationOptions = _OPTIONS,
     viewer: ViewerOptions = _VIEWER,
 ) -> ViewReport:
@@ -34,6 +35,8 @@ def visualize_mesh(
     Args:
         mesh_file: PLY file with triangles in the global frame; empty = the mesh of the map's grids.
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
+        dense_result_mesh_colours: Colour the mesh of the grids by the images of the map; the colours of
+            a mesh file are always shown.
     """
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.mesh_sources import grid_mesh, read_mesh
@@ -43,6 +46,9 @@ def visualize_mesh(
     else:
         rows = missions.rows(context.vi_map)
         folder = context.map_folder or Path()
-        mesh = grid_mesh(context.vi_map, folder, rows, dense_tsdf_mesh_min_weight)
+        mesh = grid_mesh(
+            context.vi_map, folder, rows, dense_tsdf_mesh_min_weight,
+            with_colours=dense_result_mesh_colours, progress=context.progress,
+        )  # fmt: skip
     subject = Subject(context.vi_map, context.map_key, options, clouds=(mesh,))
     return show(context, subject, viewer)

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from maplab_plugins.visualization.following import NAME, running_viewer
+from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 
 
@@ -43,7 +43,7 @@ def save_view(
     view: Literal["", "overview", "top", "side"] = "",
     overwrite: bool = False,
 ) -> SavedPicture:
-    """Save what the viewer shows as a picture.
+    """Save what the viewer shows as a picture; without a viewer the selected map.
 
     An open page takes the picture from where it looks; without one a Chromium without a window is
     started for as long as it takes.
@@ -59,7 +59,8 @@ def save_view(
     for name, size in (("width_px", width_px), ("height_px", height_px)):
         if not 16 <= size <= 8192:
             raise UserError(f"--{name}={size}: must be 16 to 8192")
-    pages = running_viewer(context).save_picture(file, (width_px, height_px), view)
+    with viewer_for_output(context) as viewer:
+        pages = viewer.save_picture(file, (width_px, height_px), view)
     taken_by = "an open page" if pages else "a browser without a window"
     return SavedPicture(file, f"{width_px} x {height_px}", taken_by)
 
@@ -70,12 +71,15 @@ def save_view(
 def export_view(context: CommandContext, *, file: Path, overwrite: bool = False) -> ExportedView:
     """Write what the viewer shows to one HTML file that opens without a network.
 
+    Without a viewer the page shows the selected map.
+
     Args:
         file: The file.
         overwrite: Replace a file that is there already.
     """
     _check_target(file, overwrite=overwrite)
-    return ExportedView(file, running_viewer(context).export(file) * 1e-6)
+    with viewer_for_output(context) as viewer:
+        return ExportedView(file, viewer.export(file) * 1e-6)
 
 
 @command(

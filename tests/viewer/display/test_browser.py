@@ -115,15 +115,24 @@ def _purple(picture: np.ndarray) -> int:
     return int(np.count_nonzero((red > green + 30) & (blue > green + 30)))
 
 
-def test_a_mesh_is_on_the_canvas(page: Page, viewer: Viewer) -> None:
+def _green(picture: np.ndarray) -> int:
+    """Return how many pixels are of a green surface, whatever light falls on it."""
+    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
+    return int(np.count_nonzero((green > red + 30) & (green > blue + 30)))
+
+
+def test_a_mesh_is_on_the_canvas_in_its_colours(page: Page, viewer: Viewer) -> None:
     middle = MAP.T_G_I[:, 4:].mean(axis=0)
     corners = np.array([[-2.0, -2.0, 0.0], [2.0, -2.0, 0.0], [2.0, 2.0, 0.0], [-2.0, 2.0, 0.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     colour = np.tile(np.array([200, 30, 200], dtype=np.uint8), (4, 1))
     before = _purple(page.still_picture())
+    colour[2:] = (30, 200, 30)
+    green = _green(page.picture())
     mesh = Cloud("Surface", corners + middle, colour, faces=faces)
     viewer.show(dataclasses.replace(SUBJECT, clouds=(mesh,)))
-    assert page.wait_until(lambda: _purple(page.picture()) > before + 2000)
+    assert page.wait_until(lambda: _purple(page.picture()) > before + 500)
+    assert page.wait_until(lambda: _green(page.picture()) > green + 500)
     page.click(page.checkbox("Surface 2"))
     assert page.wait_until(lambda: _purple(page.picture()) < before + 200)
     assert page.errors == []

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from maplab_py.viewer import colours
@@ -47,6 +48,16 @@ def test_a_view_opens_from_a_file(browser: Any, tmp_path: Path) -> None:
     assert page.wait_until(lambda: colour_count(page.picture(), colours.MISSIONS[0]) > 100)
     assert page.outside_requests("file:") == []
     assert page.page.get_by_text("walk", exact=True).count() == 1
+    path = colour_count(page.still_picture(), colours.MISSIONS[0])
+    for layer in ("trajectories", "vertices"):
+        page.click(page.page.locator(f"input[data-layer={layer}]"))
+    assert page.wait_until(
+        lambda: colour_count(page.picture(), colours.MISSIONS[0]) < path - 50, 60.0
+    )
+    hidden = page.still_picture()
+    page.click(page.page.locator("input[data-layer=frusta]"))  # not visible when it was written
+    assert page.wait_until(lambda: not np.array_equal(page.picture(), hidden), 60.0)
+    assert page.errors == []
     page.page.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,7 @@ from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
 from tests.support.waiting import wait_until
 from tests.viewer.display.page_messages import (
@@ -146,10 +148,10 @@ def test_following_sends_only_what_changed(viewer: Viewer, two_missions: VIMap) 
     first = f"{first_ids[0, 0]:016x}{first_ids[0, 1]:016x}"
     names = [str(message.get("name", "")) for message in messages]
     sent = {tuple(name.split("/")[2:4]) for name in names if name.startswith("/map/")}
-    for layer in ("trajectories", "vertices"):
+    for layer in ("trajectories", "vertices", "path_ends"):
         assert (layer, first) not in sent
     layers = {layer for layer, *_ in sent}
-    assert layers == {"trajectories", "vertices", "landmarks", "loop_closures"}
+    assert layers == {"trajectories", "vertices", "path_ends", "landmarks", "loop_closures"}
 
 
 def test_only_the_latest_wish_counts(viewer: Viewer, two_missions: VIMap) -> None:
@@ -188,6 +190,41 @@ def test_layers_and_missions_can_be_hidden(viewer: Viewer, two_missions: VIMap) 
     assert "landmarks" not in page.layers
     assert first not in {mission for _, mission in page.drawn}
     assert second in {mission for _, mission in page.drawn}
+
+
+def test_an_id_selects_what_it_names(viewer: Viewer, two_missions: VIMap) -> None:
+    camera = SimpleNamespace(position=np.array([0.0, -8.0, 6.0]), look_at=np.zeros(3))
+    page = SimpleNamespace(camera=camera, atomic=threading.Lock)
+    viewer.jump_to_id(page, to_hex(two_missions.landmarks.id[4]))
+    picked = viewer.selection.picked
+    assert picked is not None
+    assert picked.row == 4
+    np.testing.assert_allclose(camera.look_at, two_missions.p_G[4])
+    back = camera.position - camera.look_at
+    np.testing.assert_allclose(back / np.linalg.norm(back), [0.0, -0.8, 0.6], atol=1e-9)
+    viewer.jump_to_id(page, "f" * 32)
+    assert viewer.selection.picked is picked
+    contents = [
+        str(c.get("content", "")) for c in map(_properties, page_state(viewer).controls.values())
+    ]
+    assert any("no vertex, landmark" in content for content in contents)
+
+
+def test_an_export_has_all_layers_and_leaves_the_page_as_it_was(
+    viewer: Viewer, two_missions: VIMap, tmp_path: Path
+) -> None:
+    before = page_state(viewer).drawn
+    viewer.export(tmp_path / "view.html")
+    assert page_state(viewer).drawn == before
+    text = (tmp_path / "view.html").read_text()
+    assert viewer.scene is not None
+    for layer in viewer.scene.layers:
+        box = f"data-layer='{layer.name}'" + (" checked" if layer.is_visible else "")
+        assert f"{box}>" in text
+
+
+def _properties(control: Message) -> Message:
+    return {**control, **control.get("props", {})}
 
 
 def test_colouring_changes_the_legend(viewer: Viewer) -> None:
