@@ -178,7 +178,8 @@ def test_two_picks_measure_a_distance(page: Page, viewer: Viewer) -> None:
 
 def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> None:
     """The path is drawn as far as the slider has come; it has 13 pieces and a camera at its head."""
-    viewer.set_layer("loop_closures", False)  # they lie on the path
+    for layer in ("loop_closures", "path_ends"):  # they lie on the path
+        viewer.set_layer(layer, False)
     middles = 0.5 * (MAP.T_G_I[1:, 4:] + MAP.T_G_I[:-1, 4:])
 
     def pieces() -> list[bool]:
