@@ -136,8 +136,8 @@ def mission_entries(drawing: Drawing) -> tuple[MissionEntry, ...]:
     counts = np.diff(vi_map.vertex_start)
     return tuple(
         MissionEntry(
-            mission_id, codes[row], int(counts[row]), float(length_m[row]), float(span_s[row]),
-            bool(known[row]),
+            mission_id, drawing.mission_names[row], codes[row], int(counts[row]),
+            float(length_m[row]), float(span_s[row]), bool(known[row]),
         )
         for row, mission_id in enumerate(drawing.mission_ids)
     )  # fmt: skip

@@ -18,6 +18,7 @@ from maplab_py.viewer.scene import Extent, Points, Segments
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
+from maplab_py.vimap.queries import mission_labels
 
 _OUTLINE_POINTS = 1500
 _FAR_M = 2000.0
@@ -37,6 +38,11 @@ class Drawing:
     def mission_ids(self) -> list[str]:
         """Ids of all missions."""
         return to_hex_list(self.vi_map.missions.id)
+
+    @cached_property
+    def mission_names(self) -> list[str]:
+        """What all missions are called, as in the console: names, else beginnings of ids."""
+        return mission_labels(self.vi_map)
 
     @cached_property
     def mission_colours(self) -> U8:

@@ -14,6 +14,7 @@ from maplab_py.report import counted
 from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.queries import mission_labels
 from maplab_py.vimap.table import ragged_rows
 
 Facts = tuple[tuple[str, str], ...]
@@ -66,7 +67,8 @@ def landmark_facts(vi_map: VIMap, row: int) -> Facts:
     times = vi_map.vertices.timestamp_ns[observers]
     distance = np.linalg.norm(vi_map.T_G_I[observers, 4:] - landmark.p_G, axis=1)
     seen = f"{1e-9 * np.ptp(times):.2f} s" if len(times) else "never"
-    names = ", ".join(to_hex(vi_map.missions.id[m])[:8] for m in missions.tolist())
+    labels = mission_labels(vi_map)
+    names = ", ".join(labels[mission] for mission in missions.tolist())
     return (
         ("landmark", landmark.id),
         ("quality", LandmarkQuality(landmark.quality).name.lower()),

@@ -117,6 +117,7 @@ class MissionEntry:
     """One mission in the panel."""
 
     id: str
+    name: str  # else the beginning of the id
     colour: str
     vertices: int
     length_m: float

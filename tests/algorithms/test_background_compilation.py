@@ -99,6 +99,7 @@ def test_no_process_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(background_compilation.subprocess, "Popen", refuse)
     with compiling(*QUICK) as compilation:
+        assert not compilation.process_ids
         compilation.wait(SILENT)
 
 

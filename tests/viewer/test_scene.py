@@ -10,6 +10,7 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
+from maplab_py.storage.mission_names import named
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.drawing import make_drawing
@@ -83,6 +84,10 @@ def test_ends_of_paths_are_marked(two_missions: VIMap) -> None:
         np.testing.assert_array_equal(dots.rows, rows)
         np.testing.assert_allclose(dots.p, two_missions.T_G_I[rows, 4:], atol=1e-5)
         assert dots.labels == (f"start {mission_id[:8]}", f"end {mission_id[:8]}")
+    with_names = _scene(named(two_missions, ["monday", "tuesday"]))
+    assert [mission.name for mission in with_names.missions] == ["monday", "tuesday"]
+    labels = [part.labels for part in with_names.layer("path_ends").parts.values()]
+    assert labels == [("start monday", "end monday"), ("start tuesday", "end tuesday")]
     closed = np.array(walk_map().vertices.T_M_I)
     closed[-1] = closed[0]
     vi_map = walk_map()

@@ -59,7 +59,7 @@ def layer_hint(layer: Layer) -> str:
 def mission_label(mission: MissionEntry) -> str:
     """Return the words beside a mission's checkbox."""
     minutes, seconds = divmod(round(mission.duration_s), 60)
-    return f"{mission.id[:8]}  {mission.length_m:.0f} m  {minutes}:{seconds:02d}"
+    return f"{mission.name}  {mission.length_m:.0f} m  {minutes}:{seconds:02d}"
 
 
 def mission_legend(missions: Iterable[MissionEntry], limit: int = 24) -> str:

@@ -54,7 +54,7 @@ def path_ends(drawing: Drawing) -> Layer:
         dots = make_points(p[rows], _END_COLOURS, rows, 0.018 * drawing.unit_m)
         labels: tuple[str, ...] = ()
         if len(has_vertices) <= _MAX_LABELLED_MISSIONS and len(dots) == 2:
-            name = f" {drawing.mission_ids[mission][:8]}" if len(has_vertices) > 1 else ""
+            name = f" {drawing.mission_names[mission]}" if len(has_vertices) > 1 else ""
             is_closed = np.linalg.norm(p[rows[1]] - p[rows[0]]) < 0.05 * drawing.unit_m
             labels = ("start" + name, "end" + name)
             if is_closed:
@@ -119,13 +119,13 @@ def loop_closures(drawing: Drawing) -> Layer:
 
 
 def base_frames(drawing: Drawing) -> Layer:
-    """T_G_M of each mission, named by the beginning of its id."""
+    """T_G_M of each mission, labelled with its name."""
     T = drawing.vi_map.T_G_M.copy()
     T[:, 4:] += drawing.shift
     known = drawing.vi_map.baseframes.is_known[drawing.vi_map.missions.baseframe]
     parts: dict[str, Part] = {}
     for row, mission_id in enumerate(drawing.mission_ids):
-        label = mission_id[:8] + ("" if known[row] else " (base frame unknown)")
+        label = drawing.mission_names[row] + ("" if known[row] else " (base frame unknown)")
         parts[mission_id] = Axes(T[row : row + 1], 0.06 * drawing.unit_m, (label,))
     return Layer("base_frames", "Base frames", parts, len(T), is_visible=False)
 
