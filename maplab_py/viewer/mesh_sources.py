@@ -1,18 +1,28 @@
-"""Meshes to show: of the grids of a map, or of a file."""
+"""Meshes to show: of the grids of a map, or of a file, and their colours."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import numpy as np
+
+from maplab_py.algorithms.dense.distance.triangle_tree import TriangleTree
 from maplab_py.algorithms.dense.fusion.mesh_colours import vertex_colours
 from maplab_py.algorithms.dense.fusion.meshing import map_mesh
-from maplab_py.array_types import I64
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import parse_ply
 from maplab_py.progress import SILENT, Progress
+from maplab_py.viewer import colours
 from maplab_py.viewer.layers.clouds import Cloud
+from maplab_py.viewer.options import MeshColouring
+from maplab_py.viewer.scene import LegendEntry
 from maplab_py.vimap import VIMap
+
+_USUAL_PART = 95.0
+"""Percentile of the distances that has the last colour."""
 
 
 def grid_mesh(
@@ -38,8 +48,42 @@ def grid_mesh(
     return Cloud("Mesh", mesh.p, colours, faces=mesh.faces)
 
 
-def read_mesh(path: Path) -> Cloud:
-    """Return the mesh of a PLY file, in G.
+def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None = None) -> Cloud:
+    """Return a mesh in the colours that a rule gives it.
+
+    Args:
+        mesh: Mesh.
+        colouring: "shaded" is one colour, "colour" those of the mesh, "height" by z, "distance" by the
+            distance of every vertex from the reference; "auto" is the distance with a reference, else the
+            mesh's colours if it has some, else one colour.
+        reference: Another mesh.
+
+    Raises:
+        UserError: The mesh has no colours, or there is no reference, although the rule needs them.
+    """
+    if colouring == "distance" or (colouring == "auto" and reference is not None):
+        if reference is None or reference.faces is None:
+            raise UserError("--mesh_colouring=distance needs another mesh: --mesh_reference_file")
+        distance = TriangleTree(reference.p_G, reference.faces).distances(mesh.p_G)
+        largest = max(float(np.percentile(distance, _USUAL_PART)), 1e-9)
+        low, high = "0 m", f"{largest:.3g} m"
+        return _ramped(mesh, distance / largest, colours.HEAT, "distance", low, high)
+    if colouring == "height":
+        part, low_m, high_m = colours.normalised(mesh.p_G[:, 2])
+        low, high = f"{low_m:.3g} m", f"{high_m:.3g} m"
+        return _ramped(mesh, part, colours.SEQUENTIAL, "height", low, high)
+    if colouring == "colour" and mesh.colours is None:
+        raise UserError(f"--mesh_colouring=colour: the mesh {mesh.title} has no colours")
+    return dataclasses.replace(mesh, colours=None) if colouring == "shaded" else mesh
+
+
+def _ramped(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> Cloud:
+    legend = LegendEntry(text, tuple(colours.hex_codes(stops)), low, high)
+    return dataclasses.replace(mesh, colours=colours.ramp(part, stops), legend=(legend,))
+
+
+def read_mesh(path: Path, flag: str = "--mesh_file") -> Cloud:
+    """Return the mesh of a PLY file, in G; messages name the flag.
 
     Raises:
         UserError: The file cannot be read, or has no triangles.
@@ -48,10 +92,10 @@ def read_mesh(path: Path) -> Cloud:
     try:
         data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="reduce the mesh", error=MapError)
     except OSError as error:
-        raise UserError(f"--mesh_file={path} cannot be read ({error.strerror})") from error
+        raise UserError(f"{flag}={path} cannot be read ({error.strerror})") from error
     content = parse_ply(data, str(path))
     if content.faces is None or not len(content.faces):
-        raise UserError(f"--mesh_file={path} has no triangles: give a mesh")
+        raise UserError(f"{flag}={path} has no triangles: give a mesh")
     if content.faces.min() < 0 or content.faces.max() >= len(content.p):
         raise MapError(f"{path}: a triangle refers to a vertex that is not there")
     return Cloud(path.name, content.p, content.colours, faces=content.faces)

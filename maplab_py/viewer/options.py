@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from maplab_py.options import option
 
@@ -18,6 +18,9 @@ COLOURINGS = (
     "camera",
     "grey",
 )
+
+MeshColouring = Literal["auto", "shaded", "colour", "height", "distance"]
+"""Rules for the colours of meshes, see `mesh_sources.coloured_mesh`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
@@ -28,11 +27,6 @@ from maplab_py.vimap.queries import mission_sensor_id
 
 _MM = 1e-3
 _MAX_DEPTH_PIXELS = 20_000
-IMAGE_TYPES = (
-    "raw_images", "raw_color_images", "undistorted_images", "undistorted_color_images",
-    "rectified images", "rectified_color_images",
-)  # fmt: skip
-"""Types that show what a camera saw, the preferred first."""
 
 
 def type_number(name: str) -> int:
@@ -183,45 +177,3 @@ def _vertex_of(vi_map: VIMap, row: int) -> int:
     times = vi_map.vertices.timestamp_ns[start:stop]
     place = int(np.searchsorted(times, vi_map.resources.timestamp_ns[row], side="right")) - 1
     return start + max(place, 0) if stop > start else -1
-
-
-class VertexImages:
-    """The images of vertices, from the map's resources."""
-
-    def __init__(self, vi_map: VIMap, folder: Path, name: str = "") -> None:
-        """Find the images of a type; without a name those of the first type that the map has."""
-        self._store = ResourceStore(vi_map, folder)
-        self._row_of_vertex: dict[int, int] = {}
-        names = (name,) if name else IMAGE_TYPES
-        owned = vi_map.resources.owner_kind == ResourceOwner.FRAME
-        for candidate in names:
-            rows = np.flatnonzero(owned & (vi_map.resources.type == type_number(candidate)))
-            if len(rows):
-                vertices = vi_map.frames.vertex[vi_map.resources.owner[rows]]
-                pairs = zip(vertices.tolist()[::-1], rows.tolist()[::-1], strict=True)
-                self._row_of_vertex = dict(pairs)
-                break
-
-    def __len__(self) -> int:
-        return len(self._row_of_vertex)
-
-    def __call__(self, vertex: int) -> U8 | None:
-        """Return the image (H, W, 3) RGB of a vertex (row), None when it has none that can be read."""
-        row = self._row_of_vertex.get(vertex)
-        if row is None:
-            return None
-        try:
-            image = np.asarray(self._store.load(row))
-        except MapError:
-            return None
-        return as_rgb(image)
-
-
-def as_rgb(image: NDArray[np.uint8] | NDArray[np.uint16]) -> U8:
-    """Return an image (H, W[, 3] BGR), depths included, as RGB (H, W, 3)."""
-    if image.dtype != np.uint8:
-        largest = max(float(image.max(initial=0)), 1.0)
-        image = np.round(image / largest * 255.0).astype(np.uint8)
-    if image.ndim == 2:
-        return np.repeat(image[:, :, None], 3, axis=2).astype(np.uint8)
-    return np.ascontiguousarray(image[:, :, 2::-1], dtype=np.uint8)

@@ -5,24 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from maplab_py.algorithms.dense.distance.options import DistanceOptions
 from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT, FusionOptions
 from maplab_py.algorithms.dense.stereo.options import BmOptions, SgbmOptions, StereoOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,
     MissionChoice,
+    UserError,
     check_writable,
     command,
 )
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.dense.clouds import ConvertedDepthMaps
+    from maplab_py.algorithms.dense.distance.fields import FieldsReport
     from maplab_py.algorithms.dense.fusion.fusion import FusionReport
     from maplab_py.algorithms.dense.fusion.meshing import MeshReport
     from maplab_py.algorithms.dense.stereo.reconstruction import StereoReport
 
 _STEREO, _SGBM, _BM = StereoOptions(), SgbmOptions(), BmOptions()
 _FUSION = FusionOptions()
+_DISTANCE = DistanceOptions()
 
 
 @command(
@@ -125,7 +129,6 @@ def create_tsdf_from_depth_resource(
     """
     from maplab_py.algorithms.dense.fusion.fusion import fuse_depth, update_grids
     from maplab_py.memory import memory_limited
-    from maplab_py.storage.resource_types import resource_type_of
 
     if dense_result_mesh_output_file is not None:
         _check_mesh(dense_result_mesh_output_file, overwrite=overwrite)
@@ -141,14 +144,12 @@ def create_tsdf_from_depth_resource(
                 progress=context.progress,
             )
         else:
-            given = dense_depth_resource_input_type
-            flag = "--dense_depth_resource_input_type"
             vi_map, report = fuse_depth(
                 context.vi_map,
                 folder,
                 rows,
                 options,
-                input_type=resource_type_of(given, flag).number if given else None,
+                input_type=_depth_type(dense_depth_resource_input_type),
                 overwrite=overwrite,
                 progress=context.progress,
             )
@@ -157,6 +158,65 @@ def create_tsdf_from_depth_resource(
 
         file = dense_result_mesh_output_file
         write_map_mesh(vi_map, folder, file, rows, dense_tsdf_mesh_min_weight, overwrite=overwrite)
+    context.commit(vi_map)
+    return report
+
+
+@command(
+    "create_esdf_from_depth_resource",
+    "esdf",
+    example="esdf --dense_esdf_max_distance_m=3",
+    writes_files=True,
+    see_also=("create_tsdf_from_depth_resource", "visualize_esdf"),
+)
+def create_esdf_from_depth_resource(
+    context: CommandContext,
+    *,
+    missions: MissionChoice = ALL_MISSIONS,
+    dense_depth_resource_input_type: str = "",
+    options: DistanceOptions = _DISTANCE,
+    fusion: FusionOptions = _FUSION,
+    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    dense_max_memory_gb: float = 0.0,
+    overwrite: bool = False,
+) -> FieldsReport:
+    """Compute the distance of every voxel that cameras have seen from the nearest surface.
+
+    Depth is fused as by create_tsdf_from_depth_resource, together with the free space in front of the
+    surfaces. The Euclidean signed distance field is positive in free space and negative behind surfaces,
+    and exact: no distance is propagated from voxel to voxel. Missions with known base frames share a
+    field; each other one has its own. The field is a resource of its first mission and is written into the
+    map when it is saved.
+
+    Args:
+        dense_depth_resource_input_type: As of create_tsdf_from_depth_resource.
+        dense_tsdf_mesh_min_weight: Weight from which voxels count as observed for the surface, in
+            measurements at 2 m.
+        dense_max_memory_gb: Memory that the grid and the field may take; 0 = most of what is available.
+        overwrite: Replace fields that the missions have, and the file for path planners.
+    """
+    from maplab_py.algorithms.dense.distance.fields import create_fields, export_voxels
+    from maplab_py.memory import memory_limited
+
+    file = options.export_map_for_panning_path
+    if file is not None:
+        _check_cloud(file, overwrite=overwrite)
+    rows = missions.rows(context.vi_map)
+    folder = context.map_folder or Path()
+    with memory_limited(dense_max_memory_gb, "--dense_max_memory_gb"):
+        vi_map, report = create_fields(
+            context.vi_map,
+            folder,
+            rows,
+            options,
+            fusion,
+            min_weight=dense_tsdf_mesh_min_weight,
+            input_type=_depth_type(dense_depth_resource_input_type),
+            overwrite=overwrite,
+            progress=context.progress,
+        )
+    if file is not None:
+        export_voxels(vi_map, folder, file, rows, overwrite=overwrite)
     context.commit(vi_map)
     return report
 
@@ -209,3 +269,17 @@ def _check_mesh(path: Path, *, overwrite: bool) -> None:
 
     check_mesh_path(path)
     check_writable(path, overwrite=overwrite)
+
+
+def _check_cloud(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file of voxels before any work is done."""
+    if path.suffix.lower() != ".ply":
+        raise UserError(f"--dense_esdf_export_map_for_panning_path={path}: give a file named .ply")
+    check_writable(path, overwrite=overwrite)
+
+
+def _depth_type(given: str) -> int | None:
+    """Return the number of the resource type of depth that a user names, None for none."""
+    from maplab_py.storage.resource_types import resource_type_of
+
+    return resource_type_of(given, "--dense_depth_resource_input_type").number if given else None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,6 +112,58 @@ def test_a_grid_follows_the_poses(session: Session, tmp_path: Path) -> None:
     session.maps.update(entry.with_value(changed, "move"))
     assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 1
     assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 0
+
+
+def test_distances_for_a_planner(session: Session, room: StereoRoom, tmp_path: Path) -> None:
+    session.run("import_depth_maps", depth_folder=room.depth())
+    file = tmp_path / "voxels.ply"
+    report: Any = session.run("esdf", dense_esdf_export_map_for_panning_path=file)
+    (field,) = report.fields
+    assert field.depth_maps == len(session.vi_map.vertices)
+    assert 0.5 < field.free_share < 0.9
+    voxels = parse_ply(file.read_bytes(), "voxels.ply")
+    assert voxels.intensity is not None
+    assert len(voxels.p) == field.known_voxels > 20_000
+    truth = room.distances_to_surfaces(voxels.p)
+    free = voxels.intensity > 0.0
+    # surfaces that no camera has seen are missing, so that distances may be too large, but not too small
+    assert np.mean(voxels.intensity[free] < np.minimum(truth[free], 2.0) - 0.1) < 0.005
+    assert np.median(np.abs(voxels.intensity[free] - np.minimum(truth[free], 2.0))) < 0.01
+    view: Any = session.run("visualize_esdf", viewer_port=0)
+    assert "Distance field" in [line.layer for line in view.layers]
+    with pytest.raises(UserError, match=r"--dense_esdf_slice_height_m=90.00.*voxels from"):
+        session.run("visualize_esdf", dense_esdf_slice_height_m=90.0)
+    with pytest.raises(UserError, match="already: give --overwrite"):
+        session.run("esdf")
+    folder = tmp_path / "map"
+    session.run("save", map_folder=folder)
+    again: Any = session.run("esdf", overwrite=True)
+    assert again.fields == report.fields
+    reloaded = tmp_path / "reloaded.ply"
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from maplab_py.algorithms.dense.distance.fields import export_voxels\n"
+        "from maplab_py.storage.native import load_map\n"
+        "folder, file = map(Path, sys.argv[1:]); export_voxels(load_map(folder)[0], folder, file)"
+    )
+    subprocess.run([sys.executable, "-c", program, str(folder), str(reloaded)], check=True)
+    assert reloaded.read_bytes() == file.read_bytes()
+
+
+def test_distance_fields_are_refused_before_any_work(session: Session, tmp_path: Path) -> None:
+    before = session.vi_map
+    with pytest.raises(UserError, match="stereo_dense_reconstruction makes depth maps"):
+        session.run("esdf")
+    with pytest.raises(UserError, match="create_esdf_from_depth_resource makes one"):
+        session.run("visualize_esdf")
+    with pytest.raises(UserError, match=r"a file named \.ply"):
+        session.run("esdf", dense_esdf_export_map_for_panning_path=tmp_path / "voxels.txt")
+    (tmp_path / "voxels.ply").write_text("mine")
+    with pytest.raises(UserError, match="--overwrite"):
+        session.run("esdf", dense_esdf_export_map_for_panning_path=tmp_path / "voxels.ply")
+    with pytest.raises(FlagError, match="dense_esdf_max_distance_m"):
+        session.run("esdf", dense_esdf_max_distance_m=0.0)
+    assert session.vi_map is before
 
 
 def test_wrong_values_are_refused(session: Session, tmp_path: Path) -> None:

@@ -114,6 +114,8 @@ _ROOM = "load stereo_room/session_1; import_images stereo_room/raw/session_1"
 PREPARED["stereo_dense_reconstruction"] = _ROOM
 PREPARED["convert_all_depth_maps_to_point_clouds"] = f"{_ROOM}; sdr"
 PREPARED["create_tsdf_from_depth_resource"] = f"{_ROOM}; sdr"
+PREPARED["create_esdf_from_depth_resource"] = f"{_ROOM}; sdr"
+PREPARED["visualize_esdf"] = f"{_ROOM}; sdr; esdf"
 PREPARED["create_mesh_from_tsdf_grid"] = f"{_ROOM}; sdr; tsdf"
 PREPARED["export_colmap_mvs"] = PREPARED["export_for_pmvs_reconstruction"] = _ROOM
 PREPARED["visualize_mesh"] = PREPARED["create_mesh_from_tsdf_grid"]

@@ -31,9 +31,10 @@ class CloudPairs:
 
 
 def pairs_by_position(vi_map: VIMap, scans: Scans, options: CloudClosureOptions) -> CloudPairs:
-    """Return for every cloud the nearest ones of each mission, by the present poses.
+    """Return for every cloud the nearest ones of each mission, and some that precede it.
 
-    Missions of unknown base frame are compared with themselves only.
+    Nearest are those by the present poses. Missions of unknown base frame are compared with themselves
+    only.
     """
     from scipy.spatial import cKDTree
 
@@ -46,6 +47,9 @@ def pairs_by_position(vi_map: VIMap, scans: Scans, options: CloudClosureOptions)
     query, place = query[chosen], place[chosen]
     distance = np.linalg.norm(p_G[query] - p_G[place], axis=1)
     query, place = _nearest_of_each(scans, query, place, distance, options.max_candidates)
+    following, preceding = _in_sequence(scans, options)
+    both = np.stack([np.append(query, following), np.append(place, preceding)])
+    query, place = np.unique(both, axis=1)
     return CloudPairs(query, place, se3.relative(scans.T_G_S[place], scans.T_G_S[query]))
 
 
@@ -98,6 +102,25 @@ def pairs_everywhere(scans: Scans, options: CloudClosureOptions) -> CloudPairs:
 def _apart(scans: Scans, query: I64, place: I64, options: CloudClosureOptions) -> Mask:
     gap_s = np.abs(scans.time_ns[query] - scans.time_ns[place]) * 1e-9
     return np.asarray(gap_s >= options.min_time_gap_s)
+
+
+def _in_sequence(scans: Scans, options: CloudClosureOptions) -> tuple[I64, I64]:
+    """Return clouds and those of the same mission one and two gaps earlier, unless they are too far."""
+    gap_ns = round(options.sequence_gap_s * 1e9)
+    query, place = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for mission in np.unique(scans.mission).tolist() if gap_ns else []:
+        rows = np.flatnonzero(scans.mission == mission)
+        rows = rows[np.argsort(scans.time_ns[rows], kind="stable")]
+        time_ns = scans.time_ns[rows]
+        for wanted_ns in (gap_ns, 2 * gap_ns):
+            earlier = nearest_rows(time_ns, time_ns - wanted_ns)
+            is_near = np.abs(time_ns - time_ns[earlier] - wanted_ns) < gap_ns // 2
+            query.append(rows[is_near])
+            place.append(rows[earlier[is_near]])
+    q, p = np.concatenate(query), np.concatenate(place)
+    distance = np.linalg.norm(scans.T_G_S[q, 4:] - scans.T_G_S[p, 4:], axis=1)
+    near = (distance <= options.max_distance_m) & (q != p)
+    return q[near], p[near]
 
 
 def _nearest_of_each(

@@ -32,6 +32,12 @@ class CloudClosureOptions:
     min_time_gap_s: float = option(
         10.0, help="Clouds of one mission that are closer in time are not compared", unit="s"
     )
+    sequence_gap_s: float = option(
+        1.0,
+        help="Compare each cloud also with those of its mission about this long, and twice as long, before "
+        "it: they limit the drift between places that are visited once; 0 = none",
+        unit="s",
+    )
     max_candidates: int = option(3, help="Clouds of each mission that a cloud is compared with")
     every_nth: int = option(1, help="Use every n-th cloud of a sensor only")
     voxel_size_m: float = option(
@@ -85,6 +91,8 @@ class CloudClosureOptions:
             raise ValueError("lidar_lc_voxel_size_m and max_correspondence_m must be positive")
         if self.max_candidates < 1 or self.every_nth < 1:
             raise ValueError("lidar_lc_max_candidates and every_nth must be 1 or greater")
+        if self.sequence_gap_s < 0.0:
+            raise ValueError("lidar_lc_sequence_gap_s must be 0 or greater")
         if not 0.0 <= self.min_overlap <= 1.0 or not 0.0 <= self.max_conflict <= 1.0:
             raise ValueError("lidar_lc_min_overlap and max_conflict must be between 0 and 1")
         if self.covariance_scaler <= 0.0 or self.switch_variable_variance <= 0.0:

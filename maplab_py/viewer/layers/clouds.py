@@ -11,7 +11,7 @@ from maplab_py.array_types import F64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points
 from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
-from maplab_py.viewer.scene import WHOLE_MAP, Layer, Mesh, Part
+from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Mesh, Part
 from maplab_py.viewer.subsampling import spread_rows
 
 
@@ -26,6 +26,7 @@ class Cloud:
     faces: NDArray[np.int32] | None = None  # (F, 3)
     mission_id: str = WHOLE_MAP
     vertex: int = -1  # row at which it was recorded; -1 = of the whole session
+    legend: tuple[LegendEntry, ...] = ()  # what the colours mean
 
 
 def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) -> Layer:
@@ -48,7 +49,8 @@ def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) ->
     drawn = sum(len(part) for part in parts.values())
     losses = (total - drawn - thinned, NO_POSITION), (thinned, MAX_POINTS)
     notes = omission_notes(title, drawn, *losses)
-    return Layer(f"cloud_{number}", title, parts, total, notes=notes)
+    legend = clouds[0].legend if clouds else ()
+    return Layer(f"cloud_{number}", title, parts, total, legend=legend, notes=notes)
 
 
 def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
@@ -59,7 +61,7 @@ def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
     if colour is None:
         colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
     parts: dict[str, Part] = {cloud.mission_id: Mesh(p, faces, colour)}
-    return Layer(f"mesh_{number}", cloud.title, parts, len(faces))
+    return Layer(f"mesh_{number}", cloud.title, parts, len(faces), legend=cloud.legend)
 
 
 def cloud_colours(cloud: Cloud) -> U8:

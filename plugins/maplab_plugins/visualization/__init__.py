@@ -26,7 +26,7 @@ from maplab_plugins.visualization.maps import (
     visualize_sensor_extrinsics,
     visualize_sequentially,
 )
-from maplab_plugins.visualization.meshes import visualize_mesh
+from maplab_plugins.visualization.meshes import visualize_esdf, visualize_mesh
 from maplab_plugins.visualization.output import export_view, save_view, viewer_stop
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "visualize",
     "visualize_difference",
     "visualize_disparity_maps",
+    "visualize_esdf",
     "visualize_landmark_observers",
     "visualize_loop_closures",
     "visualize_mesh",

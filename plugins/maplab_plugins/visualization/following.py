@@ -181,13 +181,13 @@ def show(
 
 
 def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:
-    """Return the images that the map keeps as resources; none when it was never loaded."""
+    """Return the images and depth maps that the map keeps as resources; none when it was never loaded."""
     from maplab_py.viewer.display.selection import no_image
-    from maplab_py.viewer.resource_clouds import VertexImages
+    from maplab_py.viewer.vertex_images import VertexImages
 
     if context.map_folder is None or not len(vi_map.resources):
         return no_image
-    images = VertexImages(vi_map, context.map_folder)
+    images = VertexImages(vi_map, context.map_folder, with_depth=True)
     return images if len(images) else no_image
 
 

@@ -1,4 +1,4 @@
-"""The command that shows a mesh: of the map's grids, or of a file."""
+"""The commands that show a mesh, of the map's grids or of a file, and a slice of a distance field."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
 from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
-from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.options import MeshColouring, VisualizationOptions
 
 _OPTIONS = VisualizationOptions()
 _VIEWER = ViewerOptions()
@@ -24,6 +24,8 @@ def visualize_mesh(
     context: CommandContext,
     *,
     mesh_file: Path | None = None,
+    mesh_colouring: MeshColouring = "auto",
+    mesh_reference_file: Path | None = None,
     missions: MissionChoice = ALL_MISSIONS,
     dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
     dense_result_mesh_colours: bool = False,
@@ -34,13 +36,19 @@ def visualize_mesh(
 
     Args:
         mesh_file: PLY file with triangles in the global frame; empty = the mesh of the map's grids.
+        mesh_colouring: shaded = one colour, colour = that of the images or of the file, height = by z,
+            distance = from the mesh of --mesh_reference_file; auto = the distance with such a file, else
+            colours if there are any, else one colour.
+        mesh_reference_file: PLY file of another mesh, in the global frame.
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
-        dense_result_mesh_colours: Colour the mesh of the grids by the images of the map; the colours of
-            a mesh file are always shown.
+        dense_result_mesh_colours: Colour the mesh of the grids by the images of the map, as colour does.
     """
     from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.mesh_sources import grid_mesh, read_mesh
+    from maplab_py.viewer.mesh_sources import coloured_mesh, grid_mesh, read_mesh
 
+    reference = None
+    if mesh_reference_file is not None:
+        reference = read_mesh(mesh_reference_file, "--mesh_reference_file")
     if mesh_file is not None:
         mesh = read_mesh(mesh_file)
     else:
@@ -48,7 +56,40 @@ def visualize_mesh(
         folder = context.map_folder or Path()
         mesh = grid_mesh(
             context.vi_map, folder, rows, dense_tsdf_mesh_min_weight,
-            with_colours=dense_result_mesh_colours, progress=context.progress,
+            with_colours=dense_result_mesh_colours or mesh_colouring == "colour",
+            progress=context.progress,
         )  # fmt: skip
+    mesh = coloured_mesh(mesh, mesh_colouring, reference)
     subject = Subject(context.vi_map, context.map_key, options, clouds=(mesh,))
+    return show(context, subject, viewer)
+
+
+@command(
+    "visualize_esdf",
+    example="visualize_esdf",
+    acts_outside=True,
+    guards_effects=True,
+    see_also=("create_esdf_from_depth_resource",),
+)
+def visualize_esdf(
+    context: CommandContext,
+    *,
+    missions: MissionChoice = ALL_MISSIONS,
+    dense_esdf_slice_height_m: float | None = None,
+    options: VisualizationOptions = _OPTIONS,
+    viewer: ViewerOptions = _VIEWER,
+) -> ViewReport:
+    """Show the map with a horizontal slice through its distance field, coloured by the distance.
+
+    Args:
+        dense_esdf_slice_height_m: Height of the slice in the global frame; empty = the median height of
+            the vertices.
+    """
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.field_slices import field_slice
+
+    rows = missions.rows(context.vi_map)
+    folder = context.map_folder or Path()
+    cloud = field_slice(context.vi_map, folder, rows, dense_esdf_slice_height_m)
+    subject = Subject(context.vi_map, context.map_key, options, clouds=(cloud,))
     return show(context, subject, viewer)

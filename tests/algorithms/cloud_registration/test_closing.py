@@ -103,7 +103,7 @@ def test_maps_without_clouds_or_pairs() -> None:
         close_cloud_loops(bare, Path(), OPTIONS)
     with pytest.raises(UserError, match="no accepted closure"):
         close_cloud_loops(vi_map, Path(), dataclasses.replace(OPTIONS, from_closures=True))
-    late = dataclasses.replace(OPTIONS, min_time_gap_s=100.0)
+    late = dataclasses.replace(OPTIONS, min_time_gap_s=100.0, sequence_gap_s=0.0)
     assert "--lidar_lc_min_time_gap_s" in close_cloud_loops(vi_map, Path(), late)[1].failure
     with pytest.raises(ValueError, match="exclude each other"):
         CloudClosureOptions(search_globally=True, from_closures=True)
@@ -124,9 +124,31 @@ def test_no_wrong_edges_over_twenty_seeds(world: WorldOptions, motion: SessionOp
 
 
 @pytest.mark.slow
-def test_a_drifting_minute_is_straightened() -> None:
-    data = simulate(session(TWO_ROOMS, TOUR, rate_hz=1.0))
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(("world", "motion"), [(TWO_ROOMS, TOUR), (CORRIDOR, WALK)])
+def test_a_drifting_minute_is_straightened(
+    world: WorldOptions, motion: SessionOptions, seed: int
+) -> None:
+    data = simulate(session(world, motion, rate_hz=1.0, seed=seed))
     vi_map, _ = close_cloud_loops(data.maps[0], Path(), OPTIONS)
     relaxed, _ = relax(vi_map, RelaxationOptions())
     before = evaluate_map(data.maps[0], data.truth).ate_m
     assert evaluate_map(relaxed, data.truth).ate_m <= 0.25 * before
+
+
+def test_clouds_in_sequence_limit_the_drift_where_no_loop_closes() -> None:
+    """Without a place that is visited twice, only clouds that follow one another are compared."""
+    once = session(ROOM, dataclasses.replace(AROUND, duration_s=9.0, turns=0.5), rate_hz=2.0)
+    data = simulated(once)
+    alone = dataclasses.replace(OPTIONS, sequence_gap_s=0.0)
+    assert not len(close_cloud_loops(data.maps[0], Path(), alone)[0].loop_closure_edges)
+    vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
+    edges = vi_map.loop_closure_edges
+    stamp_ns = vi_map.vertices.timestamp_ns
+    gap_s = (stamp_ns[edges.from_vertex] - stamp_ns[edges.to_vertex]) * 1e-9
+    assert set(np.abs(gap_s).round().tolist()) == {1.0, 2.0}
+    assert report.edges_added > report.clouds
+    assert edge_errors(vi_map, data.truth)[0].max() < 0.05
+    relaxed, _ = relax(vi_map, RelaxationOptions())
+    before = evaluate_map(data.maps[0], data.truth).ate_m
+    assert evaluate_map(relaxed, data.truth).ate_m < 0.5 * before

@@ -52,14 +52,15 @@ def fill_table(coordinates: I32, table: I64) -> None:
 def allocate_blocks(
     depth: F32, camera: F64, T_G_C: F64, settings: F64, table: I64, coordinates: I32, count: int
 ) -> int:
-    """Add the blocks in the truncation band about the pixels of a depth map.
+    """Add the blocks in the truncation band about the pixels of a depth map, or from the camera on.
 
     Args:
         depth: Depths (H, W) [m], 0 = unknown.
         camera: Focal length, centre u, centre v [px].
         T_G_C: Pose (4, 4) of the camera.
-        settings: Side of a block, truncation distance, smallest and largest depth [m], and the step
-            between the pixels that are looked at.
+        settings: Side of a block, truncation distance, smallest and largest depth [m], the step
+            between the pixels that are looked at, and 1 to add the blocks of the free space in front of
+            the surface, too, else 0.
         table: Hash table (N, 2), N a power of two.
         coordinates: Blocks (capacity, 3); new ones are added.
         count: Number of blocks.
@@ -68,7 +69,7 @@ def allocate_blocks(
         The new number of blocks, or FULL.
     """
     block_m, band_m, near, far = settings[0], settings[1], settings[2], settings[3]
-    step = int(settings[4])
+    step, is_free_wanted = int(settings[4]), settings[5] > 0.0
     last = np.int64(-1)
     for v in range(0, depth.shape[0], step):
         y = (v - camera[2]) / camera[0]
@@ -80,10 +81,13 @@ def allocate_blocks(
             d0 = T_G_C[0, 0] * x + T_G_C[0, 1] * y + T_G_C[0, 2]
             d1 = T_G_C[1, 0] * x + T_G_C[1, 1] * y + T_G_C[1, 2]
             d2 = T_G_C[2, 0] * x + T_G_C[2, 1] * y + T_G_C[2, 2]
-            stretch = band_m / np.sqrt(x * x + y * y + 1.0)
-            samples = int(np.ceil(2.0 * band_m / (0.75 * block_m)))
+            length = np.sqrt(x * x + y * y + 1.0)
+            middle, stretch = z, band_m / length
+            if is_free_wanted:
+                middle, stretch = 0.5 * (z + stretch), 0.5 * (z + stretch)
+            samples = int(np.ceil(2.0 * stretch * length / (0.75 * block_m) - 1e-9))
             for k in range(samples + 1):
-                along = z + stretch * (2.0 * k / samples - 1.0)
+                along = middle + stretch * (2.0 * k / samples - 1.0)
                 a = np.int64(np.floor((d0 * along + T_G_C[0, 3]) / block_m))
                 b = np.int64(np.floor((d1 * along + T_G_C[1, 3]) / block_m))
                 c = np.int64(np.floor((d2 * along + T_G_C[2, 3]) / block_m))
@@ -126,7 +130,7 @@ def compile_kernels() -> None:
     """Compile the kernels of this module for the types that the grid uses."""
     table = np.full((64, 2), -1, dtype=np.int64)
     coordinates = np.zeros((8, 3), dtype=np.int32)
-    settings = np.array([1.0, 0.1, 0.1, 9.0, 1.0])
+    settings = np.array([1.0, 0.1, 0.1, 9.0, 1.0, 0.0])
     depth = np.ones((2, 2), dtype=np.float32)
     count = allocate_blocks(depth, np.ones(3), np.eye(4), settings, table, coordinates, 0)
     fill_table(coordinates[:count], table)

@@ -7,8 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.dense.fusion.depth_inputs import (
+    depth_type,
+    fuse_views,
+    grid_settings,
+    mission_groups,
+    short_id,
+)
 from maplab_py.algorithms.dense.fusion.depth_views import DepthViews
-from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.fusion.grid import TsdfGrid
 from maplab_py.algorithms.dense.fusion.grid_file import (
     FusedDepth,
     StoredGrid,
@@ -16,11 +23,7 @@ from maplab_py.algorithms.dense.fusion.grid_file import (
     encode_grid,
 )
 from maplab_py.algorithms.dense.fusion.options import FusionOptions
-from maplab_py.algorithms.dense.resources import (
-    CLOUDS,
-    DEPTH_MAPS,
-    chosen_missions,
-)
+from maplab_py.algorithms.dense.resources import chosen_missions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
@@ -35,8 +38,6 @@ from maplab_py.vimap.resource_queries import resources_of, without_resources
 
 GRID_TYPE = 18
 """Number of the resource type of grids of truncated signed distances."""
-_INPUT_TYPES = (9, 8, 17, 16, 21)
-"""Resource types of depth, the preferred first: optimised, raw, clouds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,39 +93,25 @@ def fuse_depth(
     """
     options = options or FusionOptions()
     rows = np.array(chosen_missions(vi_map, missions))
-    kind = _input_type(vi_map, rows, input_type)
+    kind = depth_type(vi_map, rows, input_type)
     former = _grids(vi_map, rows)
     if former.any() and not overwrite:
         raise UserError(
             f"there is a grid of {counted(int(np.count_nonzero(former)), 'mission')} already: give "
             "--overwrite to replace it, or --update to follow changed poses"
         )
-    settings = GridSettings(
-        options.voxel_size_m,
-        options.truncation_m,
-        options.min_ray_length_m,
-        options.max_ray_length_m,
-        options.weight_depth_power,
-        options.max_weight,
-    )
-    groups, notes = _groups(vi_map, rows)
+    groups, notes = mission_groups(vi_map, rows)
     depth = DepthViews(vi_map, map_folder, kind)
     new = NewResources(seed=b"grid")
     reports, owners = [], []
     for group in groups:
         resources = depth.of_missions(group)[:: options.integrate_every_nth]
         if not len(resources):
-            notes.append(f"mission {_short(vi_map, group[0])}: no {resource_type(kind).name}")
+            notes.append(f"mission {short_id(vi_map, group[0])}: no {resource_type(kind).name}")
             continue
         T_M_G = se3.inverse(vi_map.T_G_M[group[0]])
-        grid = TsdfGrid(settings)
         poses = depth.poses(resources, T_M_G)
-        for done, row in enumerate(resources.tolist()):
-            progress.step(done, 2 * len(resources), "making the blocks of the grid")
-            grid.allocate(*depth.view(row), se3.to_matrix(poses[done]))
-        for done, row in enumerate(resources.tolist()):
-            progress.step(len(resources) + done, 2 * len(resources), "fusing depth")
-            grid.integrate(*depth.view(row), se3.to_matrix(poses[done]))
+        grid = fuse_views(depth, resources, poses, grid_settings(options), progress)
         fused = FusedDepth(vi_map.resources.id[resources], poses)
         new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
         owners.append(group[0])
@@ -161,7 +148,7 @@ def update_grids(
     grids = np.flatnonzero(_grids(vi_map, rows))
     if not len(grids):
         raise UserError("the missions have no grid: create_tsdf_from_depth_resource makes one")
-    groups, notes = _groups(vi_map, np.arange(len(vi_map.missions)))
+    groups, notes = mission_groups(vi_map, np.arange(len(vi_map.missions)))
     store = ResourceStore(vi_map, map_folder)
     new = NewResources(seed=b"grid")
     reports, owners, kinds, replaced = (
@@ -255,37 +242,8 @@ def load_grids(
     ]
 
 
-def _input_type(vi_map: VIMap, missions: I64, given: int | None) -> int:
-    """Return the resource type of depth to fuse.
-
-    Raises:
-        UserError: There is none, or the given type is no depth.
-    """
-    if given is not None and given not in (*DEPTH_MAPS, *CLOUDS):
-        known = ", ".join(str(kind) for kind in (*DEPTH_MAPS, *CLOUDS))
-        raise UserError(f"--dense_depth_resource_input_type={given}: wants one of {known}")
-    wanted = _INPUT_TYPES if given is None else (given,)
-    for kind in wanted:
-        if resources_of(vi_map, (kind,), missions).any():
-            return kind
-    what = "depth" if given is None else resource_type(given).name
-    raise UserError(f"the missions have no {what}: stereo_dense_reconstruction makes depth maps")
-
-
 def _grids(vi_map: VIMap, missions: I64) -> Mask:
     return resources_of(vi_map, (GRID_TYPE,), missions)
-
-
-def _groups(vi_map: VIMap, missions: I64) -> tuple[list[list[int]], list[str]]:
-    """Group missions in a common frame: those with known base frames; each other one is alone."""
-    known = vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]]
-    together = missions[known].tolist()
-    alone = [[row] for row in missions[~known].tolist()]
-    notes = []
-    if len(missions) > 1 and alone:
-        names = ", ".join(_short(vi_map, group[0]) for group in alone)
-        notes.append(f"missions with unknown base frames have grids of their own: {names}")
-    return ([together] if together else []) + alone, notes
 
 
 def _rows_of(vi_map: VIMap, fused: FusedDepth) -> I64:
@@ -313,10 +271,6 @@ def _motion_m(T_M_C: F64, moved_T_M_C: F64) -> F64:
     before = se3.transform(T_M_C[:, None], points)
     after = se3.transform(moved_T_M_C[:, None], points)
     return np.asarray(np.linalg.norm(after - before, axis=-1).max(axis=1))
-
-
-def _short(vi_map: VIMap, mission: int) -> str:
-    return to_hex(vi_map.missions.id[mission])[:8]
 
 
 def _report(

@@ -103,8 +103,16 @@ class TsdfGrid:
         arrays = (self._coordinates, self._distance, self._weight, self._table)
         return sum(array.nbytes for array in arrays)
 
-    def allocate(self, depth: F32, pinhole: Pinhole, T_G_C: F64) -> None:
+    def allocate(
+        self, depth: F32, pinhole: Pinhole, T_G_C: F64, *, with_free_space: bool = False
+    ) -> None:
         """Make the blocks near the surface in a depth map (H, W) [m] of a camera at a pose (4, 4).
+
+        Args:
+            depth: Depths along the optical axis, 0 = unknown.
+            pinhole: Camera.
+            T_G_C: Its pose.
+            with_free_space: Also make the blocks between the camera and the surface.
 
         Raises:
             NotEnoughMemory: The grid would exceed the allowed memory.
@@ -120,7 +128,8 @@ class TsdfGrid:
         camera = np.array([pinhole.focal_px, *pinhole.centre_px])
         step = int(pinhole.focal_px * block_m / (_STEPS_PER_BLOCK * s.max_depth_m))
         step = min(max(step, 1), _MAX_PIXEL_STEP)
-        settings = np.array([block_m, s.truncation_m, s.min_depth_m, s.max_depth_m, step])
+        range_m = s.min_depth_m, s.max_depth_m
+        settings = np.array([block_m, s.truncation_m, *range_m, step, float(with_free_space)])
         while True:
             arguments = depth, camera, T_G_C, settings, self._table, self._coordinates
             count = allocate_blocks(*arguments, self.count) if len(self._table) else FULL

@@ -1,0 +1,1 @@
+"""Exact distances of points from triangle meshes, and distance fields of grids."""

@@ -1,0 +1,166 @@
+"""Euclidean signed distance fields: every observed voxel's distance from the nearest surface."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from maplab_py.algorithms.dense.distance.options import DistanceOptions
+from maplab_py.algorithms.dense.distance.triangle_tree import TriangleTree
+from maplab_py.algorithms.dense.fusion.block_kernels import BLOCK_SIDE
+from maplab_py.algorithms.dense.fusion.grid import TsdfGrid
+from maplab_py.array_types import F32, F64, I32, I64, Mask
+from maplab_py.errors import EstimationError
+from maplab_py.memory import require_memory
+from maplab_py.progress import SILENT, Progress
+
+_BLOCKS_AT_A_TIME = 1024
+_BYTES_PER_BLOCK = 4 * BLOCK_SIDE**3 + 12
+_HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(BLOCK_SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
+"""Places (512, 3) of the voxels in a block."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DistanceField:
+    """Distances from the surface at the centres of voxels, in the frame of a mission."""
+
+    voxel_size_m: float
+    max_distance_m: float  # no distance is larger
+    coordinates: I32  # (B, 3) blocks, sorted, in units of the block's side
+    distance_m: F32  # (B, 8, 8, 8) positive in free space, negative behind surfaces; NaN = unknown
+
+    def centres(self, blocks: slice = slice(None)) -> F64:
+        """Return the centres (b, 8, 8, 8, 3) of the voxels of blocks."""
+        return voxel_centres(self.coordinates[blocks], self.voxel_size_m)
+
+    def at(self, p: F64) -> F64:
+        """Return the distances (N,) of the voxels in which points (N, 3) lie; NaN = unknown."""
+        voxel = np.floor(np.asarray(p) / self.voxel_size_m).astype(np.int64)
+        block = voxel // BLOCK_SIDE
+        row = _rows_in(self.coordinates, block)
+        i, j, k = (voxel - block * BLOCK_SIDE).T
+        return np.where(row >= 0, self.distance_m[row, i, j, k], np.nan).astype(np.float64)
+
+
+def voxel_centres(coordinates: I32, voxel_size_m: float) -> F64:
+    """Return the centres (B, 8, 8, 8, 3) [m] of the voxels of blocks (B, 3)."""
+    voxels = coordinates[:, None].astype(np.int64) * BLOCK_SIDE + _OFFSETS
+    return (voxels.reshape(-1, *(BLOCK_SIDE,) * 3, 3) + 0.5) * voxel_size_m
+
+
+def distance_field(
+    grid: TsdfGrid,
+    cameras: F64,
+    options: DistanceOptions,
+    min_weight: float,
+    progress: Progress = SILENT,
+) -> DistanceField:
+    """Return the distances of a grid's voxels from its mesh, exact up to the rounding of float32.
+
+    A voxel is known if it has been seen to be free, or lies behind a surface with at least the weight
+    that the mesh needs.
+
+    Args:
+        grid: Truncated distances, with the free space.
+        cameras: Positions (K, 3) of the cameras in the frame of the grid.
+        options: Largest distance, and the spheres around the cameras.
+        min_weight: Weight from which voxels count as observed for the mesh.
+        progress: Is told about the blocks.
+
+    Raises:
+        EstimationError: The grid has no surface of this weight.
+        NotEnoughMemory: The field exceeds the allowed memory.
+    """
+    mesh = grid.mesh(min_weight)
+    if not len(mesh.faces):
+        raise EstimationError(
+            f"the grid has no surface of weight {min_weight:g}: lower --dense_tsdf_mesh_min_weight"
+        )
+    tree = TriangleTree(mesh.p, mesh.faces)
+    size_m = grid.settings.voxel_size_m
+    coordinates = _sorted_blocks(grid.coordinates)
+    if options.use_clear_sphere:
+        around = _blocks_around(cameras, options.clear_sphere_outer_radius, BLOCK_SIDE * size_m)
+        coordinates = _sorted_blocks(np.concatenate([coordinates, around]))
+    require_memory(len(coordinates) * _BYTES_PER_BLOCK, "the distance field")
+    row = _rows_in(_sorted_blocks(grid.coordinates), coordinates)
+    order = np.lexsort(grid.coordinates.T[::-1])
+    distance = np.empty((len(coordinates), *(BLOCK_SIDE,) * 3), dtype=np.float32)
+    for first in range(0, len(coordinates), _BLOCKS_AT_A_TIME):
+        progress.step(first, len(coordinates), "distances from the surface")
+        part = slice(first, first + _BLOCKS_AT_A_TIME)
+        centres = voxel_centres(coordinates[part], size_m)
+        known, is_behind = _observed(grid, order, row[part], min_weight)
+        if options.use_clear_sphere:
+            spheres = _in_spheres(centres, cameras, options) & ~known[..., None]
+            known |= spheres[..., 0]
+        distance[part] = _signed(tree, centres, known, is_behind, options.max_distance_m)
+        if options.use_clear_sphere:
+            distance[part][spheres[..., 1]] = -options.max_distance_m
+    kept = np.isfinite(distance).any(axis=(1, 2, 3))
+    return DistanceField(size_m, options.max_distance_m, coordinates[kept], distance[kept])
+
+
+def _observed(grid: TsdfGrid, order: I64, rows: I64, min_weight: float) -> tuple[Mask, Mask]:
+    """Return which voxels (b, 8, 8, 8) are known, and which of these lie behind a surface.
+
+    Args:
+        grid: Grid.
+        order: Rows of its blocks in the order of their coordinates.
+        rows: Places (b,) of the blocks in that order, -1 = not in the grid.
+        min_weight: See `distance_field`.
+    """
+    block = order[rows]
+    weight = np.where((rows >= 0)[:, None, None, None], grid.weight[block], np.float32(0.0))
+    is_behind = grid.distance[block] < 0.0
+    known = (weight > 0.0) & (~is_behind | (weight >= min_weight))
+    return known, is_behind & known
+
+
+def _signed(tree: TriangleTree, centres: F64, known: Mask, is_behind: Mask, limit: float) -> F32:
+    """Return the distances of voxels, NaN where they are not known."""
+    result = np.full(known.shape, np.nan, dtype=np.float32)
+    result[known] = tree.distances(centres[known], limit)
+    return np.where(is_behind, -result, result)
+
+
+def _in_spheres(centres: F64, cameras: F64, options: DistanceOptions) -> Mask:
+    """Return which voxels are in the inner spheres, and which only in the outer ones (..., 2)."""
+    inner, outer = options.clear_sphere_inner_radius, options.clear_sphere_outer_radius
+    bound = np.nextafter(outer, np.inf)
+    distance = cKDTree(cameras).query(centres.reshape(-1, 3), distance_upper_bound=bound)[0]
+    distance = distance.reshape(centres.shape[:-1])
+    return np.stack([distance <= inner, (distance > inner) & (distance <= outer)], axis=-1)
+
+
+def _blocks_around(cameras: F64, radius_m: float, block_m: float) -> I32:
+    """Return blocks (B, 3) that a sphere about a camera (K, 3) may touch."""
+    home = np.unique(np.floor(cameras / block_m).astype(np.int64), axis=0)
+    reach = int(np.ceil(radius_m / block_m))
+    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), -1)
+    require_memory(len(home) * steps.size * 8.0, "the spheres around the cameras")
+    blocks = np.unique((home[:, None] + steps.reshape(-1, 3)).reshape(-1, 3), axis=0)
+    distance = cKDTree(cameras).query((blocks + 0.5) * block_m)[0]
+    return blocks[distance <= radius_m + _HALF_DIAGONAL * block_m].astype(np.int32)
+
+
+def _sorted_blocks(coordinates: I32) -> I32:
+    """Return blocks (B, 3) without repetitions, in the order of their coordinates."""
+    return np.unique(coordinates, axis=0)
+
+
+def _rows_in(blocks: I32, wanted: I32 | I64) -> I64:
+    """Return the rows (N,) of wanted blocks (N, 3) in sorted blocks (B, 3), -1 = not there."""
+    if not len(blocks):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    low = blocks.min(axis=0).astype(np.int64) - 1
+    size = blocks.max(axis=0).astype(np.int64) - low + 2
+    keys, queries = (
+        np.ravel_multi_index(tuple(np.clip(c - low, 0, size - 1).T), tuple(size))
+        for c in (blocks, wanted)
+    )
+    place = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
+    return np.where(keys[place] == queries, place, -1)

@@ -1,0 +1,99 @@
+"""What is fused into grids: the depth of missions in a common frame, in one grid each."""
+
+from __future__ import annotations
+
+from maplab_py.algorithms.dense.fusion.depth_views import DepthViews
+from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.fusion.options import FusionOptions
+from maplab_py.algorithms.dense.resources import CLOUDS, DEPTH_MAPS
+from maplab_py.array_types import F64, I64
+from maplab_py.errors import UserError
+from maplab_py.geometry import se3
+from maplab_py.progress import Progress
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.resource_queries import resources_of
+
+_INPUT_TYPES = (9, 8, 17, 16, 21)
+"""Resource types of depth, the preferred first: optimised, raw, clouds."""
+
+
+def grid_settings(options: FusionOptions) -> GridSettings:
+    """Return the settings of a grid that options describe."""
+    return GridSettings(
+        options.voxel_size_m,
+        options.truncation_m,
+        options.min_ray_length_m,
+        options.max_ray_length_m,
+        options.weight_depth_power,
+        options.max_weight,
+    )
+
+
+def fuse_views(
+    depth: DepthViews,
+    resources: I64,
+    poses: F64,
+    settings: GridSettings,
+    progress: Progress,
+    *,
+    with_free_space: bool = False,
+) -> TsdfGrid:
+    """Fuse depth into a grid.
+
+    Args:
+        depth: Depth of frames.
+        resources: Rows (K,) of the resources.
+        poses: Poses (K, 7) of their cameras in the frame of the grid.
+        settings: Of the grid.
+        progress: Is told about every depth map.
+        with_free_space: The grid also has the space between cameras and surfaces.
+
+    Raises:
+        MapError: A file is missing, damaged, or of another size than the camera's images.
+        NotEnoughMemory: The grid exceeds the allowed memory.
+    """
+    grid, count = TsdfGrid(settings), len(resources)
+    matrices = se3.to_matrix(poses)
+    for done, row in enumerate(resources.tolist()):
+        progress.step(done, 2 * count, "making the blocks of the grid")
+        grid.allocate(*depth.view(row), matrices[done], with_free_space=with_free_space)
+    for done, row in enumerate(resources.tolist()):
+        progress.step(count + done, 2 * count, "fusing depth")
+        grid.integrate(*depth.view(row), matrices[done])
+    return grid
+
+
+def depth_type(vi_map: VIMap, missions: I64, given: int | None) -> int:
+    """Return the resource type of depth to fuse.
+
+    Raises:
+        UserError: There is none, or the given type is no depth.
+    """
+    if given is not None and given not in (*DEPTH_MAPS, *CLOUDS):
+        known = ", ".join(str(kind) for kind in (*DEPTH_MAPS, *CLOUDS))
+        raise UserError(f"--dense_depth_resource_input_type={given}: wants one of {known}")
+    wanted = _INPUT_TYPES if given is None else (given,)
+    for kind in wanted:
+        if resources_of(vi_map, (kind,), missions).any():
+            return kind
+    what = "depth" if given is None else resource_type(given).name
+    raise UserError(f"the missions have no {what}: stereo_dense_reconstruction makes depth maps")
+
+
+def mission_groups(vi_map: VIMap, missions: I64) -> tuple[list[list[int]], list[str]]:
+    """Group missions in a common frame: those with known base frames; each other one is alone."""
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]]
+    together = missions[known].tolist()
+    alone = [[row] for row in missions[~known].tolist()]
+    notes = []
+    if len(missions) > 1 and alone:
+        names = ", ".join(short_id(vi_map, group[0]) for group in alone)
+        notes.append(f"missions with unknown base frames have grids of their own: {names}")
+    return ([together] if together else []) + alone, notes
+
+
+def short_id(vi_map: VIMap, mission: int) -> str:
+    """Return the beginning of a mission's id."""
+    return to_hex(vi_map.missions.id[mission])[:8]
