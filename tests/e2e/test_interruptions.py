@@ -17,14 +17,17 @@ pytestmark = pytest.mark.slow
 
 PROMPT_S = 1.0
 NAMES = (
+    "create_esdf_from_depth_resource",
     "csv_export",  # several files
     "generate_summary_map_and_save_to_disk",
     "load",
     "optimize_visual_inertial",
     "plot_trajectory",  # imports a heavy library
+    "register_point_clouds",
     "save",
     "schema",
     "simulate",
+    "stereo_dense_reconstruction",
     "train_projection_matrix",
     "visualize",
 )

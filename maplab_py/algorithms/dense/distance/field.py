@@ -42,13 +42,16 @@ class DistanceField:
         block = voxel // BLOCK_SIDE
         row = _rows_in(self.coordinates, block)
         i, j, k = (voxel - block * BLOCK_SIDE).T
-        return np.where(row >= 0, self.distance_m[row, i, j, k], np.nan).astype(np.float64)
+        distance: F64 = self.distance_m[row, i, j, k].astype(np.float64)
+        distance[row < 0] = np.nan
+        return distance
 
 
 def voxel_centres(coordinates: I32, voxel_size_m: float) -> F64:
     """Return the centres (B, 8, 8, 8, 3) [m] of the voxels of blocks (B, 3)."""
     voxels = coordinates[:, None].astype(np.int64) * BLOCK_SIDE + _OFFSETS
-    return (voxels.reshape(-1, *(BLOCK_SIDE,) * 3, 3) + 0.5) * voxel_size_m
+    centres: F64 = voxels.reshape(-1, *(BLOCK_SIDE,) * 3, 3) + np.float64(0.5)
+    return centres * voxel_size_m
 
 
 def distance_field(
@@ -144,7 +147,8 @@ def _blocks_around(cameras: F64, radius_m: float, block_m: float) -> I32:
     require_memory(len(home) * steps.size * 8.0, "the spheres around the cameras")
     blocks = np.unique((home[:, None] + steps.reshape(-1, 3)).reshape(-1, 3), axis=0)
     distance = cKDTree(cameras).query((blocks + 0.5) * block_m)[0]
-    return blocks[distance <= radius_m + _HALF_DIAGONAL * block_m].astype(np.int32)
+    near = distance <= radius_m + _HALF_DIAGONAL * block_m
+    return np.asarray(blocks[near], dtype=np.int32)
 
 
 def _sorted_blocks(coordinates: I32) -> I32:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -52,10 +53,9 @@ def decode_grid(data: bytes, source: str) -> StoredGrid:
         MapError: It is no such file, or damaged; names the source.
     """
     content = GridContent(_FORMAT, data, source)
-    names = [field.name for field in dataclasses.fields(GridSettings)]
-    values = {
-        name: content.count(name) if name in _WHOLE_NUMBERS else content.value(name)
-        for name in names
+    values: dict[str, Any] = {
+        field.name: (content.count if field.name in _WHOLE_NUMBERS else content.value)(field.name)
+        for field in dataclasses.fields(GridSettings)
     }
     blocks, maps = content.count("blocks"), content.count("depth_maps")
     coordinates = content.array("<i4", (blocks, 3))

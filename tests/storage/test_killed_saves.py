@@ -1,0 +1,44 @@
+"""A save of new resources that is killed leaves the old or the new map, with all its files."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.support.data import REPOSITORY
+from tests.support.programs import module_of_tests
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")
+
+
+def outcomes(folder: Path, *words: str) -> list[str]:
+    done = subprocess.run(
+        [*module_of_tests("tests.storage.kills"), str(folder), *words],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    result: list[str] = json.loads(done.stdout)
+    return result
+
+
+def test_a_few_kills(tmp_path: Path) -> None:
+    found = outcomes(tmp_path, "60", "6")
+    assert len(found) == 7
+    assert found[0] == "new"
+    assert set(found) == {"old", "new"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [(), ("external",)])
+def test_fifty_kills_with_five_hundred_resources(tmp_path: Path, place: tuple[str, ...]) -> None:
+    found = outcomes(tmp_path, "500", "50", *place)
+    assert len(found) == 51
+    assert set(found) == {"old", "new"}
+    assert found.count("old") > 10
