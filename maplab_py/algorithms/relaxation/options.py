@@ -16,7 +16,7 @@ class RelaxationOptions:
     The drift rates say how far a mission's own trajectory is trusted between loop closures. They
     describe random walks: the variance grows with distance or time. The defaults are several times
     what a good visual-inertial odometry drifts: too small a rate makes true closures look false,
-    too large a one lets false ones bend the trajectory.
+    too large a one lets false ones deform the trajectory.
     """
 
     flag_prefix: ClassVar[str] = "relax_"

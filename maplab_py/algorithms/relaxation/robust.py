@@ -163,7 +163,7 @@ class _Graph:
         """Trust all closures, if nothing speaks against any; also return the iterations.
 
         Neither a closure against all others, nor the sum of all squared errors, which false closures
-        that agree with one another raise where they bend the trajectories.
+        that agree with one another raise where they deform the trajectories.
         """
         everything = np.ones(len(self.loops), dtype=np.bool_)
         problem = self.problem.without_loss()

@@ -209,7 +209,7 @@ def _iterate(
     has_converged = run.has_converged(new_cost)
     if not np.isfinite(new_cost) or gain < _SUFFICIENT_GAIN:
         if has_converged:
-            return "cost has settled"
+            return "cost has converged"
         run.reject()
         if run.region.is_exhausted:
             return "no step lowers the cost"
@@ -223,7 +223,7 @@ def _iterate(
         run.problem_changed()
         return ""
     if has_converged:
-        return "cost has settled"
+        return "cost has converged"
     if run.decreases.expected <= options.forecast_tolerance * new_cost:
         return "no more decrease is expected"
     if run.decreases.is_slow(new_cost, options.slow_ratio):

@@ -37,7 +37,7 @@ integration. Then the tolerances above are reduced to the second share, and the 
 class InertialTerm:
     """Preintegrated edges between vertices.
 
-    Each is integrated anew when its bias has moved far, and once more when it has settled.
+    Each is integrated again when its bias has moved far, and once more when it has converged.
     """
 
     name = "inertial"

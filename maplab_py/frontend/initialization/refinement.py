@@ -127,7 +127,7 @@ class Refinement:
         )
 
     def _prior(self, states: WindowStates) -> WindowPrior:
-        """Return what is known of the first frame: place and heading by choice, biases roughly."""
+        """Return the prior of the first frame: position and heading fixed, biases weakly held."""
         root = np.zeros((10, 15 * len(states)))
         root[:3, :3] = np.eye(3) / _GAUGE_SIGMA
         # a small turn dtheta on the right is R dtheta in M

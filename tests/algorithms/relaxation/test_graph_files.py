@@ -20,10 +20,10 @@ from maplab_py.algorithms.relaxation.graph_files import (
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.g2o import PoseGraph, read_g2o
-from maplab_py.interop.odometry_chain import chained_poses
+from maplab_py.interop.g2o import read_g2o
 from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
+from tests.support.pose_graphs import torus
 
 PLAIN = RelaxationOptions(robustness="none", num_iterations=100)
 # final values of GTSAM's Levenberg-Marquardt from the file's poses, twice its error; tolerances 0:
@@ -166,31 +166,8 @@ def test_losses_hold_false_edges_off(robustness):
     assert _rms(robust.T_G_V, clean) < 0.25  # the edges' own noise is 0.1 m and 0.2 rad
 
 
-def _torus(poses: int, turns: int, seed: int) -> PoseGraph:
-    """Wind a trajectory around a torus; each pose is measured from the one a turn before as well."""
-    rng = np.random.default_rng(seed)
-    row, per_turn = np.arange(poses), poses // turns
-    around, along = 2.0 * np.pi * row / per_turn, 2.0 * np.pi * row / poses
-    ring_m = 10.0 + 4.0 * np.cos(around)
-    p = np.column_stack([ring_m * np.cos(along), ring_m * np.sin(along), 4.0 * np.sin(around)])
-    zero = np.zeros(poses)
-    q = so3.multiply(
-        so3.exp(np.column_stack([zero, zero, along])),
-        so3.exp(np.column_stack([zero, -around, zero])),
-    )
-    T = se3.make(q, p)
-    first = np.concatenate([row[:-1], row[:-per_turn]])
-    second = np.concatenate([row[1:], row[per_turn:]])
-    sigma = np.repeat([0.05, 0.02], 3)
-    noise = rng.normal(size=(len(first), 6)) * sigma
-    measured = se3.retract(se3.relative(T[first], T[second]), noise)
-    chain = chained_poses(row, first[: poses - 1], second[: poses - 1], measured[: poses - 1])
-    information = np.tile(np.diag(sigma**-2), (len(first), 1, 1))
-    return PoseGraph(row, chain, first, second, measured, information, np.zeros(1, dtype=np.int64))
-
-
 def test_closures_that_nothing_contradicts_cost_no_more_than_the_plain_solution():
-    graph = _torus(1000, 20, seed=5)
+    graph = torus(1000, 20, seed=5)
     plain = optimize_graph(graph, PLAIN)
     robust = optimize_graph(graph, RelaxationOptions(num_iterations=100))
     assert robust.cost_after == pytest.approx(plain.cost_after, rel=1e-6)
@@ -199,7 +176,7 @@ def test_closures_that_nothing_contradicts_cost_no_more_than_the_plain_solution(
 
 
 def test_a_false_closure_of_a_torus_is_switched_off():
-    graph = _torus(1000, 20, seed=6)
+    graph = torus(1000, 20, seed=6)
     measured = graph.T_A_B.copy()
     measured[1500, 4:] += 3.0
     wrong = dataclasses.replace(graph, T_A_B=measured)
@@ -208,7 +185,7 @@ def test_a_false_closure_of_a_torus_is_switched_off():
 
 
 def test_poses_that_only_contradicting_closures_hold_do_not_end_the_relaxation():
-    graph = _torus(200, 10, seed=7)
+    graph = torus(200, 10, seed=7)
     lonely = 1000  # no odometry leads there
     ends = np.array([0, 50, 100])
     T_A_B = se3.identity(3)

@@ -233,7 +233,7 @@ def test_the_step_that_ends_a_run_is_solved_again_more_exactly() -> None:
     _, summary = optimize_states(
         iterative, dense.states, SolverOptions(function_tolerance=1e-3), SILENT
     )
-    assert summary.termination == "cost has settled"
+    assert summary.termination == "cost has converged"
     assert len(iterative.iterations) == summary.iterations + 1
     first = iterative.try_step(dense.states, iterative.linearize(dense.states, DAMPING), DAMPING)
     assert first.refine is not None
