@@ -12,6 +12,7 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_drawing
 from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.layers import (
+    beside,
     cameras,
     closures,
     clouds,
@@ -97,8 +98,10 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers += clouds.layers_of_clouds(drawing, subject.clouds)
     if subject.truth is not None:
         layers += references.ground_truth(drawing, subject.truth)
-    if subject.other is not None:
-        layers += references.compared(drawing, subject.other, side_by_side=subject.side_by_side)
+    if subject.other is not None and subject.side_by_side:
+        layers += beside.beside(drawing, subject.other, (subject.title, subject.other_name))
+    elif subject.other is not None:
+        layers += references.compared(drawing, subject.other)
     remembered, unreadable = closures.recorded_closures(drawing)
     layers += remembered
     added, problems = plugin_layers(drawing, {layer.name for layer in layers})
@@ -108,7 +111,8 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     notes = [note for layer in layers for note in layer.notes] + unreadable + problems
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
-        notes.insert(0, f"in grey: {subject.other_name}")
+        where = "beside it" if subject.side_by_side else "in grey"
+        notes.insert(0, f"{where}: {subject.other_name}")
     return Scene(
         subject.title, tuple(layers), mission_entries(drawing), extent, drawing.origin_G,
         notes=tuple(notes),
@@ -117,7 +121,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
 
 def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:
     """Return the extent of the map together with the path of another state of it."""
-    shift = references.reference_shift(drawing, side_by_side=side_by_side)
+    shift = beside.shift_beside(drawing, other) if side_by_side else -drawing.origin_G
     path = other.T_G_I[:, 4:] + shift
     path = path[np.isfinite(path).all(axis=1)]
     outline = np.concatenate([drawing.extent.outline, path])

@@ -111,8 +111,12 @@ def test_difference_to_a_snapshot_and_to_the_state_before(session: Session) -> N
     with pytest.raises(UserError, match=r"no snapshot 'after' .*before"):
         session.run("visualize_difference", with_snapshot="after")
     session.maps.add("stranger", walk_map(seed=9), select=False)
-    with pytest.raises(UserError, match="no vertex in common"):
+    with pytest.raises(UserError, match=r"no vertex in common; --side_by_side"):
         session.run("visualize_difference", with_map_key="stranger")
+    report = session.run("visualize_difference", with_map_key="stranger", side_by_side=True)
+    assert report.vertices == 0
+    assert np.isnan(report.mean_m)
+    assert _layers(report.view)["Names"] == (2, True)
 
 
 def test_loop_closures_only(session: Session) -> None:

@@ -7,11 +7,17 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F64
+from maplab_py.geometry import se3, so3
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.layers.cameras import mission_cameras
 from maplab_py.viewer.scene import Extent
 
 FIELD_OF_VIEW_RAD = float(np.radians(45.0))
 _ELEVATIONS_DEG = {"overview": 38.0, "top": 89.9, "side": 8.0}
 VIEWS = tuple(_ELEVATIONS_DEG)
+FREE, BEHIND, INSIDE = "free", "ride behind", "through the camera"
+RIDES = (FREE, BEHIND, INSIDE)
+"""How a page looks at a mission that is played."""
 _ASPECT = 1.35
 """Width by height that a view of everything is sure to fit."""
 _MARGIN = 1.08
@@ -92,6 +98,42 @@ def approach(camera: Any, p: F64, distance_m: float) -> None:
     back = back / length if length > 1e-9 else np.array([0.0, -0.8, 0.6])
     camera.position = p + distance_m * back
     camera.look_at = p
+
+
+def ride(camera: Any, drawing: Drawing, vertex: int, how: str) -> None:
+    """Move the camera of a page along with a vertex (row), behind it or where its camera is.
+
+    It looks where the first camera of the mission looks; without cameras where the path leads.
+    """
+    centre, forward = _line_of_sight(drawing, vertex)
+    length = 0.3 * drawing.unit_m
+    if how == BEHIND:
+        level = np.array([forward[0], forward[1], 0.0])
+        norm = float(np.linalg.norm(level))
+        back = level / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0])
+        camera.position = centre + length * (np.array([0.0, 0.0, 0.6]) - back)
+        camera.look_at = centre + 0.2 * length * back
+    else:
+        camera.position = centre
+        camera.look_at = centre + 0.1 * length * forward
+
+
+def _line_of_sight(drawing: Drawing, vertex: int) -> tuple[F64, F64]:
+    """Return from where (3,) and in which direction (3,) the camera of a vertex looks."""
+    vi_map = drawing.vi_map
+    p = drawing.p_vertices[vertex]
+    mission = int(vi_map.vertices.mission[vertex])
+    cameras = mission_cameras(vi_map, mission)
+    if cameras:
+        T_G_C = se3.compose(vi_map.T_G_I[vertex], cameras[0].T_I_C)
+        offset = T_G_C[4:] - vi_map.T_G_I[vertex, 4:]
+        return p + offset, so3.rotate(T_G_C[:4], np.array([0.0, 0.0, 1.0]))
+    start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
+    step = (
+        drawing.p_vertices[min(vertex + 1, stop - 1)] - drawing.p_vertices[max(vertex - 1, start)]
+    )
+    length = float(np.linalg.norm(step))
+    return p, step / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
 
 
 def aim_initially(camera: Any, extent: Extent, *, beside_panel: bool = True) -> None:

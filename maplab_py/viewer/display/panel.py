@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display import text
+from maplab_py.viewer.display.callbacks import by_user
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
@@ -24,8 +24,6 @@ MAX_SWITCHES = 24
 
 _ALL = "all missions"
 _HINT = "Click a vertex, a landmark or a loop closure."
-
-logger = logging.getLogger(__name__)
 
 
 class Actions(Protocol):
@@ -52,12 +50,6 @@ class Actions(Protocol):
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""
 
-    def set_step(self, step: int) -> None:
-        """Move the time slider."""
-
-    def set_playing(self, is_playing: bool) -> None:
-        """Play or pause."""
-
     def set_measuring(self, is_measuring: bool) -> None:
         """Measure between picks."""
 
@@ -66,25 +58,6 @@ class Actions(Protocol):
 
     def clear_pick(self) -> None:
         """Forget what was picked."""
-
-
-def by_user(
-    lock: threading.RLock, action: Callable[[Any], None], say: Callable[[str], None]
-) -> Callable[[Any], None]:
-    """Make a callback: only for what a page does, one at a time; errors are said and logged."""
-
-    def callback(event: Any) -> None:
-        if getattr(event, "client_id", None) is None:
-            return
-        try:
-            with lock:
-                action(event)
-        except Exception:
-            logger.exception("the viewer could not do what a page asked for")
-            with lock:
-                say("this could not be done: the log file has the reason")
-
-    return callback
 
 
 class Panel:
@@ -99,8 +72,6 @@ class Panel:
         self._mission_of_label: dict[str, str] = {}
         self._mission_widgets: list[Any] = []
         self._signature: tuple[Any, ...] = ()
-        self._steps = 0
-        self._is_sliding = False
         self.header = self._gui.add_html("", order=0)
         self._layers = self._gui.add_folder("Layers", order=1)
         self._missions = self._gui.add_folder("Missions", order=2)
@@ -111,8 +82,6 @@ class Panel:
         self._bind(self.colouring, lambda _: self._choose_colouring())
         self._bind(self.coloured_mission, lambda _: self._choose_colouring())
         self._add_selection()
-        self._playback = self._gui.add_folder("Playback", order=5, expand_by_default=False)
-        self._add_playback(200)
         self._add_view()
 
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
@@ -157,25 +126,8 @@ class Panel:
         self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
         self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
 
-    def _add_playback(self, steps: int) -> None:
-        with self._playback:
-            self.slider: Any = self._gui.add_slider("step", 0, steps, 1, steps)
-            self.playing: Any = self._gui.add_checkbox("play", False)
-            self.time = self._gui.add_html(text.hint("the whole map"))
-        self._steps = steps
-        self._bind(self.slider, self._slide)
-        self._bind(self.playing, lambda event: self._actions.set_playing(event.target.value))
-
-    def _slide(self, event: Any) -> None:
-        """Follow the slider, which the user may hold: it must not be pushed back meanwhile."""
-        self._is_sliding = True
-        try:
-            self._actions.set_step(int(event.target.value))
-        finally:
-            self._is_sliding = False
-
     def _add_view(self) -> None:
-        with self._gui.add_folder("View", order=6, expand_by_default=False):
+        with self._gui.add_folder("View", order=5, expand_by_default=False):
             self.views = self._gui.add_button_group("look", VIEWS)
             self.dark: Any = self._gui.add_checkbox("dark", False)
             self.ground = self._gui.add_checkbox("ground grid", True)
@@ -299,15 +251,6 @@ class Panel:
             self.image.image = image
         if self.image.visible != (image is not None):
             self.image.visible = image is not None
-
-    def show_step(self, step: int, steps: int, note: str) -> None:
-        """Move the slider, which may have another number of steps now, unless it moved us."""
-        if steps != self._steps:
-            self.slider.max = steps
-            self._steps = steps
-        if not self._is_sliding and int(self.slider.value) != step:
-            self.slider.value = step
-        self.time.content = text.hint(note)
 
 
 def _switch_colour(mission: MissionEntry, *, is_shown: bool) -> tuple[int, int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from maplab_py.array_types import F32, F64, U8
+from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.viewer.colours import linear_light
 from maplab_py.viewer.drawing import axis_lines
 from maplab_py.viewer.glb import coloured_glb, is_coloured
@@ -169,9 +170,10 @@ def add_part(
     if not len(part):
         return []
     if isinstance(part, Points):
+        order = _shuffled(len(part))
         return [
             scene.add_point_cloud(
-                name, part.p, part.colours, point_size=part.size_m * point_scale,
+                name, part.p[order], part.colours[order], point_size=part.size_m * point_scale,
                 point_shape="circle", point_shading="flat", precision="float32",
             ),
             *_add_labels(server, name, part.labels, part.p),
@@ -210,6 +212,12 @@ def _add_labels(
     ]
 
 
+@functools.lru_cache(maxsize=16)
+def _shuffled(count: int) -> I64:
+    """Return an order of points whose beginnings are spread over all of them; `page.js` uses that."""
+    return np.random.default_rng(0).permutation(count)
+
+
 def _line_colours(colours: U8) -> U8:
     """Return colours (N, 2, 3) of both ends of lines (N,).
 
@@ -229,12 +237,13 @@ def _moved_in_place(node: _Node, part: Part) -> bool:
         and isinstance(part, Points)
         and (before.size_m, before.labels) == (part.size_m, part.labels)
     ):
+        order = _shuffled(len(part))
         if not np.array_equal(before.p, part.p):
-            node.handles[0].points = part.p
+            node.handles[0].points = part.p[order]
             for label, p in zip(node.handles[1:], part.p, strict=False):
                 label.position = p.astype(np.float64)
         if not np.array_equal(before.colours, part.colours):
-            node.handles[0].colors = part.colours
+            node.handles[0].colors = part.colours[order]
     elif (
         isinstance(before, Segments)
         and isinstance(part, Segments)

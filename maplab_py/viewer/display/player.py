@@ -17,7 +17,7 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.display.parts import add_part
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.layers.cameras import frustum_points, mission_cameras
-from maplab_py.viewer.layers.clouds import Cloud, cloud_colours
+from maplab_py.viewer.layers.clouds import Cloud, cloud_colours, colour_ranges
 from maplab_py.viewer.layers.landmarks import landmark_colours, point_size
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Timeline, make_timeline
@@ -70,10 +70,19 @@ class Player:
             if self._fades:
                 self._show_recent(step)
 
-    def head(self) -> int:
-        """Return the vertex (row) that the first mission that is played has reached, or -1."""
-        rows = self.timeline.head[self.step, self._plays]
-        return int(rows[0]) if len(rows) else -1
+    def missions(self) -> I64:
+        """Return the rows of the missions that are played and have vertices."""
+        counts = np.diff(self._drawing.vi_map.vertex_start)
+        return np.flatnonzero(self._plays & (counts > 0))
+
+    def head(self, mission: int = -1) -> int:
+        """Return the vertex (row) that a mission, -1 = the first, has reached; -1 = none."""
+        if mission < 0:
+            played = self.missions()
+            if not len(played):
+                return -1
+            mission = int(played[0])
+        return int(self.timeline.head[self.step, mission])
 
     def note(self) -> str:
         """Return the words beside the slider."""
@@ -127,6 +136,7 @@ class Player:
     def _add_clouds(self, clouds: tuple[Cloud, ...]) -> None:
         total = max(sum(len(cloud.p_G) for cloud in clouds), 1)
         limit = self._drawing.options.max_points
+        ranges = colour_ranges(clouds)
         for number, cloud in enumerate(clouds):
             if cloud.faces is not None:
                 continue
@@ -134,7 +144,7 @@ class Player:
             p = cloud.p_G - self._drawing.origin_G
             rows = spread_rows(p, max(1, limit * len(p) // total))
             size = 0.9 * self._drawing.unit_m / np.sqrt(max(min(total, limit), 1_000))
-            part = make_points(p[rows], cloud_colours(cloud)[rows], rows, size)
+            part = make_points(p[rows], cloud_colours(cloud, ranges)[rows], rows, size)
             for handle in add_part(self._server, f"/play/{step}/cloud_{number}", part):
                 handle.visible = False
                 self._chunks.setdefault(step, []).append(handle)

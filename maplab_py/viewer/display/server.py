@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import gzip
 import logging
 import re
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import resources
 from typing import Any
 
 import rich
@@ -68,8 +70,48 @@ def start_server(port: int) -> viser.ViserServer:
 
 
 def _restricted_serve() -> Any:
-    """Return the function that opens the socket, restricted to connections of the viewer's pages."""
-    return functools.partial(websockets.asyncio.server.serve, origins=_LOCAL_ORIGINS)
+    """Return the function that opens the socket, restricted to connections of the viewer's pages.
+
+    The page that it serves carries the script `page.js`.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def restricted(*arguments: Any, process_request: Any = None, **settings: Any) -> Any:
+        if process_request is not None:
+            process_request = with_page_script(process_request)
+        return serve(
+            *arguments, origins=_LOCAL_ORIGINS, process_request=process_request, **settings
+        )
+
+    return restricted
+
+
+@functools.cache
+def page_script() -> str:
+    """Return the script that the page runs beside viser's."""
+    code = resources.files("maplab_py.viewer.display").joinpath("page.js").read_text("utf-8")
+    return f"<script>{code}</script>"
+
+
+def with_page_script(process_request: Any) -> Any:
+    """Return a server of files that adds our script to the page; all else is passed on."""
+    pages: dict[bytes, bytes] = {}
+
+    def process(connection: Any, request: Any) -> Any:
+        response = process_request(connection, request)
+        if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+            return response
+        if response.body not in pages:
+            is_packed = response.headers.get("Content-Encoding") == "gzip"
+            page = gzip.decompress(response.body) if is_packed else response.body
+            page = page.replace(b"<head>", b"<head>" + page_script().encode(), 1)
+            pages[response.body] = gzip.compress(page) if is_packed else page
+        response.body = pages[response.body]
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    return process
 
 
 def _no_sharing(*_: object, **__: object) -> None:

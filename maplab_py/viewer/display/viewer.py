@@ -17,11 +17,13 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
+from maplab_py.viewer.display.callbacks import by_user
 from maplab_py.viewer.display.camera import aim, aim_initially, approach
 from maplab_py.viewer.display.export import export_html
-from maplab_py.viewer.display.panel import Panel, by_user
+from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes
 from maplab_py.viewer.display.picture import save_picture, take_picture
+from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
 from maplab_py.viewer.display.server import LOOPBACK, start_server
@@ -68,8 +70,7 @@ class Viewer:
         self._selection = Selection(self._server, self._panel)
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
-        self._player: Player | None = None
-        self._playback = PlaybackOptions()
+        self._playback = Playback(self._server, self, self._lock, self._panel.say)
         self._image_of: ImageOf = no_image
         self._is_dark = is_dark
         self._drawing: Drawing | None = None
@@ -86,8 +87,6 @@ class Viewer:
         self._server.scene.on_click()(by_user(self._lock, self._clicked, self._panel.say))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
-        self._ticker = threading.Thread(target=self._tick, name="maplab playback", daemon=True)
-        self._ticker.start()
         atexit.register(self.stop)
 
     # -- what the console does --------------------------------------------------------------------
@@ -143,7 +142,7 @@ class Viewer:
         drawing = make_checked_drawing(subject)
         scene = scene_of(drawing, subject)
         with self._lock:
-            self._playback = playback or PlaybackOptions()
+            self._playback.configure(playback or PlaybackOptions(), image_of)
             self._image_of = image_of
             self._choices = {}
             moves_view = self.scene is None or is_elsewhere(self.scene, scene)
@@ -175,7 +174,7 @@ class Viewer:
         if began < self._next_live or self._pending is not None or not self.pages:
             return False
         with self._lock:
-            if self._drawing is None or self.scene is None or self._player is not None:
+            if self._drawing is None or self.scene is None or self.player is not None:
                 return False
             scene = moved_scene(self.scene, self._drawing, make_map())
             self._nodes.show(scene, self.visible_layers, self.visible_missions)
@@ -240,6 +239,7 @@ class Viewer:
             if self._is_stopped:
                 return
             self._is_stopped = True
+        self._playback.end()
         self._wake.set()
         self._idle.set()
         self._server.stop()
@@ -281,16 +281,11 @@ class Viewer:
         """What is picked."""
         return self._selection
 
-    @property
-    def player(self) -> Player | None:
-        """The mission that the time slider plays, if any."""
-        return self._player
-
     def set_layer(self, name: str, is_visible: bool) -> None:
         """Show or hide a layer."""
         with self._lock:
             self._choices[name] = is_visible
-            self._redraw()
+            self.redraw()
 
     def set_missions(self, visible: set[str]) -> None:
         """Show these missions and no others."""
@@ -298,8 +293,8 @@ class Viewer:
             if self.scene is None:
                 return
             self._hidden = {m.id for m in self.scene.missions} - visible
-            self._stop_playback()
-            self._redraw()
+            self._playback.stop()
+            self.redraw()
 
     def set_colouring(self, colouring: str, only_mission: str = "") -> None:
         """Colour landmarks by another rule, all or those of a mission (id) alone."""
@@ -343,62 +338,37 @@ class Viewer:
             with client.atomic():
                 aim(client.camera, self.scene.extent, view)
 
-    # -- the time slider --------------------------------------------------------------------------
+    # -- the time line ----------------------------------------------------------------------------
+
+    @property
+    def player(self) -> Player | None:
+        """What is played; None while the whole map is shown."""
+        return self._playback.player
 
     def set_step(self, step: int) -> None:
         """Show the map as it was after a step; the last step is the whole map."""
         with self._lock:
-            if self._drawing is None or self.scene is None:
-                return
-            steps = self._playback.steps
-            if step >= steps:
-                self._stop_playback()
-                self._redraw()
-                return
-            if self._player is None:
-                self._nodes.show(
-                    without_played(self.scene), self.visible_layers, self.visible_missions
-                )
-                clouds = self.subject.clouds if self.subject is not None else ()
-                self._player = Player(
-                    self._server, self._drawing, self.visible_missions, self._playback, clouds
-                )
-            self._player.go(max(step, 0))
-            self._panel.show_step(max(step, 0), steps, self._player.note())
-            vertex = self._player.head()
-            self._panel.show_image(self._image_of(vertex) if vertex >= 0 else None)
+            self._playback.set_step(step)
 
     def set_playing(self, is_playing: bool) -> None:
         """Play or pause; playing from the end starts again at the beginning."""
         with self._lock:
-            if is_playing and self._player is None:
-                self.set_step(0)
-            if self._panel.playing.value != is_playing:
-                self._panel.playing.value = is_playing
+            self._playback.set_playing(is_playing)
 
-    def _stop_playback(self) -> None:
-        if self._player is not None:
-            self._player.remove()
-            self._player = None
-            self._panel.show_image(None)
-        if self._panel.playing.value:
-            self._panel.playing.value = False
-        steps = self._playback.steps
-        self._panel.show_step(steps, steps, "the whole map")
+    @property
+    def playback(self) -> Playback:
+        """The time line, and what it plays."""
+        return self._playback
 
-    def _tick(self) -> None:
-        """Move the slider while it plays."""
-        while not self._is_stopped:
-            time.sleep(1.0 / self._playback.vertex_frequency)
-            try:
-                with self._lock:
-                    if not self._is_stopped and self._panel.playing.value and self._player:
-                        self.set_step(self._player.step + 1)
-            except Exception:
-                logger.exception("the viewer cannot play on")
-                with self._lock:
-                    self._panel.playing.value = False
-                    self._panel.say("playing stopped: the log file has the reason")
+    def set_ride(self, ride: str) -> None:
+        """Let the view ride along with the plotted mission, one of `camera.RIDES`."""
+        with self._lock:
+            self._playback.set_ride(ride)
+
+    def open_time_line(self) -> None:
+        """Open the window of the time line."""
+        with self._lock:
+            self._playback.time_line.open()
 
     # -- picking ----------------------------------------------------------------------------------
 
@@ -480,13 +450,14 @@ class Viewer:
         self.subject, self.scene, self._drawing = subject, scene, drawing
         if is_new_map:
             self._selection.clear()
-        self._stop_playback()
+        self._playback.stop()
         if is_new_place:
             self._show_ground(scene)
         self._panel.show_colouring(subject.options, scene.missions)
-        self._redraw()
+        self.redraw()
 
-    def _redraw(self) -> None:
+    def redraw(self) -> None:
+        """Draw what is visible; only differences are sent."""
         if self.scene is None:
             return
         layers, missions = self.visible_layers, self.visible_missions
@@ -494,4 +465,4 @@ class Viewer:
         self._panel.show(self.scene, layers, missions)
 
     def _drawn(self, scene: Scene) -> Scene:
-        return scene if self._player is None else without_played(scene)
+        return scene if self.player is None else without_played(scene)

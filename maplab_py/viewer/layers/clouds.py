@@ -29,15 +29,20 @@ class Cloud:
     legend: tuple[LegendEntry, ...] = ()  # what the colours mean
 
 
+ColourRanges = dict[str, tuple[float, float]]
+"""First and last value of the ramp, by what the ramp is of: height or intensity."""
+
+
 def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) -> Layer:
     """Return one layer of clouds of the same title, with no more points than the options allow."""
     total = sum(len(cloud.p_G) for cloud in clouds)
     parts: dict[str, Part] = {}
     thinned = 0
+    ranges = colour_ranges(clouds)
     for mission_id in dict.fromkeys(cloud.mission_id for cloud in clouds):
         mission_clouds = [cloud for cloud in clouds if cloud.mission_id == mission_id]
         p = np.concatenate([cloud.p_G for cloud in mission_clouds]) - drawing.origin_G
-        colour = np.concatenate([cloud_colours(cloud) for cloud in mission_clouds])
+        colour = np.concatenate([cloud_colours(cloud, ranges) for cloud in mission_clouds])
         limit = max(1, drawing.options.max_points * len(p) // max(total, 1))
         finite = np.flatnonzero(np.isfinite(p).all(axis=1))
         rows = finite[spread_rows(p[finite], limit)]
@@ -49,7 +54,8 @@ def cloud_layer(drawing: Drawing, clouds: tuple[Cloud, ...], number: int = 0) ->
     drawn = sum(len(part) for part in parts.values())
     losses = (total - drawn - thinned, NO_POSITION), (thinned, MAX_POINTS)
     notes = omission_notes(title, drawn, *losses)
-    legend = clouds[0].legend if clouds else ()
+    stored = dict.fromkeys(entry for cloud in clouds for entry in cloud.legend)
+    legend = (*stored, *range_legend(title, ranges))
     return Layer(f"cloud_{number}", title, parts, total, legend=legend, notes=notes)
 
 
@@ -61,16 +67,51 @@ def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
     if colour is None:
         colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
     parts: dict[str, Part] = {cloud.mission_id: Mesh(p, faces, colour)}
-    return Layer(f"mesh_{number}", cloud.title, parts, len(faces), legend=cloud.legend)
+    swatch = () if colour.ndim == 2 else (LegendEntry(cloud.title, (colours.to_hex(colour),)),)
+    return Layer(f"mesh_{number}", cloud.title, parts, len(faces), legend=cloud.legend or swatch)
 
 
-def cloud_colours(cloud: Cloud) -> U8:
-    """Return the colours (N, 3) stored with the cloud; else by intensity, else by height."""
+def cloud_colours(cloud: Cloud, ranges: ColourRanges | None = None) -> U8:
+    """Return the colours (N, 3) stored with the cloud; else by intensity, else by height.
+
+    Args:
+        cloud: The cloud.
+        ranges: Values of the first and the last colour; the cloud's own when not given.
+    """
     if cloud.colours is not None:
         return cloud.colours
-    values = cloud.p_G[:, 2] if cloud.intensity is None else cloud.intensity
-    part, _, _ = colours.normalised(np.asarray(values, dtype=np.float64))
-    return colours.ramp(part, colours.SEQUENTIAL)
+    what, values = _coloured_by(cloud)
+    low, high = (ranges or colour_ranges((cloud,)))[what]
+    return colours.ramp((values - low) / max(high - low, 1e-12), colours.SEQUENTIAL)
+
+
+def colour_ranges(clouds: tuple[Cloud, ...]) -> ColourRanges:
+    """Return the usual range of what colours those clouds that have no colours."""
+    values: dict[str, list[F64]] = {}
+    for cloud in clouds:
+        if cloud.colours is None:
+            what, number = _coloured_by(cloud)
+            values.setdefault(what, []).append(number)
+    return {what: colours.normalised(np.concatenate(all_))[1:] for what, all_ in values.items()}
+
+
+def range_legend(title: str, ranges: ColourRanges) -> tuple[LegendEntry, ...]:
+    """Return the ramps of clouds that are coloured by a value."""
+    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
+    units = {"height": " m", "intensity": ""}
+    return tuple(
+        LegendEntry(
+            f"{title}: {what}", codes, f"{low:.4g}{units[what]}", f"{high:.4g}{units[what]}"
+        )
+        for what, (low, high) in ranges.items()
+    )
+
+
+def _coloured_by(cloud: Cloud) -> tuple[str, F64]:
+    """Return what colours a cloud without colours, and its values (N,)."""
+    if cloud.intensity is None:
+        return "height", np.asarray(cloud.p_G[:, 2], dtype=np.float64)
+    return "intensity", np.asarray(cloud.intensity, dtype=np.float64)
 
 
 def layers_of_clouds(drawing: Drawing, clouds: tuple[Cloud, ...]) -> list[Layer]:

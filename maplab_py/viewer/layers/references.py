@@ -15,16 +15,9 @@ from maplab_py.geometry.alignment import align_yaw_position
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
-from maplab_py.viewer.layers.landmarks import point_size
-from maplab_py.viewer.omissions import (
-    BAD_QUALITY,
-    MAX_POINTS,
-    NO_POSITION,
-    omission_notes,
-)
+from maplab_py.viewer.layers.beside import reference_landmarks
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
-from maplab_py.viewer.subsampling import spread_rows
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import VIMap
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,50 +30,24 @@ class MarkedSegments:
     title: str = "information"
 
 
-def compared(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> list[Layer]:
+def compared(drawing: Drawing, other: VIMap) -> list[Layer]:
     """Another state of the map in grey, and how far the vertices have moved since.
 
     Args:
         drawing: The map as it is shown.
         other: The map to compare with; vertices correspond by id.
-        side_by_side: Draw it beside the map instead of over it; then nothing has moved visibly
-            and there are no displacement lines.
     """
-    shift = reference_shift(drawing, side_by_side=side_by_side)
+    shift = -drawing.origin_G
     p = other.T_G_I[:, 4:] + shift
     mission = other.vertices.mission
     start = np.flatnonzero(mission[1:] == mission[:-1])
     path = make_segments(p[start], p[start + 1], colours.REFERENCE, start, 2.0)
     lines: dict[str, Part] = {WHOLE_MAP: path}
-    layers = [Layer("reference_trajectories", "Reference paths", lines, len(other.missions))]
-    p_L = other.p_G + shift
-    layers.append(_reference_landmarks(drawing, other, p_L, is_visible=side_by_side))
-    if not side_by_side:
-        layers.append(_displacements(drawing, other))
-    return layers
-
-
-def _reference_landmarks(drawing: Drawing, other: VIMap, p_L: F64, *, is_visible: bool) -> Layer:
-    """Return the landmarks (L, 3) of the other state that are not of bad quality."""
-    is_good = other.landmarks.quality != LandmarkQuality.BAD
-    good = np.flatnonzero(np.isfinite(p_L).all(axis=1) & is_good)
-    rows = good[spread_rows(p_L[good], drawing.options.max_points)]
-    cloud = make_points(p_L[rows], colours.REFERENCE, rows, point_size(drawing))
-    title, points = "Reference landmarks", {WHOLE_MAP: cloud}
-    bad = int(np.count_nonzero(~is_good))
-    losses = (
-        (bad, BAD_QUALITY),
-        (len(p_L) - bad - len(good), NO_POSITION),
-        (len(good) - len(rows), MAX_POINTS),
-    )
-    notes = omission_notes(title, len(rows), *losses)
-    return Layer("reference_landmarks", title, points, len(p_L), is_visible=is_visible, notes=notes)
-
-
-def reference_shift(drawing: Drawing, *, side_by_side: bool) -> F64:
-    """Return what takes positions of the other state (3,) from G to the scene."""
-    aside = 2.2 * drawing.extent.radius_m if side_by_side else 0.0
-    return np.asarray(np.array([aside, 0.0, 0.0]) - drawing.origin_G)
+    return [
+        Layer("reference_trajectories", "Reference paths", lines, len(other.missions)),
+        reference_landmarks(drawing, other, shift, colours.REFERENCE, is_visible=False),
+        _displacements(drawing, other),
+    ]
 
 
 def displacements(vi_map: VIMap, other: VIMap) -> tuple[I64, I64, F64]:
@@ -104,6 +71,39 @@ def _displacements(drawing: Drawing, other: VIMap) -> Layer:
     return Layer("displacements", "Displacement", parts, len(here), legend=(legend,))
 
 
+def _aligned_truth(drawing: Drawing, truth: Trajectory) -> tuple[I64, F64, F64]:
+    """Return the vertices (N,) with ground truth, where they are in truth (N, 3), and T_scene_R.
+
+    Raises:
+        UserError: Too few vertices have ground truth to lay it on the map.
+    """
+    stamps = drawing.vi_map.vertices.timestamp_ns
+    T_R_B, has_truth = match(truth, stamps, TrajectoryEvaluationOptions())
+    rows = np.flatnonzero(has_truth)
+    if len(rows) < 3:
+        raise UserError(
+            f"{truth.source}: only {len(rows)} vertices have ground truth, 3 are needed "
+            "(do the clocks agree?)"
+        )
+    try:
+        T_scene_R = align_yaw_position(drawing.p_vertices[rows], T_R_B[rows, 4:])
+    except EstimationError as error:
+        raise UserError(f"{truth.source}: {error}") from None
+    return rows, se3.transform(T_scene_R, T_R_B[rows, 4:]), T_scene_R
+
+
+def errors_against(drawing: Drawing, truth: Trajectory) -> F64:
+    """Return how far each vertex (V,) is from the true path laid on the map [m]; NaN without truth.
+
+    Raises:
+        UserError: Too few vertices have ground truth to lay it on the map.
+    """
+    rows, p_true, _ = _aligned_truth(drawing, truth)
+    error_m = np.full(len(drawing.p_vertices), np.nan)
+    error_m[rows] = np.linalg.norm(drawing.p_vertices[rows] - p_true, axis=1)
+    return error_m
+
+
 def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
     """The true path laid on the map, and the error of each vertex.
 
@@ -111,19 +111,8 @@ def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
         UserError: Too few vertices have ground truth to lay it on the map.
     """
     vi_map = drawing.vi_map
-    T_R_B, has_truth = match(truth, vi_map.vertices.timestamp_ns, TrajectoryEvaluationOptions())
-    rows = np.flatnonzero(has_truth)
-    if len(rows) < 3:
-        raise UserError(
-            f"{truth.source}: only {len(rows)} vertices have ground truth, 3 are needed "
-            "(do the clocks agree?)"
-        )
+    rows, p_true, T_scene_R = _aligned_truth(drawing, truth)
     p_vertex = drawing.p_vertices[rows]
-    try:
-        T_scene_R = align_yaw_position(p_vertex, T_R_B[rows, 4:])
-    except EstimationError as error:
-        raise UserError(f"{truth.source}: {error}") from None
-    p_true = se3.transform(T_scene_R, T_R_B[rows, 4:])
     span = vi_map.vertices.timestamp_ns[rows]
     inside = (truth.times_ns >= span.min()) & (truth.times_ns <= span.max())
     path = se3.transform(T_scene_R, truth.T_R_B[inside, 4:])

@@ -151,14 +151,15 @@ def _show(
 
 def _write(clouds: tuple[Cloud, ...], path: Path) -> None:
     from maplab_py.interop.ply import PlyCloud, write_ply
-    from maplab_py.viewer.layers.clouds import cloud_colours
+    from maplab_py.viewer.layers.clouds import cloud_colours, colour_ranges
 
     has_intensity = all(cloud.intensity is not None for cloud in clouds)
+    ranges = colour_ranges(clouds)
     intensity = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
     write_ply(
         PlyCloud(
             np.concatenate([cloud.p_G for cloud in clouds]),
-            np.concatenate([cloud_colours(cloud) for cloud in clouds]),
+            np.concatenate([cloud_colours(cloud, ranges) for cloud in clouds]),
             np.concatenate(intensity) if has_intensity else None,
         ),
         path,

@@ -171,6 +171,7 @@ def show(
     check_cancelled()
     viewer.show(subject, playback=playback, image_of=images)
     if plays:
+        viewer.open_time_line()
         viewer.set_playing(True)
     scene = viewer.scene
     if scene is None:

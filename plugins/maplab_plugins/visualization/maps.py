@@ -180,29 +180,34 @@ def visualize_difference(
     options: VisualizationOptions = _OPTIONS,
     viewer: ViewerOptions = _VIEWER,
 ) -> DifferenceReport:
-    """Show the selected map over another state of it, with lines where vertices have moved.
+    """Show the selected map over or beside another state of it or another map.
+
+    Over each other lines show how far vertices have moved. Side by side each mission has one colour
+    on both sides, one camera looks at both, and the maps need not have anything in common.
 
     Args:
         with_map_key: Another map in memory; vertices correspond by id.
         with_snapshot: A snapshot of the selected map. With neither the state before the last
             command that changed it.
-        side_by_side: Draw the other state beside the map instead of below it.
+        side_by_side: Draw the other state or map beside the map instead of over it.
     """
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.references import displacements
 
     other, name = _other_state(context, with_map_key, with_snapshot)
     here, _, distance = displacements(context.vi_map, other)
-    if not len(here):
-        raise UserError(f"{name} and map '{context.map_key}' have no vertex in common")
+    if not len(here) and not side_by_side:
+        raise UserError(
+            f"{name} and map '{context.map_key}' have no vertex in common; "
+            "--side_by_side shows both all the same"
+        )
     subject = Subject(
         context.vi_map, context.map_key, options, other, name, side_by_side=side_by_side
     )
     view = show(context, subject, viewer)
     missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)
-    return DifferenceReport(
-        name, len(here), missing, float(distance.mean()), float(distance.max()), view
-    )
+    mean_m, largest_m = (distance.mean(), distance.max()) if len(here) else (np.nan, np.nan)
+    return DifferenceReport(name, len(here), missing, float(mean_m), float(largest_m), view)
 
 
 def _other_state(context: CommandContext, map_key: str, snapshot: str) -> tuple[VIMap, str]:

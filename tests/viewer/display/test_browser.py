@@ -76,7 +76,8 @@ def page(shared_page: Page, viewer: Viewer) -> Page:
 
 def drag_slider(page: Page, start: float, end: float) -> None:
     """Pull the handle with the mouse: its arrow keys would turn the view as well."""
-    thumb = page.page.get_by_role("slider").first
+    row = page.page.locator("xpath=//*[text()='step']/ancestor::*[.//*[@role='slider']][1]")
+    thumb = row.get_by_role("slider").first
     thumb.scroll_into_view_if_needed()
     box = thumb.locator("xpath=..").bounding_box()
     y = box["y"] + 0.5 * box["height"]
@@ -186,7 +187,9 @@ def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> Non
         return is_drawn_at(page, viewer, middles, colours.MISSIONS[0])
 
     assert page.wait_until(lambda: all(pieces()))
-    page.click(page.page.get_by_text("Playback"))
+    # the time line shall not hide what is looked at
+    viewer.playback.time_line.panel.float(x=-15, y=-15, width=320)
+    viewer.open_time_line()
     page.settle()
     drag_slider(page, 1.0, 0.0)
     assert page.wait_until(lambda: viewer.player is not None and viewer.player.step == 0)
@@ -197,6 +200,35 @@ def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> Non
     drag_slider(page, 0.6, 1.0)
     assert page.wait_until(lambda: viewer.player is None)
     assert page.wait_until(lambda: all(pieces()))
+
+
+def test_a_slow_page_draws_less_while_it_is_turned(page: Page, viewer: Viewer) -> None:
+    """Tests draw seldom, so that this page is a slow one."""
+    sphere = np.random.default_rng(0).normal(size=(60_000, 3))
+    viewer.show(dataclasses.replace(SUBJECT, clouds=(Cloud("dense", sphere),)))
+
+    def drawn() -> int:
+        return int(page.page.evaluate("window.__viserTestpoints.rendererInfo.render.points"))
+
+    assert page.wait_until(lambda: drawn() > 60_000)
+    resting = page.still_picture()
+    page.page.mouse.move(300.0, 400.0)
+    page.page.mouse.down()
+    fewest = drawn()
+    for step in range(60):
+        page.page.mouse.move(300.0 + 3.0 * (step % 20), 400.0)
+        fewest = min(fewest, drawn())
+        if fewest < 30_000:
+            break
+    page.page.mouse.move(300.0, 400.0)
+    page.page.mouse.up()
+    assert fewest < 30_000
+    assert page.wait_until(lambda: drawn() > 60_000)
+    again = page.still_picture()
+    assert again.shape == resting.shape
+    assert np.count_nonzero((again < 250).all(axis=2)) > 0.5 * np.count_nonzero(
+        (resting < 250).all(axis=2)
+    )
 
 
 def test_the_theme_and_the_view_can_be_changed(page: Page, viewer: Viewer) -> None:

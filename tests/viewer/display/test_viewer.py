@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import socket
 import threading
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +18,17 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from maplab_py.errors import UserError
-from maplab_py.viewer.building import Subject
-from maplab_py.viewer.display.panel import by_user
+from maplab_py.geometry import so3
+from maplab_py.sensors import SensorSet
+from maplab_py.viewer.building import Subject, make_checked_drawing
+from maplab_py.viewer.display.callbacks import by_user
+from maplab_py.viewer.display.camera import BEHIND, INSIDE, ride
+from maplab_py.viewer.display.parts import add_part
+from maplab_py.viewer.display.server import page_script
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
+from maplab_py.viewer.scene import Points
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
@@ -282,7 +291,7 @@ def test_clouds_and_images_come_with_their_vertices(two_missions: VIMap) -> None
         head = player.head()
         assert asked[-1] == head == player.timeline.head[3, 0]
         page = page_state(viewer)
-        assert page.control(type="GuiImageMessage")["visible"] == (head == 3)
+        assert ("data:image/jpeg" in page.html) == (head == 3)
         assert "cloud_0" not in page.layers
         steps = [int(player.timeline.vertex_step[v]) for v in (0, 6, 11)]
         assert len(set(steps)) == 3
@@ -291,9 +300,79 @@ def test_clouds_and_images_come_with_their_vertices(two_missions: VIMap) -> None
         viewer.set_step(11)
         page = page_state(viewer)
         assert "cloud_0" in page.layers
-        assert not page.control(type="GuiImageMessage")["visible"]
+        assert "data:image" not in page.html
     finally:
         viewer.stop()
+
+
+def test_the_time_line_plots_the_chosen_mission(two_missions: VIMap) -> None:
+    viewer = Viewer(0)
+    try:
+        viewer.show(Subject(two_missions, "test"), playback=PlaybackOptions(steps=10))
+        viewer.set_step(4)
+        first = page_state(viewer)
+        chooser = first.control(label="plots of")
+        assert len(chooser["options"]) == 2
+        assert chooser["value"] == chooser["options"][0]
+        assert "M400.0 0V100" in first.html
+        assert "landmarks</span>" in first.html
+        viewer.playback.choose_mission(chooser["options"][1])
+        second = page_state(viewer)
+        assert "M400.0 0V100" in second.html
+        assert second.html != first.html
+        viewer.set_step(10)
+        assert "0V100" not in page_state(viewer).html
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize("has_camera", [True, False])
+def test_the_view_rides_along(two_missions: VIMap, has_camera: bool) -> None:
+    vi_map = two_missions if has_camera else two_missions.replace(sensors=SensorSet())
+    drawing = make_checked_drawing(Subject(vi_map))
+    camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+    ride(camera, drawing, 5, INSIDE)
+    assert np.linalg.norm(camera.position - drawing.p_vertices[5]) < 0.2
+    forward = camera.look_at - camera.position
+    forward = forward / np.linalg.norm(forward)
+    path = drawing.p_vertices[6] - drawing.p_vertices[4]
+    if has_camera:  # it looks along z of the camera, which is that of the IMU here
+        expected = so3.rotate(vi_map.T_G_I[5, :4], np.array([0.0, 0.0, 1.0]))
+    else:
+        expected = path / np.linalg.norm(path)
+    np.testing.assert_allclose(forward, expected, atol=1e-6)
+    ride(camera, drawing, 5, BEHIND)
+    assert camera.position[2] > drawing.p_vertices[5, 2]
+    seen = camera.look_at - camera.position
+    assert seen[:2] @ expected[:2] > 0.0
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_page_carries_our_script(viewer: Viewer, encoding: str) -> None:
+    request = urllib.request.Request(viewer.url, headers={"Accept-Encoding": encoding})
+    with urllib.request.urlopen(request, timeout=20.0) as answer:
+        body = answer.read()
+        assert answer.headers["Content-Length"] == str(len(body))
+    page = gzip.decompress(body) if encoding == "gzip" else body
+    assert page_script().encode() in page
+    assert page.index(b"<head>") < page.index(page_script().encode()) < page.index(b"</head>")
+
+
+def test_points_are_sent_in_an_order_whose_beginning_is_spread() -> None:
+    sent: list[tuple[np.ndarray, np.ndarray]] = []
+    scene = SimpleNamespace(
+        add_point_cloud=lambda _, p, colours, **__: sent.append((p, colours)),
+    )
+    rows = np.arange(1000)
+    p = np.stack([rows, rows, rows], axis=1).astype(np.float32)
+    colour = np.stack([rows % 256, rows // 256, 0 * rows], axis=1).astype(np.uint8)
+    server: Any = SimpleNamespace(scene=scene)
+    add_part(server, "/cloud", Points(p, colour, rows, 0.1))
+    ((points, colours),) = sent
+    order = points[:, 0].astype(int)
+    assert sorted(order) == list(rows)
+    np.testing.assert_array_equal(colours, colour[order])
+    assert np.bincount(order[:200] // 100, minlength=10).min() >= 8
 
 
 def test_live_updates_wait_for_a_page(viewer: Viewer, two_missions: VIMap) -> None:
