@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from maplab_py.estimation.terms.extension import ResidualRows, residual
     from maplab_py.viewer.extension import LayerLines, LayerPoints, viewer_layer
     from maplab_py.vimap import VIMap
+    from maplab_py.vision.features.extension import ExtractedFeatures, feature_extractor
 
 _IMPORTED_ON_USE = {
     "VIMap": "maplab_py.vimap",
@@ -37,10 +38,12 @@ _IMPORTED_ON_USE = {
     "LayerLines": "maplab_py.viewer.extension",
     "LayerPoints": "maplab_py.viewer.extension",
     "viewer_layer": "maplab_py.viewer.extension",
+    "ExtractedFeatures": "maplab_py.vision.features.extension",
+    "feature_extractor": "maplab_py.vision.features.extension",
 }
 """Modules that commands without such a need, and `help`, do not wait for."""
 
-API_VERSION = (1, 4)
+API_VERSION = (1, 5)
 """Version of what this file exports: (breaking changes, additions)."""
 
 __all__ = [
@@ -49,6 +52,7 @@ __all__ = [
     "Cancelled",
     "CommandContext",
     "EstimationError",
+    "ExtractedFeatures",
     "FlagError",
     "LayerLines",
     "LayerPoints",
@@ -62,6 +66,7 @@ __all__ = [
     "VIMap",
     "check_writable",
     "command",
+    "feature_extractor",
     "importer",
     "key_of_folder",
     "option",

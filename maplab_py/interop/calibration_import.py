@@ -1,4 +1,4 @@
-"""Calibrations of other programs: kalibr, EuRoC, OpenVINS, Basalt. The inverse of the export.
+"""Calibrations of other programs: kalibr, EuRoC, OpenVINS, Basalt, COLMAP. The inverse of the export.
 
 The format follows from the content, not from the name. A time shift of kalibr or Basalt becomes the camera's
 time offset, t_imu = t_camera + offset.
@@ -14,6 +14,7 @@ import numpy as np
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.basalt import read_basalt
+from maplab_py.interop.colmap.calibration import is_colmap, read_calibration
 from maplab_py.interop.recordings.calibration import (
     ANY_DEVICE,
     device_of,
@@ -37,7 +38,7 @@ class CalibrationFile:
     """What a calibration file has: a camera rig, an IMU, or both."""
 
     source: Path
-    format: str  # for people: "kalibr", "EuRoC", "OpenVINS", "Basalt", "maplab"
+    format: str  # for people: "kalibr", "EuRoC", "OpenVINS", "Basalt", "COLMAP", "maplab"
     sensors: SensorSet
     rig_id: str = ""  # empty = none
     imu_id: str = ""
@@ -50,7 +51,8 @@ def import_calibration(
 
     Args:
         path: kalibr's or OpenVINS' camera chain or IMU file, OpenVINS' estimator_config.yaml or the
-            folder with it, a sensor.yaml of EuRoC or its folder, Basalt's json, or sensors.yaml.
+            folder with it, a sensor.yaml of EuRoC or its folder, Basalt's json, the folder of a COLMAP
+            model or its cameras.txt or cameras.bin, or sensors.yaml.
         imu_file: IMU file that belongs to a camera chain, or imu0/sensor.yaml to that of a camera.
         chosen: Sensors of a sensors.yaml that has several of a kind.
 
@@ -73,6 +75,9 @@ def import_calibration(
 
 
 def _import_any(path: Path, imu_file: Path | None, chosen: DeviceOptions) -> CalibrationFile:
+    if is_colmap(path):
+        _refuse_imu_file(path, imu_file)
+        return _file(path, "COLMAP", read_calibration(path))
     if path.is_dir():
         _refuse_imu_file(path, imu_file)
         folder = path / "mav0" if (path / "mav0").is_dir() else path
@@ -106,7 +111,8 @@ def _import_any(path: Path, imu_file: Path | None, chosen: DeviceOptions) -> Cal
         return _file(path, "maplab", device_of(read_sensors(path), str(path), chosen))
     raise UserError(
         f"{path}: the format is not known: give a camera chain or IMU file of kalibr, a sensor.yaml of "
-        "EuRoC, OpenVINS' estimator_config.yaml, Basalt's calibration.json, or sensors.yaml"
+        "EuRoC, OpenVINS' estimator_config.yaml, Basalt's calibration.json, a COLMAP model or its "
+        "cameras.txt, or sensors.yaml"
     )
 
 

@@ -329,20 +329,22 @@ class LocalizationSummaryMap(_message.Message):
     def __init__(self, p_G_landmark: _Optional[_Iterable[float]] = ..., uncompressed_map: _Optional[_Union[UncompressedLocalizationSummaryMap, _Mapping]] = ..., extras: _Optional[_Union[SummaryMapExtras, _Mapping]] = ...) -> None: ...
 
 class SummaryMapExtras(_message.Message):
-    __slots__ = ("landmark_covariance", "landmark_ids", "observer_ids", "sensors_yaml", "projection", "sha256")
+    __slots__ = ("landmark_covariance", "landmark_ids", "observer_ids", "sensors_yaml", "projection", "sha256", "descriptor_kind")
     LANDMARK_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     LANDMARK_IDS_FIELD_NUMBER: _ClassVar[int]
     OBSERVER_IDS_FIELD_NUMBER: _ClassVar[int]
     SENSORS_YAML_FIELD_NUMBER: _ClassVar[int]
     PROJECTION_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
+    DESCRIPTOR_KIND_FIELD_NUMBER: _ClassVar[int]
     landmark_covariance: _containers.RepeatedScalarFieldContainer[float]
     landmark_ids: bytes
     observer_ids: bytes
     sensors_yaml: str
     projection: MatrixXf
     sha256: bytes
-    def __init__(self, landmark_covariance: _Optional[_Iterable[float]] = ..., landmark_ids: _Optional[bytes] = ..., observer_ids: _Optional[bytes] = ..., sensors_yaml: _Optional[str] = ..., projection: _Optional[_Union[MatrixXf, _Mapping]] = ..., sha256: _Optional[bytes] = ...) -> None: ...
+    descriptor_kind: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, landmark_covariance: _Optional[_Iterable[float]] = ..., landmark_ids: _Optional[bytes] = ..., observer_ids: _Optional[bytes] = ..., sensors_yaml: _Optional[str] = ..., projection: _Optional[_Union[MatrixXf, _Mapping]] = ..., sha256: _Optional[bytes] = ..., descriptor_kind: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class UncompressedLocalizationSummaryMap(_message.Message):
     __slots__ = ("descriptors", "p_G_observer", "observer_indices", "observation_to_landmark_index")

@@ -23,6 +23,7 @@ from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.map_files import COPY_AGAIN, read_message
 from maplab_py.storage.message_scan import MemoryBudget
+from maplab_py.vimap.descriptors import DescriptorDepth
 
 FILE_NAME = "localization_summary_map"
 
@@ -43,8 +44,9 @@ class SummaryMap:
     landmark_id: U64 | None = None  # (L, 2)
     observer_id: U64 | None = None  # (K, 2)
     landmark_covariance: F32 | None = None  # (L, 3, 3) in G [m^2]
-    projection: F32 | None = None  # (dimensions, descriptor bits)
+    projection: F32 | None = None  # (dimensions, bits or numbers of a descriptor)
     sensors: SensorSet | None = None
+    descriptor_kind: tuple[int, int, int] | None = None  # bytes, feature type, depth; None = binary
 
 
 def summary_map_file(path: Path) -> Path | None:
@@ -118,6 +120,8 @@ def _message(summary: SummaryMap) -> Any:
         extras.landmark_covariance.extend(upper.ravel().tolist())
     if summary.projection is not None:
         _fill_matrix(extras.projection, summary.projection)
+    if summary.descriptor_kind is not None:
+        extras.descriptor_kind.extend(summary.descriptor_kind)
     if summary.sensors is not None:
         extras.sensors_yaml = write_sensors(summary.sensors)
     extras.sha256 = _digest(summary)
@@ -141,12 +145,24 @@ def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
         columns["landmark_covariance"] = full
     if extras.HasField("projection"):
         matrix = _matrix(extras.projection, f"{file}: projection")
-        if len(matrix) != summary.descriptors.shape[1] or matrix.shape[1] % 8:
+        kind = list(extras.descriptor_kind)
+        if len(matrix) != summary.descriptors.shape[1] or not _takes(matrix, kind):
             raise MapError(f"{file}: the projection does not fit the descriptors")
+        columns["descriptor_kind"] = (kind[0], kind[1], kind[2]) if kind else None
         columns["projection"] = np.ascontiguousarray(matrix)
     if extras.sensors_yaml:
         columns["sensors"] = parse_sensors(extras.sensors_yaml, f"{file}: sensors")
     return dataclasses.replace(summary, **columns)
+
+
+def _takes(projection: F32, kind: list[int]) -> bool:
+    """Return whether a projection takes descriptors of a kind; empty = binary of any size."""
+    width = int(projection.shape[1])
+    if not kind:
+        return width % 8 == 0
+    if len(kind) != 3 or kind[2] not in (DescriptorDepth.UINT8, DescriptorDepth.FLOAT32):
+        return False
+    return width * (4 if kind[2] == DescriptorDepth.FLOAT32 else 1) == kind[0]
 
 
 def _digest(summary: SummaryMap) -> bytes:
@@ -154,6 +170,10 @@ def _digest(summary: SummaryMap) -> bytes:
     digest = hashlib.sha256()
     for field in dataclasses.fields(summary):
         value = getattr(summary, field.name)
+        if field.name == "descriptor_kind":
+            if value is None:
+                continue  # as in files from before there was this field
+            value = np.array(value, dtype=np.int64)
         digest.update(f"{field.name}:".encode())
         if isinstance(value, np.ndarray):
             digest.update(np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes())

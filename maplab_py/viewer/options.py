@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar, Literal
 
+from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.vimap.descriptors import type_of_name
 
 COLOURINGS = (
     "mission",
@@ -63,7 +65,9 @@ class VisualizationOptions:
         True, help="Hide landmarks of bad quality at first; the panel can show them."
     )
     show_only_landmark_type: str = option(
-        "", help="Show landmarks of this feature type (its number) only; empty = all."
+        "",
+        help="Show landmarks of this feature type only: Binary, SuperPoint, R2D2, SIFT, LIDARSuperPoint or "
+        "a number; empty = all.",
     )
     landmarks_min_observers: int = option(
         0, help="Leave out landmarks that fewer vertices observe."
@@ -115,10 +119,11 @@ class VisualizationOptions:
             raise ValueError(
                 f"--vis_landmark_gray_level={self.landmark_gray_level}: must be 0 to 255"
             )
-        if self.show_only_landmark_type and not self.show_only_landmark_type.isdigit():
-            raise ValueError(
-                f"--vis_show_only_landmark_type={self.show_only_landmark_type}: a number is expected"
-            )
+        if self.show_only_landmark_type:
+            try:
+                type_of_name(self.show_only_landmark_type)
+            except FlagError as error:
+                raise ValueError(f"--vis_show_only_landmark_type: {error}") from None
 
     @property
     def landmark_colouring(self) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.array_types import I32
+from maplab_py.errors import FlagError
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import Frames
 
@@ -79,29 +80,61 @@ def binary_descriptor_sizes(frames: Frames) -> I32:
     return _of_keypoints(frames, lambda block: block.size if block.is_binary else 0, 0)
 
 
+def sizes_of_type(frames: Frames, feature_type: int, depth: int) -> I32:
+    """Return the bytes (K,) of each keypoint's descriptor of a type and depth, 0 of all others."""
+
+    def size(block: DescriptorBlock) -> int:
+        return block.size if block[2:] == (depth, feature_type) else 0
+
+    return _of_keypoints(frames, size, 0)
+
+
 def feature_types(frames: Frames) -> I32:
     """Return the feature type (K,) of each keypoint's descriptor, `NO_DESCRIPTOR` without one."""
     return _of_keypoints(frames, lambda block: block.feature_type, NO_DESCRIPTOR)
 
 
-def other_types(frames: Frames) -> str:
-    """Return the names of the types that are not binary, as in "SuperPoint, type 7", or ""."""
-    kinds = {
+def types_of(frames: Frames) -> set[int]:
+    """Return the feature types of all descriptors that can be compared.
+
+    Descriptors of the binary type with numbers that are not bytes cannot be.
+    """
+    return {
         block.feature_type
         for blocks in frames.descriptor_blocks
         for block in blocks or ()
-        if block.keypoints and not block.is_binary
+        if block.keypoints and (block.is_binary or block.feature_type != FeatureType.BINARY)
     }
-    return ", ".join(_NAMES.get(kind, f"type {kind}") for kind in sorted(kinds))
+
+
+def type_name(feature_type: int) -> str:
+    """Return maplab's name of a feature type, as in "SIFT" or "type 7"."""
+    return _NAMES.get(feature_type, f"type {feature_type}")
+
+
+def type_of_name(name: str) -> int:
+    """Return the feature type that maplab calls so; its number is a name, too.
+
+    Raises:
+        FlagError: There is no such type.
+    """
+    for feature_type, known in _NAMES.items():
+        if name.lower() == known.lower():
+            return feature_type
+    if name.isdigit() and int(name) < 2**31:
+        return int(name)
+    raise FlagError(f"{name} is no feature type: wants one of {', '.join(TYPE_NAMES)}, or a number")
 
 
 _NAMES: dict[int, str] = {
-    FeatureType.BINARY: "binary type with numbers that are not bytes",
+    FeatureType.BINARY: "Binary",
     FeatureType.SUPERPOINT: "SuperPoint",
     FeatureType.R2D2: "R2D2",
     FeatureType.SIFT: "SIFT",
     FeatureType.LIDAR_SUPERPOINT: "LIDARSuperPoint",
 }
+TYPE_NAMES = tuple(_NAMES.values())
+"""Names of the feature types in maplab's flags."""
 
 
 def _of_keypoints(frames: Frames, value: Callable[[DescriptorBlock], int], default: int) -> I32:

@@ -1,1 +1,1 @@
-"""Place recognition: binary descriptors, their projection and index, and absolute pose."""
+"""Place recognition: descriptors, their projection and index, and absolute pose."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple, Protocol
 
-from maplab_py.array_types import F32, I32, I64, U64
+from maplab_py.array_types import F32, I8, I32, I64, U64
 
 
 class DescriptorColumns(NamedTuple):
     """Descriptors as the compiled searches take them, see `DescriptorSet`."""
 
-    words: U64  # (N, W)
+    words: U64 | I8  # (N, W)
     label: I64  # (N,)
     session: I32  # (N,)
     time_ns: I64  # (N,)
@@ -22,7 +22,7 @@ class DescriptorSet:
     """Descriptors with the labels, sessions and times that restrict matches."""
 
     projected: F32  # (N, dimensions)
-    words: U64  # (N, W), packed bits
+    words: U64 | I8  # (N, W), packed bits, or signed bytes of descriptors that are not binary
     label: I64  # (N,) landmark; a match of equal non-negative labels is not reported
     session: I32  # (N,) mission
     time_ns: I64  # (N,)
@@ -58,7 +58,7 @@ class Neighbours:
     """The k nearest neighbours of every query in ascending order, one per label."""
 
     row: I32  # (Q, k), -1 where there are fewer than k
-    distance: F32  # (Q, k) bits, or squared distance in the projected space; inf where none
+    distance: F32  # (Q, k) as `differences`, or squared in the projected space; inf where none
 
 
 class DescriptorIndex(Protocol):

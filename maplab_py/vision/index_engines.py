@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.vision.descriptors import pack_words
+from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule
 from maplab_py.vision.projection import learn_projection
 
 INDEX_ENGINES = ("imi", "kd", "hamming")
+_SHORT = DescriptorKind(8)
 
 
 def make_index(
@@ -36,13 +37,19 @@ def make_index(
     return InvertedMultiIndex(database, seed=seed, cells_per_query=words_per_query)
 
 
-def compile_kernels() -> None:
-    """Compile the projection and the search of every index on random tracks."""
+def compile_kernels(kind: DescriptorKind = _SHORT) -> None:
+    """Compile the projection and the search of every index on random tracks.
+
+    Args:
+        kind: Descriptors of 8 bytes; bits and numbers have kernels of their own.
+    """
     label = np.repeat(np.arange(60), 5)
     descriptors = np.random.default_rng(0).integers(0, 256, (60, 8), dtype=np.uint8)[label]
     database = DescriptorSet(
-        projected=learn_projection(descriptors, label, dimensions=4).project(descriptors),
-        words=pack_words(descriptors),
+        projected=learn_projection(descriptors, label, kind=kind, dimensions=4).project(
+            descriptors
+        ),
+        words=kind.comparable(descriptors),
         label=label,
         session=np.zeros(len(label), dtype=np.int32),
         time_ns=np.zeros(len(label), dtype=np.int64),

@@ -1,4 +1,4 @@
-"""Projection of binary descriptors to few real dimensions, learned from tracks.
+"""Projection of descriptors to few real dimensions, learned from tracks.
 
 Within a track descriptors vary by noise; between tracks they vary by content. The projection
 keeps the directions along which the two differ most, scaled so that the squared Euclidean
@@ -16,6 +16,7 @@ import numpy as np
 from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.compilation import compiled, prange
 from maplab_py.errors import EstimationError
+from maplab_py.vision.descriptor_kind import DescriptorKind
 
 DIMENSIONS = 10
 MIN_TRACK_LENGTH = 5
@@ -23,18 +24,29 @@ MAX_TRAINING_SAMPLES = 50_000
 _MIN_TRAINING_TRACKS = 50
 _REGULARISATION = 1e-3
 """Variance [bit^2] added to every direction, so that constant bits do not dominate."""
+_ROUNDING_VARIANCE = 1.0 / 12.0
+"""The same for the signed bytes of other descriptors, which are rounded."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescriptorProjection:
-    """Linear map from the bits of a descriptor (most significant bit of byte 0 first)."""
+    """Linear map from the bits of a descriptor (most significant bit of byte 0 first), or its numbers.
 
-    matrix: F32  # (dimensions, 8 * bytes)
+    Numbers are those of `DescriptorKind.steps`.
+    """
+
+    matrix: F32  # (dimensions, 8 * bytes), or (dimensions, numbers)
+    given_kind: DescriptorKind | None = None  # None = binary of as many bytes as the matrix takes
+
+    @property
+    def kind(self) -> DescriptorKind:
+        """The descriptors that this projection takes."""
+        return self.given_kind or DescriptorKind(int(self.matrix.shape[1]) // 8)
 
     @property
     def descriptor_size(self) -> int:
         """Length [bytes] of the descriptors that this projection takes."""
-        return int(self.matrix.shape[1]) // 8
+        return self.kind.size
 
     def project(self, descriptors: U8) -> F32:
         """Return descriptors (N, bytes) as points (N, dimensions).
@@ -48,12 +60,16 @@ class DescriptorProjection:
                 f"{descriptors.shape[1]}"
             )
         projected = np.empty((len(descriptors), len(self.matrix)), dtype=np.float32)
-        _sum_table(np.ascontiguousarray(descriptors), self._table, projected)
+        values = descriptors if self.kind.is_binary else self.kind.steps(descriptors).view(np.uint8)
+        _sum_table(np.ascontiguousarray(values), self._table, projected)
         return projected
 
     @cached_property
     def _table(self) -> F32:
         """Look-up table (bytes, 256, dimensions): contribution of each value of each byte."""
+        if not self.kind.is_binary:
+            steps = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.float32)
+            return steps[:, None] * np.ascontiguousarray(self.matrix.T)[:, None, :]
         values = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32)
         by_byte = self.matrix.T.reshape(self.descriptor_size, 8, len(self.matrix))
         table = np.einsum("vb,pbd->pvd", values, by_byte, optimize=False)
@@ -64,6 +80,7 @@ def learn_projection(
     descriptors: U8,
     track: I64,
     *,
+    kind: DescriptorKind | None = None,
     dimensions: int = DIMENSIONS,
     min_track_length: int = MIN_TRACK_LENGTH,
     max_samples: int = MAX_TRAINING_SAMPLES,
@@ -73,6 +90,7 @@ def learn_projection(
     Args:
         descriptors: Descriptors (N, bytes).
         track: Label (N,) of the track or landmark that each belongs to, negative for none.
+        kind: What the descriptors are; None = binary.
         dimensions: Dimensions to keep.
         min_track_length: Shortest track to learn from; halved down to 2 while there are too few.
         max_samples: Learn from about as many descriptors, taken as whole tracks spread evenly.
@@ -86,24 +104,27 @@ def learn_projection(
             f"the descriptor projection cannot be learned: fewer than {_MIN_TRAINING_TRACKS} tracks "
             "have two or more observations with descriptors"
         )
-    bits = np.unpackbits(descriptors[rows], axis=1).astype(np.float64)
+    kind = kind or DescriptorKind(descriptors.shape[1])
+    raw = descriptors[rows]
+    bits = (np.unpackbits(raw, axis=1) if kind.is_binary else kind.steps(raw)).astype(np.float64)
     first = np.flatnonzero(np.diff(track[rows], prepend=-1))
     length = np.diff(np.append(first, len(rows)))
     sums = np.add.reduceat(bits, first, axis=0)
-    # sums of 0/1 products are exact in double precision, whatever the order of summation
+    # sums of products of small integers are exact in double precision, whatever their order
     second_moment = bits.T @ bits
     weighted = sums / np.sqrt(length)[:, None]
     within = (second_moment - weighted.T @ weighted) / (len(rows) - len(first))
     mean = bits.mean(axis=0)
     overall = second_moment / len(rows) - np.outer(mean, mean)
-    return DescriptorProjection(_likelihood_ratio_metric(within, overall, dimensions))
+    floor = _REGULARISATION if kind.is_binary else _ROUNDING_VARIANCE
+    return DescriptorProjection(_likelihood_ratio_metric(within, overall, dimensions, floor), kind)
 
 
-def _likelihood_ratio_metric(within: F64, overall: F64, dimensions: int) -> F32:
+def _likelihood_ratio_metric(within: F64, overall: F64, dimensions: int, floor: float) -> F32:
     """Return A (dimensions, bits) with |A d|^2 = d^T (within^-1 - overall^-1) d, truncated."""
     from threadpoolctl import threadpool_limits
 
-    eye = np.eye(len(within)) * _REGULARISATION
+    eye = np.eye(len(within)) * floor
     with threadpool_limits(limits=1, user_api="blas"):
         s, V = np.linalg.eigh(within + eye)
         whiten = (V / np.sqrt(s)).T

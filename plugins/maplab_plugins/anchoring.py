@@ -29,7 +29,7 @@ def anchor_all_missions(
 ) -> AnchoringReport:
     """Anchor every mission of unknown base frame to the known ones, directly or through other missions.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 
@@ -52,9 +52,9 @@ def anchor_mission(
 ) -> AnchoringReport:
     """Anchor one mission of unknown base frame to the known ones.
 
-    Places are recognised by binary descriptors; keypoints with others are left out. With --T_G_M a
-    person decides where the mission is: the pose is taken as it is, or with --to as an approximate
-    one that selects the alignment with another mission.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
+    With --T_G_M a person decides where the mission is: the pose is taken as it is, or with --to as
+    an approximate one that selects the alignment with another mission.
 
     Args:
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.

@@ -76,14 +76,15 @@ def import_calibration(
     chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
 ) -> CalibrationImport:
-    """Read a calibration of kalibr, EuRoC, OpenVINS or Basalt, for sensors.yaml or for the map.
+    """Read a calibration of kalibr, EuRoC, OpenVINS, Basalt or COLMAP, for sensors.yaml or for the map.
 
     The format follows from the content. In a map poses and stamps are unchanged: a time shift that differs
     from that of the recording becomes an image delay.
 
     Args:
         calibration_file: kalibr's camera chain or IMU file, OpenVINS' estimator_config.yaml, a sensor.yaml
-            of EuRoC or the folder with all of them, Basalt's json, or sensors.yaml.
+            of EuRoC or the folder with all of them, Basalt's json, the folder of a COLMAP model of one rig,
+            its cameras.txt or cameras.bin of one camera, or sensors.yaml.
         imu_calibration_file: IMU file that belongs to a camera chain, or to the sensor.yaml of a camera.
         sensors_file: Write sensors.yaml for maplab here.
         apply: Give the calibration to the device of the map.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 _OPTIONS = LocalizationOptions()
+_FEATURES = FeatureTypeOptions()
 _SIZE = SizeOptions()
 
 
@@ -48,6 +50,7 @@ def localize(
     localization_map: str = "",
     *,
     options: LocalizationOptions = _OPTIONS,
+    features: FeatureTypeOptions = _FEATURES,
     chosen: MissionChoice = ALL_MISSIONS,
     sequence_length: int = 1,
     success_error_m: float = 0.5,
@@ -60,7 +63,8 @@ def localize(
 ) -> LocalizationReport:
     """Localise the images of the selected map in another map, one by one; no map is changed.
 
-    Only binary descriptors are matched; keypoints with others are left out.
+    Descriptors of one feature type are matched, in a summary map those that it was made from, else
+    those of --lc_feature_type; keypoints with others are left out.
 
     Errors are against --ground_truth or --truth, else against the poses that the selected map has.
 
@@ -89,7 +93,7 @@ def localize(
             check_writable(path, overwrite=overwrite)
     query = context.vi_map
     missions = chosen.rows(context.vi_map)
-    database, searched = _database(context, localization_map, missions, size)
+    database, searched = _database(context, localization_map, missions, features, size)
     localizations = localize_missions(
         database,
         query,
@@ -115,6 +119,7 @@ def _database(
     context: CommandContext,
     name: str,
     queries: NDArray[np.int64] | None,
+    features: FeatureTypeOptions,
     size: SizeOptions,
 ) -> tuple[LocalizationMap, VIMap | None]:
     """Return what to search in, and the full map if it is one."""
@@ -122,6 +127,7 @@ def _database(
     from maplab_py.storage.native import is_map_folder, load_map
     from maplab_py.storage.summary_map import read_summary_map, summary_map_file
 
+    kind: dict[str, Any] = {"feature_type": features.type_number, "sizes": features.sizes}
     if not name:
         session_map = context.vi_map
         others = np.setdiff1d(
@@ -132,14 +138,14 @@ def _database(
                 "say where to localise, --localization_map=..., or which of the map's missions are "
                 "the queries, --map_mission=..."
             )
-        return database_of_map(session_map, missions=others), session_map
+        return database_of_map(session_map, missions=others, **kind), session_map
     if name in context.maps:
         vi_map = context.maps.get(name).vi_map
-        return database_of_map(vi_map), vi_map
+        return database_of_map(vi_map, **kind), vi_map
     path, megabytes = Path(name), size.proto_max_size_megabytes
     if is_map_folder(path):
         vi_map, _ = load_map(path, max_size_megabytes=megabytes, progress=context.progress)
-        return database_of_map(vi_map), vi_map
+        return database_of_map(vi_map, **kind), vi_map
     if summary_map_file(path) is not None:
         return database_of_summary(read_summary_map(path, max_size_megabytes=megabytes)), None
     raise UserError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions, LoopClosureOptions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.plugin import CommandContext, Message, Report, command
 from maplab_py.report import counted
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
 
 _LOOPS = LoopClosureOptions()
+_FEATURES = FeatureTypeOptions()
 _RELAXATION = RelaxationOptions()
 
 
@@ -73,7 +74,7 @@ def loopclosure_all_missions(
 ) -> LoopClosureReport:
     """Detect loop closures within and between missions and merge their landmarks.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
 
     Args:
         lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
@@ -93,7 +94,7 @@ def loopclosure_one_mission(
 ) -> LoopClosureReport:
     """Detect loop closures within one mission and merge their landmarks.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
 
     Args:
         lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
@@ -123,13 +124,14 @@ def train_projection_matrix(
     context: CommandContext,
     file: Path,
     *,
+    features: FeatureTypeOptions = _FEATURES,
     lc_target_dimensionality: int = _LOOPS.target_dimensionality,
     map_mission_list: str = "",
     overwrite: bool = False,
 ) -> TrainingReport:
     """Train the projection of descriptors on the feature tracks of the map and write it.
 
-    Only binary descriptors are used.
+    Descriptors of one feature type are used.
 
     Args:
         file: File to write; to be given as --lc_projection_matrix_filename.
@@ -141,7 +143,13 @@ def train_projection_matrix(
     from maplab_py.vision.projection_file import save_projection
 
     missions = context.mission_rows("", map_mission_list)
-    projection, report = train_projection(context.vi_map, missions, lc_target_dimensionality)
+    projection, report = train_projection(
+        context.vi_map,
+        missions,
+        lc_target_dimensionality,
+        feature_type=features.type_number,
+        sizes=features.sizes,
+    )
     save_projection(projection, file, overwrite=overwrite)
     return dataclasses.replace(report, file=str(file))
 
@@ -255,7 +263,7 @@ def relax(
 ) -> RelaxReport:
     """Find loop closures and relax the pose graph over them and over the map's loop closure edges.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
 
     Args:
         lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.
@@ -276,7 +284,7 @@ def relax_missions_independently(
 ) -> RelaxMissionsReport:
     """Relax every mission over its internal loop closures only.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
 
     Args:
         lc_relax_merge_landmarks: Merge the landmarks of the closures afterwards, as lc does.

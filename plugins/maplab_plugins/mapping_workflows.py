@@ -41,7 +41,7 @@ def create_localization_summary_map(
 ) -> WorkflowReport:
     """Create a localisation map from raw sessions: tracks, keyframes, optimisation, anchors, loops.
 
-    Places are recognised by binary descriptors; keypoints with others are left out.
+    Places are recognised by descriptors of one feature type; keypoints with others are left out.
 
     Runs itl, rtl, kfh, elq with two observers, optvi, aam when there are several missions, relax,
     lc, optvi and elq, then lsparsify and summary_map if asked to.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.reports import SummaryMapContent, SummaryMapReport
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
 
 _SUMMARY = SummaryMapOptions()
+_FEATURES = FeatureTypeOptions()
 _SIZE = SizeOptions()
 
 
@@ -25,11 +27,12 @@ def generate_summary_map_and_save_to_disk(
     *,
     summary_map_save_path: Path | None = None,
     options: SummaryMapOptions = _SUMMARY,
+    features: FeatureTypeOptions = _FEATURES,
     overwrite: bool = False,
 ) -> SummaryMapReport:
     """Write the good landmarks of the selected map and their descriptors to a summary map.
 
-    Only binary descriptors are projected; observations with others are left out.
+    Descriptors of one feature type are projected; observations with others are left out.
 
     Args:
         summary_map_save_path: Folder that gets the file localization_summary_map.
@@ -42,7 +45,13 @@ def generate_summary_map_and_save_to_disk(
         raise UserError("no destination: give --summary_map_save_path=FOLDER")
     file = summary_map_save_path / FILE_NAME
     check_writable(file, overwrite=overwrite)
-    summary = make_summary_map(context.vi_map, options, progress=context.progress)
+    summary = make_summary_map(
+        context.vi_map,
+        options,
+        feature_type=features.type_number,
+        sizes=features.sizes,
+        progress=context.progress,
+    )
     data = summary_map_bytes(summary)
     write_bytes(file, [data], overwrite=overwrite)
     return SummaryMapReport(

@@ -22,10 +22,14 @@ EXAMPLE = REPOSITORY / "docs" / "examples" / "maplab_hello"
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the example beside nothing else and return the folder."""
+    return install_example(EXAMPLE, tmp_path_factory)
+
+
+def install_example(example: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install an example beside nothing else and return the folder."""
     folder = tmp_path_factory.mktemp("installed")
-    source = tmp_path_factory.mktemp("source") / "maplab_hello"
-    shutil.copytree(EXAMPLE, source)
+    source = tmp_path_factory.mktemp("source") / example.name
+    shutil.copytree(example, source)
     words = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--target", str(folder)]
     done = subprocess.run(
         [sys.executable, "-m", "pip", *words, str(source)],
@@ -37,7 +41,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _maplab(installed: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_maplab(installed: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     paths = [str(installed), *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return subprocess.run(
         [sys.executable, "-m", "maplab_py", *arguments],
@@ -50,7 +54,7 @@ def _maplab(installed: Path, *arguments: str) -> subprocess.CompletedProcess[str
 
 
 def test_the_console_lists_it(installed: Path) -> None:
-    done = _maplab(installed, "--json", "plugins")
+    done = run_maplab(installed, "--json", "plugins")
     assert done.returncode == 0, done.stderr
     plugins = {line["plugin"]: line for line in json.loads(done.stdout)["report"]["plugins"]}
     assert plugins["hello"]["version"] == "1.0.0"
@@ -64,7 +68,7 @@ def test_its_commands_run_on_a_map(installed: Path, tmp_path: Path) -> None:
         f"load {tmp_path / 'map'}; cfl --far_distance_m=3; "
         f"rename_description --text='a small room'; save --map_folder={tmp_path / 'renamed'}"
     )
-    done = _maplab(installed, "--json", "-c", script)
+    done = run_maplab(installed, "--json", "-c", script)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout.splitlines()[1])["report"]
     assert report["landmarks"] == len(simulated().maps[0].landmarks)
@@ -74,7 +78,7 @@ def test_its_commands_run_on_a_map(installed: Path, tmp_path: Path) -> None:
 
 def test_its_options_refuse_nonsense(installed: Path, tmp_path: Path) -> None:
     save_map(simulated().maps[0], tmp_path / "map")
-    done = _maplab(installed, "-c", f"load {tmp_path / 'map'}; cfl --far_distance_m=-1")
+    done = run_maplab(installed, "-c", f"load {tmp_path / 'map'}; cfl --far_distance_m=-1")
     assert done.returncode == 2
     assert "--far_distance_m must be greater than 0" in done.stderr
 
@@ -82,7 +86,7 @@ def test_its_options_refuse_nonsense(installed: Path, tmp_path: Path) -> None:
 def test_its_residual_takes_part_in_optvi(installed: Path, tmp_path: Path) -> None:
     save_map(simulated().maps[0], tmp_path / "map")
     script = f"load {tmp_path / 'map'}; optvi --ba_residuals=flat_floor --ba_num_iterations=3"
-    done = _maplab(installed, "--json", "--discard", "-c", script)
+    done = run_maplab(installed, "--json", "--discard", "-c", script)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout.splitlines()[1])["report"]
     terms = {term["term"]: term for term in report["terms"]}
@@ -92,7 +96,7 @@ def test_its_residual_takes_part_in_optvi(installed: Path, tmp_path: Path) -> No
 
 def test_a_residual_that_no_plugin_has_is_refused(installed: Path, tmp_path: Path) -> None:
     save_map(simulated().maps[0], tmp_path / "map")
-    done = _maplab(installed, "-c", f"load {tmp_path / 'map'}; optvi --ba_residuals=flat_flor")
+    done = run_maplab(installed, "-c", f"load {tmp_path / 'map'}; optvi --ba_residuals=flat_flor")
     assert done.returncode == 2
     assert "no plugin has a residual 'flat_flor'; there are: flat_floor" in done.stderr
 
@@ -101,7 +105,7 @@ def test_its_importer_makes_a_map(installed: Path, tmp_path: Path) -> None:
     rows = "0,0,0\n1,0,0\n1,2,0\n"
     (tmp_path / "a walk.csv").write_text(rows)
     script = f"import_positions '{tmp_path / 'a walk.csv'}' --period_s=0.5; check_map_consistency"
-    done = _maplab(installed, "--json", "--discard", "-c", f"{script}; map_stats")
+    done = run_maplab(installed, "--json", "--discard", "-c", f"{script}; map_stats")
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert lines[0]["report"]["map_key"] == "a_walk"
@@ -124,7 +128,7 @@ def test_its_importer_refuses_what_is_no_path(installed: Path, line: str, messag
     (installed / "bad.csv").write_text("x,y,z\n")
     (installed / "two.csv").write_text("1,2\n3,4\n")
     (installed / "good.csv").write_text("1,2,3\n3,4,5\n")
-    done = _maplab(installed, "-c", line)
+    done = run_maplab(installed, "-c", line)
     assert done.returncode == 2
     assert message in done.stderr
 

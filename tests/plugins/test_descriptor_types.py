@@ -87,7 +87,10 @@ def test_maps_without_binary_descriptors_are_refused_in_one_line(
     with Session() as session:
         session.run("load", map_folder=floats)
         before = session.vi_map
-        with pytest.raises(EstimationError, match="no binary descriptors, only SuperPoint, SIFT"):
+        with pytest.raises(
+            EstimationError,
+            match="no Binary descriptors, only SuperPoint, SIFT: --lc_feature_type=SuperPoint",
+        ):
             session.run(command, **{name: Path(value) for name, value in arguments.items()})
         assert session.vi_map is before
     assert list(tmp_path.iterdir()) == []

@@ -111,7 +111,7 @@ def test_a_graph_is_exported_imported_and_relaxed(session: Session, tmp_path: Pa
     before = np.linalg.norm(graph.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
     report = session.run("relax")
     assert report.failure == ""
-    assert "no binary descriptors" in report.loop_closures.notes[0]
+    assert "no Binary descriptors" in report.loop_closures.notes[0]
     assert len(session.vi_map.loop_closure_edges) == len(graph.loop_closure_edges) > 0
     after = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
     assert after < 0.5 * before

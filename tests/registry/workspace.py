@@ -111,6 +111,8 @@ PREPARED["visualize_difference"] = f"{MERGED}; snapshot before; rlq"
 for _name in ("export_images", "remove_resources", "clean_up_resource_folders"):
     PREPARED[_name] = "load with_resources/office"
 _ROOM = "load stereo_room/session_1; import_images stereo_room/raw/session_1"
+PREPARED["extract_features"] = _ROOM
+PREPARED["track_features"] = f"{_ROOM}; extract_features --max_features=100"
 PREPARED["stereo_dense_reconstruction"] = _ROOM
 PREPARED["convert_all_depth_maps_to_point_clouds"] = f"{_ROOM}; sdr"
 PREPARED["create_tsdf_from_depth_resource"] = f"{_ROOM}; sdr"

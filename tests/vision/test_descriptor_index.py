@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from maplab_py.vision.descriptors import hamming, pack_words
+from maplab_py.vision.descriptors import differences, pack_words
 from maplab_py.vision.hamming_index import HammingIndex
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.index_engines import INDEX_ENGINES, make_index
@@ -29,13 +29,13 @@ def test_hamming_counts_different_bits(size):
     descriptors = rng.integers(0, 256, size=(50, size), dtype=np.uint8)
     a, b = rng.integers(0, 50, size=(2, 200))
     words = pack_words(descriptors)
-    np.testing.assert_array_equal(hamming(words, a, words, b), exact_bits(descriptors, a, b))
+    np.testing.assert_array_equal(differences(words, a, words, b), exact_bits(descriptors, a, b))
 
 
 def test_descriptors_of_different_lengths_are_not_compared():
     rows = np.zeros(1, dtype=np.int64)
     with pytest.raises(ValueError, match="cannot be compared"):
-        hamming(np.zeros((1, 6), np.uint64), rows, np.zeros((1, 8), np.uint64), rows)
+        differences(np.zeros((1, 6), np.uint64), rows, np.zeros((1, 8), np.uint64), rows)
 
 
 def test_exhaustive_index_finds_the_nearest(features):

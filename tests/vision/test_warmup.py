@@ -2,7 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.vision import kmeans, pose_kernels, projection, search_kernels, track_union
+from maplab_py.vision import (
+    epipolar_matching,
+    kmeans,
+    pose_kernels,
+    projection,
+    search_kernels,
+    track_union,
+)
 from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.features import corner_kernels
 from maplab_py.vision.tracking import tracker, two_point_kernels
@@ -21,13 +28,24 @@ def test_warmup_compiles_every_kernel_that_place_recognition_calls():
     for kernel in (
         kmeans._nearest,
         projection._sum_table,
-        search_kernels.bits_between,
+        search_kernels.differences_between,
         search_kernels.search_all,
         search_kernels.search_cells,
         track_union._unite,
         pose_kernels.search_poses,
     ):
         assert len(kernel.signatures) >= 1
+
+
+def test_warmup_compiles_the_search_of_numbers():
+    vision_jobs()["descriptors of numbers"]()
+    for kernel in (search_kernels.search_all, search_kernels.search_cells):
+        words = {
+            str(signature[-5 if kernel is search_kernels.search_all else 1])
+            for signature in kernel.signatures
+        }
+        assert any("int8" in text for text in words)
+    assert len(epipolar_matching._fill.signatures) >= 2
 
 
 def test_a_search_on_a_map_compiles_nothing_more():
@@ -38,7 +56,7 @@ def test_a_search_on_a_map_compiles_nothing_more():
     kernels = (
         kmeans._nearest,
         projection._sum_table,
-        search_kernels.bits_between,
+        search_kernels.differences_between,
         search_kernels.search_cells,
         track_union._unite,
         pose_kernels.search_poses,

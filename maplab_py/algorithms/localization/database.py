@@ -14,7 +14,9 @@ from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.descriptors import FeatureType, type_name
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DescriptorProjection
 
@@ -41,8 +43,8 @@ class LocalizationMap:
     projection: DescriptorProjection
 
     @property
-    def has_bits(self) -> bool:
-        """Return whether the database holds binary descriptors, not only projected ones."""
+    def has_descriptors(self) -> bool:
+        """Return whether the database holds descriptors, not only projected ones."""
         return bool(self.descriptors.words.shape[1] > 0)
 
     @cached_property
@@ -92,22 +94,37 @@ class LocalizationMap:
 
 
 def database_of_map(
-    vi_map: VIMap, *, missions: I64 | None = None, projection: DescriptorProjection | None = None
+    vi_map: VIMap,
+    *,
+    missions: I64 | None = None,
+    projection: DescriptorProjection | None = None,
+    feature_type: int = FeatureType.BINARY,
+    sizes: tuple[int, ...] = (),
 ) -> LocalizationMap:
     """Build the database from the good landmarks that missions (None = all) observe.
 
     A single observation suffices: keyframing removes observations but keeps the position that
     they determined.
 
+    Args:
+        vi_map: The map.
+        missions: Mission rows.
+        projection: Projection of the descriptors; None = learned from the tracks.
+        feature_type: Type of the descriptors.
+        sizes: Lengths [bytes] that they may have; empty = any.
+
     Raises:
         EstimationError: No landmark has descriptors, or the projection cannot be learned.
     """
     judged, _ = evaluate_unknown_quality(vi_map)
     rows = np.arange(len(judged.missions)) if missions is None else missions
-    features, projection = map_features(judged, rows, projection=projection)
+    features, projection = map_features(
+        judged, rows, projection=projection, feature_type=feature_type, sizes=sizes
+    )
     good_features = features_of_good_landmarks(judged, features)
     if len(good_features) == 0:
-        raise EstimationError("the map has no good landmark with binary descriptors: run rtl")
+        name = type_name(feature_type)
+        raise EstimationError(f"the map has no good landmark with {name} descriptors: run rtl")
     descriptors = features.descriptors.take(good_features)
     landmarks, label = np.unique(descriptors.label, return_inverse=True)
     vertices, observer = np.unique(features.vertex[good_features], return_inverse=True)
@@ -145,7 +162,7 @@ def database_of_summary(
                 "the summary map does not hold the projection of its descriptors: it was written "
                 "by another program"
             )
-        projection = DescriptorProjection(summary.projection)
+        projection = DescriptorProjection(summary.projection, _kind(summary))
     count = len(summary.descriptors)
     if count == 0:
         raise UserError("the summary map has no landmark")
@@ -165,6 +182,13 @@ def database_of_summary(
         observer_id=summary.observer_id,
         projection=projection,
     )
+
+
+def _kind(summary: SummaryMap) -> DescriptorKind | None:
+    """Return the kind of the descriptors that a summary map was made from; None = binary."""
+    if summary.descriptor_kind is None:
+        return None
+    return DescriptorKind(*summary.descriptor_kind)
 
 
 def _grouped(key: I64, value: I64, groups: int) -> tuple[I64, I64]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I8, I64, U64
 from maplab_py.geometry import se3
 from maplab_py.vimap.table import ragged_rows
 
@@ -26,7 +26,7 @@ def guided_matches(
     T_G_I: F64,
     *,
     projected: NDArray[np.float32],
-    words: NDArray[np.uint64],
+    words: U64 | I8,
     origin_I: F64,
     ray_I: F64,
     radius_rad: F64,
@@ -38,11 +38,11 @@ def guided_matches(
         database: The map.
         T_G_I: Approximate pose (7,) of the query.
         projected: Projected descriptors (N, dimensions) of its keypoints.
-        words: Packed descriptors (N, W); empty rows for summary maps.
+        words: Descriptors (N, W) as the map compares them; empty rows for summary maps.
         origin_I: Camera centres (N, 3) of the keypoints in the body frame [m].
         ray_I: Unit rays (N, 3) of the keypoints in the body frame.
         radius_rad: Angle (N,) around each ray in which landmarks are searched.
-        max_distance: Largest distance of descriptors: bits, or squared in the projected space.
+        max_distance: Largest difference of descriptors, or squared distance of projected ones.
     """
     landmarks = np.flatnonzero(_in_range(database, T_G_I[4:]))
     p_I = se3.transform(se3.inverse(T_G_I), database.p_G[landmarks])
@@ -54,11 +54,11 @@ def guided_matches(
     count = np.diff(start)[landmark]
     row = rows[ragged_rows(start, landmark)]
     owner = np.repeat(keypoint, count)
-    if database.has_bits:
-        from maplab_py.vision.search_kernels import bits_between
+    if database.has_descriptors:
+        from maplab_py.vision.search_kernels import differences_between
 
         distance = np.empty(len(row))
-        bits_between(words, owner, database.descriptors.words, row, distance)
+        differences_between(words, owner, database.descriptors.words, row, distance)
     else:
         offset = projected[owner] - database.descriptors.projected[row]
         distance = np.einsum("nd,nd->n", offset, offset).astype(np.float64)

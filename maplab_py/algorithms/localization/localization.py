@@ -140,7 +140,7 @@ def describe(
     localized = int(localizations.is_localized.sum())
     answered = [answer for answer in localizations.answers if answer.outcome is Outcome.LOCALIZED]
     return LocalizationReport(
-        map_kind="full" if database.has_bits else "summary",
+        map_kind="full" if database.has_descriptors else "summary",
         map_landmarks=len(database.p_G),
         map_observations=len(database.descriptors),
         queries=len(outcomes),

@@ -19,7 +19,6 @@ from maplab_py.array_types import F64, I64
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level
-from maplab_py.vision.descriptors import pack_words
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
 
@@ -82,31 +81,33 @@ class Localizer:
         """
         self._map = database
         self._options = options
-        bits = 8 * database.projection.descriptor_size
+        kind = database.projection.kind
         self._max_distance = (
-            options.max_bit_fraction * bits if database.has_bits else options.max_projected_distance
+            kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
+            if database.has_descriptors
+            else options.max_projected_distance
         )
         self._index = InvertedMultiIndex(
             database.descriptors,
             seed=options.seed,
             cells_per_query=options.num_words_for_nn_search,
-            rank_by_bits=database.has_bits,
+            rank_by_bits=database.has_descriptors,
             max_distance=self._max_distance,
         )
 
     @property
     def max_distance(self) -> float:
-        """Largest distance of descriptors of a match: bits, or squared in the projected space."""
+        """Largest difference of descriptors of a match, or squared distance in the projected space."""
         return self._max_distance
 
     def described(self, descriptors: NDArray[np.uint8]) -> DescriptorSet:
         """Return descriptors (N, bytes) in the form in which the map has them."""
         count = len(descriptors)
         raw = np.ascontiguousarray(descriptors)
-        words = self._map.descriptors.words.shape[1]
+        projection, words = self._map.projection, np.zeros((count, 0), dtype=np.uint64)
         return DescriptorSet(
-            projected=self._map.projection.project(raw),
-            words=pack_words(raw) if words else np.zeros((count, 0), dtype=np.uint64),
+            projected=projection.project(raw),
+            words=projection.kind.comparable(raw) if self._map.has_descriptors else words,
             label=np.full(count, -1, dtype=np.int64),
             session=np.full(count, -1, dtype=np.int32),
             time_ns=np.zeros(count, dtype=np.int64),

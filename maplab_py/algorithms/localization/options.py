@@ -23,6 +23,11 @@ class LocalizationOptions:
         0.26,
         help="Largest fraction of descriptor bits in which a match may differ; full maps only.",
     )
+    max_descriptor_distance: float = option(
+        0.45,
+        help="Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit "
+        "length; full maps only.",
+    )
     max_projected_distance: float = option(
         40.0, help="Largest squared distance of projected descriptors of a match; summary maps."
     )
@@ -56,6 +61,11 @@ class LocalizationOptions:
                 raise FlagError(f"--localization_{name} must be at least 1")
         if self.min_inlier_count < 3:
             raise FlagError("--localization_min_inlier_count must be at least 3")
-        for name in ("ransac_pixel_sigma", "max_position_sigma_m", "max_projected_distance"):
+        for name in (
+            "ransac_pixel_sigma",
+            "max_position_sigma_m",
+            "max_projected_distance",
+            "max_descriptor_distance",
+        ):
             if getattr(self, name) <= 0.0:
                 raise FlagError(f"--localization_{name} must be positive")

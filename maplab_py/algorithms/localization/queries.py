@@ -32,7 +32,9 @@ def query_vertices(vi_map: VIMap, missions: I64, projection: DescriptorProjectio
     Raises:
         EstimationError: The map has no descriptors, or others than the projection takes.
     """
-    features, _ = map_features(vi_map, missions, projection=projection)
+    features, _ = map_features(
+        vi_map, missions, projection=projection, feature_type=projection.kind.feature_type
+    )
     counts = np.bincount(features.vertex, minlength=len(vi_map.vertices))
     chosen = np.isin(vi_map.vertices.mission, missions)
     return QueryVertices(vi_map, features, starts_of_counts(counts), np.flatnonzero(chosen))
@@ -46,7 +48,7 @@ def queries(source: QueryVertices, sequence_length: int = 1) -> Iterator[Query]:
     """
     vi_map = source.vi_map
     first_of_mission = vi_map.vertex_start[vi_map.vertices.mission]
-    size = source.features.descriptor_bits // 8
+    size = source.features.kind.size
     for vertex in source.vertex.tolist():
         first = max(vertex - sequence_length + 1, int(first_of_mission[vertex]))
         rows = np.arange(source.start[first], source.start[vertex + 1])

@@ -32,7 +32,7 @@ class Matches:
 
     query: I64  # (M,) sorted
     database: I64  # (M,)
-    bits: I32  # (M,) different bits
+    bits: I32  # (M,) different bits, or squared distance of descriptors that are not binary
 
     def __len__(self) -> int:
         return len(self.query)

@@ -72,9 +72,7 @@ def detect(
     given = None
     if options.projection_matrix_filename:
         given = load_projection(Path(options.projection_matrix_filename))
-    features, used = map_features(
-        vi_map, missions, projection=given, dimensions=options.target_dimensionality
-    )
+    features, used = _features(vi_map, missions, options, given)
     # the queries' missions are always searched: they reveal ambiguous places
     rule = MatchRule(round(options.min_image_time_seconds * 1e9))
     progress.step(1, 4, "descriptor matches")
@@ -121,14 +119,27 @@ def detect(
     )
 
 
+def _features(
+    vi_map: VIMap, missions: I64, options: LoopClosureOptions, given: DescriptorProjection | None
+) -> tuple[MapFeatures, DescriptorProjection]:
+    return map_features(
+        vi_map,
+        missions,
+        projection=given,
+        dimensions=options.target_dimensionality,
+        feature_type=options.type_number,
+        sizes=options.sizes,
+    )
+
+
 def _notes(
     options: LoopClosureOptions, given: DescriptorProjection | None, used: DescriptorProjection
 ) -> tuple[str, ...]:
     if given is None or given is used:
         return ()
     return (
-        f"{options.projection_matrix_filename} is for descriptors of {given.descriptor_size} "
-        f"bytes, the map has {used.descriptor_size}: learned a projection from the map",
+        f"{options.projection_matrix_filename} is for descriptors {given.kind.words}, the map has "
+        f"{used.kind.words}: learned a projection from the map",
     )
 
 

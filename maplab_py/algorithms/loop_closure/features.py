@@ -13,9 +13,15 @@ from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
 from maplab_py.memory import require_memory
 from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.descriptors import other_types
+from maplab_py.vimap.descriptors import (
+    DescriptorDepth,
+    FeatureType,
+    sizes_of_type,
+    type_name,
+    types_of,
+)
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vision.descriptors import pack_words
+from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_projection
 
@@ -25,7 +31,7 @@ _BYTES_PER_KEYPOINT = 300
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapFeatures:
-    """Keypoints with binary descriptors, ready to be matched; one row each."""
+    """Keypoints with descriptors of one kind, ready to be matched; one row each."""
 
     keypoint: I64  # (N,) keypoint rows of the map
     vertex: I64  # (N,)
@@ -34,7 +40,7 @@ class MapFeatures:
     origin_I: F64  # (N, 3) camera centre in the body frame [m]
     ray_I: F64  # (N, 3) unit rays in the body frame
     rad_per_px: F64  # (N,) angle that a pixel covers there
-    descriptor_bits: int
+    kind: DescriptorKind
 
     def __len__(self) -> int:
         return len(self.keypoint)
@@ -46,34 +52,33 @@ def map_features(
     *,
     projection: DescriptorProjection | None = None,
     dimensions: int = DIMENSIONS,
+    feature_type: int = FeatureType.BINARY,
+    sizes: tuple[int, ...] = (),
 ) -> tuple[MapFeatures, DescriptorProjection]:
     """Collect the features of some missions; learn the projection from their tracks unless given.
 
-    A projection for descriptors of another length is learned again, too.
+    A projection for descriptors of another kind is learned again, too.
 
-    Only binary descriptors of the most frequent length are used. Features of good landmarks that
-    two or more keypoints observe form the database.
+    Only descriptors of one type and of the most frequent length are used. Features of good landmarks
+    that two or more keypoints observe form the database.
+
+    Args:
+        vi_map: The map.
+        missions: Mission rows.
+        projection: Projection of descriptors.
+        dimensions: Dimensions of a projection that is learned.
+        feature_type: Type of the descriptors.
+        sizes: Lengths [bytes] that they may have; empty = any.
 
     Raises:
-        EstimationError: There are no binary descriptors, all of a mission have another length than
+        EstimationError: There are no such descriptors, all of a mission have another length than
             the most frequent one, or there are too few tracks to learn from.
     """
     frames = vi_map.frames
     wanted = np.isin(vi_map.vertices.mission[frames.vertex], missions) & frames.is_valid
-    sizes = np.where(wanted[vi_map.keypoint_frame], vi_map.binary_descriptor_size, 0)
-    by_size = np.bincount(sizes, minlength=1)
-    by_size[0] = 0
-    size = int(np.argmax(by_size))
-    if size == 0:
-        others = other_types(frames)
-        raise EstimationError(
-            f"the map has no binary descriptors, only {others}: places are recognised by binary "
-            "descriptors alone"
-            if others
-            else "the map has no descriptors: places cannot be recognised"
-        )
-    _check_missions_match(vi_map, sizes, size)
-    keypoint = np.flatnonzero(sizes == size)
+    kind, of_kind = most_frequent_kind(vi_map, wanted, feature_type, sizes)
+    size = kind.size
+    keypoint = np.flatnonzero(of_kind)
     require_memory(
         float(len(keypoint)) * (_BYTES_PER_KEYPOINT + 2 * size), "reading the descriptors"
     )
@@ -81,12 +86,12 @@ def map_features(
     keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
-    if projection is None or projection.descriptor_size != size:
-        projection = learn_projection(raw, landmark, dimensions=dimensions)
+    if projection is None or projection.kind != kind:
+        projection = learn_projection(raw, landmark, kind=kind, dimensions=dimensions)
     vertex = vi_map.keypoint_vertex[keypoint].astype(np.int64)
     descriptors = DescriptorSet(
         projected=projection.project(raw),
-        words=pack_words(raw),
+        words=kind.comparable(raw),
         label=landmark,
         session=np.ascontiguousarray(vi_map.vertices.mission[vertex]),
         time_ns=np.ascontiguousarray(vi_map.vertices.timestamp_ns[vertex]),
@@ -99,13 +104,75 @@ def map_features(
         origin_I=origin,
         ray_I=ray,
         rad_per_px=rad_per_px[seen],
-        descriptor_bits=8 * size,
+        kind=kind,
     )
     return features, projection
 
 
+def most_frequent_kind(
+    vi_map: VIMap,
+    wanted: Mask,
+    feature_type: int,
+    sizes: tuple[int, ...] = (),
+    *,
+    flag: str = "--lc_feature_type",
+) -> tuple[DescriptorKind, Mask]:
+    """Return the most frequent kind of descriptors of a type, and which keypoints (K,) have it.
+
+    Args:
+        vi_map: The map.
+        wanted: Frames (F,) to look at.
+        feature_type: Type of the descriptors.
+        sizes: Lengths [bytes] that they may have; empty = any.
+        flag: What chooses the type, for the message.
+
+    Raises:
+        EstimationError: There are none, or all of a mission have another length.
+    """
+    depths = [DescriptorDepth.UINT8, DescriptorDepth.FLOAT32]
+    if feature_type == FeatureType.BINARY:
+        depths.pop()
+    best: tuple[int, DescriptorKind, I32] | None = None
+    for depth in depths:
+        of_depth = sizes_of_type(vi_map.frames, feature_type, depth)
+        allowed = wanted[vi_map.keypoint_frame]
+        if sizes:
+            allowed &= np.isin(of_depth, sizes)
+        of_depth = np.where(allowed, of_depth, 0)
+        by_size = np.bincount(of_depth, minlength=1)
+        by_size[0] = 0
+        size = int(np.argmax(by_size))
+        if size and (best is None or by_size[size] > best[0]):
+            best = int(by_size[size]), DescriptorKind(size, feature_type, depth), of_depth
+    if best is None:
+        raise EstimationError(_no_descriptors(vi_map, feature_type, sizes, flag))
+    _, kind, of_depth = best
+    _check_missions_match(vi_map, of_depth, kind.size)
+    return kind, of_depth == kind.size
+
+
+def _no_descriptors(vi_map: VIMap, feature_type: int, sizes: tuple[int, ...], flag: str) -> str:
+    """Return why a map has no descriptors of a type, and the remedy."""
+    name = type_name(feature_type)
+    others = sorted(types_of(vi_map.frames) - {feature_type})
+    if sizes and feature_type in types_of(vi_map.frames):
+        wanted = " or ".join(str(size) for size in sizes)
+        return (
+            f"the map has no {name} descriptors of {wanted} bytes, as the flag "
+            f"{'--feature_type' if flag == '--feature_type' else '--feature_descriptor_type'} asks for"
+        )
+    if others:
+        names = ", ".join(type_name(other) for other in others)
+        remedy = f"{flag}={type_name(others[0])} takes those"
+        return f"the map has no {name} descriptors, only {names}: {remedy}, extract_features makes others"
+    return (
+        "the map has no descriptors: places cannot be recognised; extract_features makes some from "
+        "images"
+    )
+
+
 def _check_missions_match(vi_map: VIMap, sizes: I32, size: int) -> None:
-    """Check that every mission with binary descriptors, sizes (K,) [bytes], has some of a size."""
+    """Check that every mission with descriptors of a type, sizes (K,) [bytes], has some of a size."""
     mission = vi_map.vertices.mission[vi_map.keypoint_vertex]
     count = len(vi_map.missions)
     described = np.bincount(mission[sizes > 0], minlength=count)
@@ -123,15 +190,22 @@ def _check_missions_match(vi_map: VIMap, sizes: I32, size: int) -> None:
 
 
 def train_projection(
-    vi_map: VIMap, missions: I64 | None, dimensions: int
+    vi_map: VIMap,
+    missions: I64 | None,
+    dimensions: int,
+    *,
+    feature_type: int = FeatureType.BINARY,
+    sizes: tuple[int, ...] = (),
 ) -> tuple[DescriptorProjection, TrainingReport]:
     """Learn a projection from the tracks of some missions (rows; None = all).
 
     Raises:
-        EstimationError: There are no binary descriptors, or too few tracks to learn from.
+        EstimationError: There are no such descriptors, or too few tracks to learn from.
     """
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
-    features, projection = map_features(vi_map, rows, dimensions=dimensions)
+    features, projection = map_features(
+        vi_map, rows, dimensions=dimensions, feature_type=feature_type, sizes=sizes
+    )
     d = features.descriptors
     order = np.argsort(d.label, kind="stable")
     order = order[d.label[order] >= 0]

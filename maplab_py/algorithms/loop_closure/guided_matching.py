@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.landmarks.covariance import landmark_covariance
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.closure_table import Closures
-from maplab_py.algorithms.loop_closure.features import findable_landmarks, points_in_mission
+from maplab_py.algorithms.loop_closure.features import (
+    findable_landmarks,
+    most_frequent_kind,
+    points_in_mission,
+)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-from maplab_py.vision.descriptors import hamming, pack_words
+from maplab_py.vision.descriptors import differences
 from maplab_py.vision.rays_and_points import Rays, points_near_rays
 
 _RADIUS_PX = 12.0
@@ -31,6 +35,8 @@ _MAX_SIGMAS, _BIT_FACTOR = 2.0, 0.75
 _MIN_SHARED_LANDMARKS = 5
 """Vertices that share as many landmarks with the place's vertex belong to the place."""
 _CLOSURES_AT_ONCE = 256
+_NOT_COMPARABLE = np.iinfo(np.int32).max
+"""Difference of descriptors of different kinds."""
 _DESCRIPTORS = 16
 """Observations of a landmark whose descriptors are compared."""
 
@@ -42,7 +48,7 @@ class LandmarkMatches:
     closure: I64  # row of `Closures`
     keypoint: I64
     landmark: I64
-    bits: NDArray[np.int32]  # different bits
+    bits: NDArray[np.int32]  # different bits, or squared distance of other descriptors
 
     def take(self, rows: I64 | Mask) -> LandmarkMatches:
         """Return the matches of a mask or rows."""
@@ -57,7 +63,7 @@ def guided_matches(
 
     Of each query vertex the usable closure with most inliers counts. A match lies within two deviations
     of keypoint, landmark and pose, its descriptors differ in at most three quarters of
-    `max_bit_fraction`, and no other keypoint of the image or landmark is more similar.
+    what a match may differ in, and no other keypoint of the image or landmark is more similar.
 
     Args:
         vi_map: The map, whose landmarks have a quality.
@@ -95,12 +101,15 @@ class _Search:
         findable = np.flatnonzero(self._findable)
         self._covariance_G = np.zeros((len(vi_map.landmarks), 3, 3))
         self._covariance_G[findable] = landmark_covariance(vi_map, findable, self._sigma_px)
-        sizes = vi_map.binary_descriptor_size
-        self._bytes = int(sizes.max(initial=0))
-        self._described = (sizes == self._bytes) & (self._bytes > 0)
-        self._words = pack_words(
-            np.ascontiguousarray(vi_map.keypoints.descriptor[:, : self._bytes])
+        ends = np.concatenate([closures.query_vertex, closures.place_vertex])
+        missions = np.unique(vi_map.vertices.mission[ends])
+        wanted = np.isin(vi_map.vertices.mission[vi_map.frames.vertex], missions)
+        kind, self._described = most_frequent_kind(
+            vi_map, wanted, options.type_number, options.sizes
         )
+        raw = np.ascontiguousarray(vi_map.keypoints.descriptor[:, : kind.size])
+        self._words = kind.comparable(raw)
+        self._largest = kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
 
     def matches(self, rows: I64) -> LandmarkMatches:
         """Return the matches of some closures (rows)."""
@@ -181,13 +190,12 @@ class _Search:
         number = np.arange(len(owner)) - np.repeat(np.cumsum(compared) - compared, compared)
         step = number * count[owner] // np.maximum(compared[owner], 1)
         other = vi_map.observations[vi_map.observation_start[near.landmark[owner]] + step]
-        bits = hamming(self._words, near.keypoint[owner], self._words, other)
-        bits[~self._described[other]] = 8 * self._bytes
-        fewest = np.full(len(near.keypoint), 8 * self._bytes, dtype=np.int32)
+        bits = differences(self._words, near.keypoint[owner], self._words, other)
+        bits[~self._described[other]] = _NOT_COMPARABLE
+        fewest = np.full(len(near.keypoint), _NOT_COMPARABLE, dtype=np.int32)
         np.minimum.at(fewest, owner, bits)
         near = dataclasses.replace(near, bits=fewest)
-        limit = _BIT_FACTOR * self._options.max_bit_fraction * 8 * self._bytes
-        near = near.take(fewest <= limit)
+        near = near.take(fewest <= _BIT_FACTOR * self._largest)
         near = near.take(_first(near.bits, near.closure, near.keypoint))
         frame = vi_map.keypoint_frame[near.keypoint].astype(np.int64)
         return near.take(

@@ -15,7 +15,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.search_memory import nearest_rows
 from maplab_py.array_types import I64
-from maplab_py.vision.descriptors import hamming
+from maplab_py.vision.descriptors import differences
 from maplab_py.vision.index import MatchRule
 
 _NEIGHBOURS = 3
@@ -43,9 +43,10 @@ def match_features(
         query, matched = _in_chosen_missions(features, options, rule, database)
     else:
         query, matched = _in_all_missions(features, options, rule, apart, queries, database)
-    bits = hamming(d.words, query, d.words, matched)
+    bits = differences(d.words, query, d.words, matched)
     matches = Matches(query, matched, bits)
-    return matches.take(bits <= options.max_bit_fraction * features.descriptor_bits), landmarks
+    largest = features.kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
+    return matches.take(bits <= largest), landmarks
 
 
 def _in_all_missions(

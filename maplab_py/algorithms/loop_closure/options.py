@@ -5,14 +5,55 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
+from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.vimap.descriptors import FeatureType, type_of_name
+
+_BYTES_OF_DESCRIPTORS = {"": (), "brisk": (48, 64), "freak": (64,), "orb": (32,), "akaze": (61,)}
+"""Lengths of binary descriptors: of BRISK, C++ maplab's and OpenCV's."""
 
 
 @dataclasses.dataclass(frozen=True)
-class LoopClosureOptions:
-    """Recognition, verification and use of places. maplab's names where it has the option."""
+class FeatureTypeOptions:
+    """The descriptors by which places are recognised."""
 
     flag_prefix: ClassVar[str] = "lc_"
+
+    feature_type: str = option(
+        "Binary",
+        help="Features that are matched: Binary by different bits, SuperPoint, R2D2, SIFT, "
+        "LIDARSuperPoint or another type by its number by distance; types never match each other",
+    )
+    feature_descriptor_type: str = option(
+        "",
+        help="Binary descriptors to match, by their length: brisk (48 or 64 bytes), freak (64), orb "
+        "(32) or akaze (61); empty = those of the most frequent length",
+        choices=tuple(_BYTES_OF_DESCRIPTORS),
+        flag="feature_descriptor_type",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the type."""
+        try:
+            type_of_name(self.feature_type)
+        except FlagError as error:
+            raise FlagError(f"--lc_feature_type: {error}") from None
+
+    @property
+    def type_number(self) -> int:
+        """Return the feature type's number."""
+        return type_of_name(self.feature_type)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Return the lengths [bytes] that descriptors may have; empty = any."""
+        is_binary = self.type_number == FeatureType.BINARY
+        return _BYTES_OF_DESCRIPTORS[self.feature_descriptor_type] if is_binary else ()
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopClosureOptions(FeatureTypeOptions):
+    """Recognition, verification and use of places. maplab's names where it has the option."""
 
     detector_engine: str = option(
         "imi",
@@ -39,6 +80,10 @@ class LoopClosureOptions:
     )
     max_bit_fraction: float = option(
         0.26, help="Largest fraction of descriptor bits in which a match may differ"
+    )
+    max_descriptor_distance: float = option(
+        0.45,
+        help="Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length",
     )
     fraction_best_scores: float = option(
         0.25,

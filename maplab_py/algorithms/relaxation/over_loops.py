@@ -13,6 +13,7 @@ from maplab_py.algorithms.relaxation.relaxation import relax_graph
 from maplab_py.array_types import I64
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import type_name, types_of
 from maplab_py.vimap.ids import IdIndex
 
 
@@ -32,9 +33,11 @@ def relax_over_loops(
     Raises:
         EstimationError: Nothing to recognise places by, or the pose graph has no usable solution.
     """
-    if not vi_map.binary_descriptor_size.any() and len(vi_map.loop_closure_edges):
+    wanted = loop_options.type_number
+    if wanted not in types_of(vi_map.frames) and len(vi_map.loop_closure_edges):
         relaxed = relax_graph(vi_map, options, missions=missions, progress=progress)
-        note = "the map has no binary descriptors: only its own loop closure edges count"
+        name = type_name(wanted)
+        note = f"the map has no {name} descriptors: only its own loop closure edges count"
         return relaxed.vi_map, LoopClosureReport(notes=(note,)), relaxed.report
     search, search_report = search_loops(vi_map, loop_options, missions=missions, progress=progress)
     new = IdIndex(vi_map.loop_closure_edges.id).rows(search.edges.id) < 0

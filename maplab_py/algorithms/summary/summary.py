@@ -16,6 +16,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import FeatureType, type_name
 from maplab_py.vision.projection import DescriptorProjection
 
 _FLAT_DIRECTION_SIGMA_M = 10.0
@@ -29,6 +30,8 @@ def make_summary_map(
     options: SummaryMapOptions,
     *,
     projection: DescriptorProjection | None = None,
+    feature_type: int = FeatureType.BINARY,
+    sizes: tuple[int, ...] = (),
     progress: Progress = SILENT,
 ) -> SummaryMap:
     """Reduce a map to its good landmarks in G.
@@ -39,17 +42,23 @@ def make_summary_map(
         vi_map: The map; its base frames must be known.
         options: Content of the summary map.
         projection: Projection of the descriptors; by default learned from the map's tracks.
+        feature_type: Type of the descriptors.
+        sizes: Lengths [bytes] that they may have; empty = any.
         progress: Progress.
 
     Raises:
-        EstimationError: No good landmark has binary descriptors, or too few tracks to learn from.
+        EstimationError: No good landmark has descriptors of the type, or too few tracks to learn from.
     """
     judged, _ = evaluate_unknown_quality(vi_map, progress)
     missions = np.arange(len(judged.missions))
-    features, projection = map_features(judged, missions, projection=projection)
+    features, projection = map_features(
+        judged, missions, projection=projection, feature_type=feature_type, sizes=sizes
+    )
     rows = features_of_good_landmarks(judged, features)
     if len(rows) == 0:
-        raise EstimationError("no good landmark has binary descriptors: run rtl")
+        raise EstimationError(
+            f"no good landmark has {type_name(feature_type)} descriptors: run rtl"
+        )
     rows = rows[np.argsort(features.descriptors.label[rows], kind="stable")]
     if options.max_observations_per_landmark:
         rows = _spread(rows, features, options.max_observations_per_landmark)
@@ -75,6 +84,7 @@ def make_summary_map(
         landmark_covariance=covariance,
         projection=projection.matrix,
         sensors=judged.sensors,
+        descriptor_kind=None if features.kind.is_binary else features.kind,
     )
     return rounded(summary, options)
 

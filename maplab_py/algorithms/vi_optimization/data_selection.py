@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.vi_optimization.options import DataOptions, RobustnessOptions
 from maplab_py.algorithms.vi_optimization.thinning import LeftOut, thinned
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import Observations
@@ -18,6 +18,7 @@ from maplab_py.geometry import so3
 from maplab_py.geometry.triangulation import triangulate
 from maplab_py.report import counted
 from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.descriptors import type_name, type_of_name
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.scale_marks import is_metric
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
@@ -52,6 +53,8 @@ def select(vi_map: VIMap, options: DataOptions, missions: NDArray[np.integer] | 
     wanted = is_in[vi_map.landmarks.vertex]
     if options.use_only_good_landmarks:
         wanted = wanted & (vi_map.landmarks.quality != LandmarkQuality.BAD)
+    if options.feature_type and options.include_visual:
+        wanted = wanted & _of_type(vi_map, type_of_name(options.feature_type))
     keypoints = vi_map.observations if options.include_visual else np.zeros(0, dtype=np.int64)
     keypoints = keypoints[wanted[vi_map.keypoints.landmark[keypoints]]]
     keypoints = keypoints[is_in[vi_map.keypoint_vertex[keypoints]]]
@@ -61,6 +64,23 @@ def select(vi_map: VIMap, options: DataOptions, missions: NDArray[np.integer] | 
     keypoints, left_out = thinned(vi_map, keypoints[rich[frame]], options)
     landmarks = np.unique(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
     return Selection(vertices, landmarks, row_of_vertex, keypoints, left_out)
+
+
+def _of_type(vi_map: VIMap, feature_type: int) -> Mask:
+    """Return which landmarks (L,) have a feature type.
+
+    Raises:
+        UserError: None has it.
+    """
+    of_type = vi_map.landmarks.feature_type == feature_type
+    if not of_type.any():
+        types = np.unique(vi_map.landmarks.feature_type).tolist()
+        names = ", ".join(type_name(other) for other in types)
+        raise UserError(
+            f"--ba_feature_type={type_name(feature_type)}: the map has no landmarks of that type"
+            + (f", only of {names}" if names else "")
+        )
+    return np.asarray(of_type)
 
 
 def check_finite(vi_map: VIMap, selection: Selection, options: DataOptions) -> None:

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.vimap.descriptors import type_of_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +29,11 @@ class DataOptions:
         False, help="Use the absolute pose measurements; they then fix position and heading."
     )
     residuals: str = option("", help="Residuals of plugins to use as well, separated by commas.")
+    feature_type: str = option(
+        "",
+        help="Use landmarks of this feature type only: Binary, SuperPoint, R2D2, SIFT, LIDARSuperPoint or a "
+        "number; empty = all types.",
+    )
     min_landmarks_per_frame: int = option(
         0, help="Leave out the observations of images that see fewer landmarks."
     )
@@ -56,7 +62,12 @@ class DataOptions:
     altitude_meters: float = option(0.0, help="Altitude that goes with --ba_latitude.", unit="m")
 
     def __post_init__(self) -> None:
-        """Check the limits of thinning."""
+        """Check the limits of thinning and the feature type."""
+        if self.feature_type:
+            try:
+                type_of_name(self.feature_type)
+            except FlagError as error:
+                raise FlagError(f"--ba_feature_type: {error}") from None
         for name in ("max_observations_per_landmark", "max_covisible_frames"):
             if getattr(self, name) < 0:
                 raise FlagError(f"--ba_{name} must not be negative; 0 = all")

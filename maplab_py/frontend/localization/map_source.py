@@ -23,6 +23,7 @@ from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.storage.native import is_map_folder, load_map
 from maplab_py.storage.summary_map import SummaryMap, read_summary_map, summary_map_file
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import type_name
 
 _FLAG = "--vio_localization_map_folder"
 _SMALLEST_SIGMA_M = 1e-3
@@ -96,7 +97,13 @@ def check_descriptors(searched: SearchedMap, size: int) -> None:
     Raises:
         UserError: The map has descriptors of another size.
     """
-    wanted = searched.database.projection.descriptor_size
+    kind = searched.database.projection.kind
+    wanted = kind.size
+    if not kind.is_binary:
+        raise UserError(
+            f"{searched.name}: its descriptors are {type_name(kind.feature_type)}, those of recordings are "
+            "Binary: choose a map with Binary descriptors"
+        )
     if size != wanted:
         raise UserError(
             f"{searched.name}: its descriptors have {wanted} bytes, those of the recording {size}: "

@@ -117,6 +117,15 @@ def read_binary(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, rigs, frames, images, points)
 
 
+def read_binary_cameras(path: Path) -> tuple[ColmapCamera, ...]:
+    """Read cameras.bin.
+
+    Raises:
+        MapError: It is missing, damaged, or cut.
+    """
+    return _cameras(_Cursor(path))
+
+
 def _cameras(file: _Cursor) -> tuple[ColmapCamera, ...]:
     cameras = []
     for _ in range(file.count(24)):

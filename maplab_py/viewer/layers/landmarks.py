@@ -13,6 +13,7 @@ from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
 from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.descriptors import type_of_name
 from maplab_py.vimap.queries import observation_counts, observer_counts
 
 
@@ -69,7 +70,7 @@ def _selection_steps(drawing: Drawing) -> list[tuple[NDArray[np.bool_], str]]:
         keep = observer_mission_counts(vi_map) >= wanted
         steps.append((keep, "by --vis_landmarks_min_number_of_observer_missions"))
     if options.show_only_landmark_type:
-        keep = vi_map.landmarks.feature_type == int(options.show_only_landmark_type)
+        keep = vi_map.landmarks.feature_type == type_of_name(options.show_only_landmark_type)
         steps.append((keep, "by --vis_show_only_landmark_type"))
     return steps
 

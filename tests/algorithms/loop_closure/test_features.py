@@ -46,4 +46,4 @@ def test_missions_with_descriptors_of_different_sizes_are_not_mixed():
     with pytest.raises(EstimationError, match="has descriptors of 40 bytes, others have 48"):
         map_features(mixed, np.arange(2))
     for mission_row, bits in ((0, 384), (1, 320)):
-        assert map_features(mixed, np.array([mission_row]))[0].descriptor_bits == bits
+        assert map_features(mixed, np.array([mission_row]))[0].kind.dimensions == bits

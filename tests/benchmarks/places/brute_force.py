@@ -63,7 +63,7 @@ def search(
     """
     judged, _ = evaluate_unknown_quality(vi_map)
     features, _ = map_features(judged, np.arange(len(judged.missions)))
-    raw = judged.keypoints.descriptor[features.keypoint, : features.descriptor_bits // 8]
+    raw = judged.keypoints.descriptor[features.keypoint, : features.kind.size]
     start = np.searchsorted(features.vertex, np.arange(len(judged.vertices) + 1))
     p_G = judged.p_G
     time_s = 1e-9 * judged.vertices.timestamp_ns
@@ -79,7 +79,7 @@ def search(
         apart_s = since_s if later_only else np.abs(since_s)
         for query in queries[apart_s >= min_time_s].tolist():
             mine = np.arange(start[query], start[query + 1])
-            i, j = _mutual(raw[mine], raw[rows], round(MAX_BITS * features.descriptor_bits))
+            i, j = _mutual(raw[mine], raw[rows], round(MAX_BITS * features.kind.dimensions))
             if len(i) < min_inliers:
                 continue
             inliers, T_M_I = _pose(features, mine[i], points[j])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from maplab_py.vision.descriptors import hamming, pack_words
+from maplab_py.vision.descriptors import differences, pack_words
 from maplab_py.vision.features.description import DESCRIPTOR_BYTES, describe
 from tests.vision.features.test_detection import mosaic
 
@@ -16,7 +16,7 @@ def keypoints(count: int = 60) -> np.ndarray:
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     rows = np.arange(len(a))
-    return hamming(pack_words(a), rows, pack_words(b), rows)
+    return differences(pack_words(a), rows, pack_words(b), rows)
 
 
 def test_descriptors_recognise_keypoints_in_a_turned_image() -> None:

@@ -1,0 +1,119 @@
+"""Options of the extraction of features and of their tracks."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+from maplab_py.vimap.descriptors import type_of_name
+from maplab_py.vision.features.extension import plugin_extractor
+from maplab_py.vision.features.extractors import KINDS
+
+PLUGIN = "plugin:"
+"""Beginning of the names of extractors that plugins have."""
+_MAX_FEATURES = 100_000
+
+
+@dataclasses.dataclass(frozen=True)
+class ExtractionOptions:
+    """What is extracted from images."""
+
+    flag_prefix: ClassVar[str] = ""
+
+    feature_type: str = option(
+        "sift",
+        help="Detector and descriptor: sift (SIFT, 128 bytes), orb (Binary, 32 bytes), brisk (Binary, 64), "
+        "akaze (Binary, 61), or plugin:NAME, a feature extractor of a plugin",
+    )
+    feature_model: str = option(
+        "", help="File of a plugin's extractor, such as a network in the ONNX format"
+    )
+    max_features: int = option(1000, help="Largest number of keypoints of an image")
+    feature_sigma_px: float = option(0.8, help="Standard deviation of the new keypoints", unit="px")
+    replace: bool = option(
+        False,
+        help="Replace the keypoints of frames that have such features, or keypoints without descriptors, "
+        "with their observations; else those frames stay as they are",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.feature_type not in KINDS and not self.feature_type.startswith(PLUGIN):
+            raise FlagError(
+                f"--feature_type={self.feature_type}: wants {', '.join(KINDS)} or {PLUGIN}NAME"
+            )
+        if not 1 <= self.max_features <= _MAX_FEATURES:
+            raise FlagError(f"--max_features={self.max_features}: wants a number from 1 to 100000")
+        if not 0.0 < self.feature_sigma_px <= 100.0:
+            raise FlagError(
+                f"--feature_sigma_px={self.feature_sigma_px:g}: wants a positive number up to 100"
+            )
+        if self.feature_model and not self.feature_type.startswith(PLUGIN):
+            raise FlagError(
+                f"--feature_model: {self.feature_type} takes no file, only {PLUGIN}NAME"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureTrackOptions:
+    """How keypoints of neighbouring frames are linked."""
+
+    flag_prefix: ClassVar[str] = "track_"
+
+    feature_type: str = option(
+        "sift",
+        help="Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, plugin:NAME) or by "
+        "their type (Binary, SuperPoint, R2D2, SIFT or a number)",
+        flag="feature_type",
+    )
+    neighbors: int = option(2, help="Following frames of the camera that a frame is matched with")
+    epipolar_gate_px: float = option(
+        4.0,
+        help="Largest distance of a keypoint from the epipolar line that the map's poses predict",
+        unit="px",
+    )
+    min_depth_m: float = option(
+        0.3, help="Smallest distance of a point, which limits its parallax", unit="m"
+    )
+    max_ratio: float = option(
+        0.9, help="Largest ratio of the differences of the best and the second best match"
+    )
+    max_bit_fraction: float = option(
+        0.25, help="Largest fraction of bits in which matched Binary descriptors differ"
+    )
+    max_descriptor_distance: float = option(
+        0.45, help="Largest distance of other matched descriptors, scaled to unit length"
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 1 <= self.neighbors <= 100:
+            raise FlagError(f"--track_neighbors={self.neighbors}: wants a number from 1 to 100")
+        for name in (
+            "epipolar_gate_px",
+            "min_depth_m",
+            "max_bit_fraction",
+            "max_descriptor_distance",
+        ):
+            if not getattr(self, name) > 0.0:
+                raise FlagError(f"--track_{name} must be positive")
+        if not 0.0 < self.max_ratio <= 1.0:
+            raise FlagError(f"--track_max_ratio={self.max_ratio:g}: wants a number from 0 to 1")
+
+    def wanted(self) -> tuple[int, tuple[int, ...]]:
+        """Return the feature type and the sizes [bytes] of the descriptors, empty = any.
+
+        Raises:
+            UserError: There is no such type or plugin.
+        """
+        if self.feature_type in KINDS:
+            kind = KINDS[self.feature_type]
+            return kind.feature_type, (kind.size,)
+        if self.feature_type.startswith(PLUGIN):
+            return plugin_extractor(self.feature_type.removeprefix(PLUGIN)).feature_type, ()
+        try:
+            return type_of_name(self.feature_type), ()
+        except FlagError as error:
+            raise FlagError(f"--feature_type: {error}") from None

@@ -1,0 +1,76 @@
+"""Kinds of descriptors: which can be compared with each other, and how.
+
+Binary descriptors are compared by the number of different bits. All others are vectors of numbers,
+scaled to unit length, so that Euclidean distance and cosine order them alike; they are compared as
+signed bytes, whose rounding (0.05 for 256 numbers) lies far below the noise of descriptors.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from maplab_py.array_types import I8, U8, U64
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, type_name
+from maplab_py.vision.descriptors import pack_words
+
+STEPS_PER_UNIT = 254
+"""Steps of a signed byte per unit of length: single numbers up to half the length are kept."""
+
+
+class DescriptorKind(NamedTuple):
+    """Feature type, size and depth of descriptors; only equal kinds match each other."""
+
+    size: int  # bytes of a descriptor
+    feature_type: int = FeatureType.BINARY
+    depth: int = DescriptorDepth.UINT8
+
+    @property
+    def is_binary(self) -> bool:
+        """Return whether descriptors are bit strings."""
+        return self.feature_type == FeatureType.BINARY
+
+    @property
+    def dimensions(self) -> int:
+        """Return the number of bits of a binary descriptor, of numbers of another one."""
+        if self.is_binary:
+            return 8 * self.size
+        return self.size // 4 if self.depth == DescriptorDepth.FLOAT32 else self.size
+
+    @property
+    def words(self) -> str:
+        """Return the kind in words, as in "SIFT of 128 bytes"."""
+        return f"{type_name(self.feature_type)} of {self.size} bytes"
+
+    def steps(self, raw: U8) -> I8:
+        """Return descriptors (N, size) that are not binary as vectors of signed bytes (N, dimensions).
+
+        They have unit length, that is `STEPS_PER_UNIT`. Vectors without a length, or with a number
+        that is not finite, become zero, which is far from all others.
+        """
+        values = np.ascontiguousarray(raw)
+        if self.depth == DescriptorDepth.FLOAT32:
+            values = values.view("<f4")
+        vectors = values.astype(np.float64)
+        largest = np.abs(vectors).max(axis=1, initial=0.0, keepdims=True)
+        usable = np.isfinite(largest) & (largest > 0.0)  # a NaN makes the largest one NaN
+        vectors = np.where(usable, vectors, 0.0) / np.where(usable, largest, 1.0)
+        length = np.sqrt(np.einsum("nd,nd->n", vectors, vectors))[:, None]
+        vectors *= STEPS_PER_UNIT / np.where(length > 0.0, length, 1.0)
+        return np.clip(np.rint(vectors), -127, 127).astype(np.int8)
+
+    def comparable(self, raw: U8) -> U64 | I8:
+        """Return descriptors (N, size) as indices compare them: packed bits, or signed bytes."""
+        return pack_words(raw) if self.is_binary else self.steps(raw)
+
+    def largest(self, bit_fraction: float, distance: float) -> float:
+        """Return the largest difference of a match in the unit that `differences` counts in.
+
+        Args:
+            bit_fraction: Largest share of different bits of binary descriptors.
+            distance: Largest Euclidean distance of others, scaled to unit length.
+        """
+        if self.is_binary:
+            return bit_fraction * 8 * self.size
+        return (distance * STEPS_PER_UNIT) ** 2

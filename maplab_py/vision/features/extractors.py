@@ -1,0 +1,81 @@
+"""Detectors with descriptors of OpenCV, by name: SIFT, ORB, BRISK and AKAZE.
+
+SIFT descriptors (D. Lowe, IJCV 2004) are the square roots of their shares of the sum, 512 units long
+(R. Arandjelovic, A. Zisserman, CVPR 2012), as COLMAP stores them, so that the two match each other.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from maplab_py.array_types import F32, F64, U8
+from maplab_py.vimap.descriptors import FeatureType
+from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.features.extension import ExtractedFeatures
+
+KINDS = {
+    "sift": DescriptorKind(128, FeatureType.SIFT),
+    "orb": DescriptorKind(32),
+    "brisk": DescriptorKind(64),
+    "akaze": DescriptorKind(61),
+}
+"""Descriptors of each extractor."""
+_SIFT_LENGTH = 512.0
+_local = threading.local()
+
+
+def extract(name: str, image: U8, max_features: int) -> ExtractedFeatures:
+    """Return the strongest features of an image, the strongest first; deterministic.
+
+    Threads may call it at the same time.
+
+    Args:
+        name: One of `KINDS`.
+        image: Grey values (H, W).
+        max_features: Largest number of features.
+    """
+    keypoints, descriptors = _detector(name, max_features).detectAndCompute(
+        np.ascontiguousarray(image), None
+    )
+    rows = np.array(
+        [(*point.pt, point.size, point.response, point.angle) for point in keypoints]
+    ).reshape(-1, 5)
+    size = KINDS[name].size
+    if descriptors is None:
+        descriptors = np.zeros((0, size), dtype=np.uint8)
+    elif name == "sift":
+        descriptors = _square_roots(descriptors)
+    # ties are decided by place and direction, not by the order in which threads found them
+    order = np.lexsort((rows[:, 4], rows[:, 0], rows[:, 1], -rows[:, 3]))[:max_features]
+    uv_px: F64 = rows[order, :2]
+    return ExtractedFeatures(uv_px, rows[order, 3], descriptors[order], rows[order, 2])
+
+
+def _square_roots(descriptors: F32) -> U8:
+    """Return SIFT descriptors (N, 128) as bytes of square roots, 512 long."""
+    total = descriptors.sum(axis=1, keepdims=True)
+    roots = np.sqrt(np.maximum(descriptors, 0.0) / np.maximum(total, 1e-9))
+    return np.asarray(np.clip(np.rint(_SIFT_LENGTH * roots), 0, 255), dtype=np.uint8)
+
+
+def _detector(name: str, max_features: int) -> Any:
+    """Return this thread's detector; those of BRISK and AKAZE do not take a number of features."""
+    detectors = _local.__dict__
+    key = f"{name} {max_features}"
+    if key not in detectors:
+        import cv2
+
+        library: Any = cv2
+        if name == "sift":
+            # precise upscaling: else keypoints of the finest octave are off by a quarter pixel
+            detectors[key] = library.SIFT_create(
+                nfeatures=max_features, enable_precise_upscale=True
+            )
+        elif name == "orb":
+            detectors[key] = library.ORB_create(nfeatures=max_features)
+        else:
+            detectors[key] = getattr(library, f"{name.upper()}_create")()
+    return detectors[key]
