@@ -120,7 +120,7 @@ def create_tsdf_from_depth_resource(
         dense_depth_resource_input_type: Number or name of the resource type to fuse: depth maps (8, 9) or
             clouds of cameras (16, 17, 21); empty = the first of 9, 8, 17, 16, 21 that there is.
         update: Do not fuse again: take the depth maps whose poses have changed out of the grid and add
-            them at their present poses.
+            them at their present poses. Voxels and weights stay as they are.
         dense_update_threshold_m: Depth maps that moved by less stay as they are.
         dense_max_memory_gb: Memory that the grid may take; 0 = most of what is available.
         dense_result_mesh_output_file: Also write the mesh: .ply, .obj, .stl or .glb.
@@ -134,12 +134,15 @@ def create_tsdf_from_depth_resource(
         _check_mesh(dense_result_mesh_output_file, overwrite=overwrite)
     rows = missions.rows(context.vi_map)
     folder = context.map_folder or Path()
+    input_type = _depth_type(dense_depth_resource_input_type)
     with memory_limited(dense_max_memory_gb, "--dense_max_memory_gb"):
         if update:
             vi_map, report = update_grids(
                 context.vi_map,
                 folder,
                 rows,
+                options,
+                input_type=input_type,
                 threshold_m=dense_update_threshold_m,
                 progress=context.progress,
             )
@@ -149,7 +152,7 @@ def create_tsdf_from_depth_resource(
                 folder,
                 rows,
                 options,
-                input_type=_depth_type(dense_depth_resource_input_type),
+                input_type=input_type,
                 overwrite=overwrite,
                 progress=context.progress,
             )

@@ -87,6 +87,19 @@ def test_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (tmp_path / "trajectory.csv").is_file()
 
 
+@pytest.mark.slow
+def test_dense_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Session(load_registry()) as session:
+        for _, text in blocks(DOCS / "tutorial_dense.md", "maplab"):
+            for words in split_commands(text):
+                assert session.execute(session.parse(words)).failure == ""
+    for name in ("odometry.ply", "optimised.glb", "distances.ply"):
+        assert (tmp_path / name).stat().st_size > 100_000
+    assert len(list((tmp_path / "dense_room" / "resources" / "voxblox_esdf_map").iterdir())) == 1
+    assert (tmp_path / "dense_colmap" / "stereo" / "patch-match.cfg").is_file()
+
+
 def test_scenario_of_the_simulation_page_is_one() -> None:
     ((_, text),) = blocks(DOCS / "simulation.md", "yaml")
     scenario = parse_scenario(text, "simulation.md")

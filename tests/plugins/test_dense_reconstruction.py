@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from maplab_py.atomic.files import PendingFile
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
@@ -164,6 +166,51 @@ def test_distance_fields_are_refused_before_any_work(session: Session, tmp_path:
     with pytest.raises(FlagError, match="dense_esdf_max_distance_m"):
         session.run("esdf", dense_esdf_max_distance_m=0.0)
     assert session.vi_map is before
+
+
+def test_an_update_keeps_the_voxels(session: Session) -> None:
+    part = {"dense_stereo_debug_reconstruction_end_fraction_of_trajectory": 0.1}
+    session.run("sdr", **part)
+    report: Any = session.run("tsdf", dense_tsdf_voxel_size_m=0.2)
+    assert report.grids[0].voxel_size_m == 0.2
+    before = session.vi_map
+    for flags, message in (
+        (
+            {"dense_tsdf_voxel_size_m": 0.05},
+            "voxel_size_m=0.2, and --update keeps that: leave out 0.05",
+        ),
+        ({"dense_tsdf_weight_depth_power": 2}, "weight_depth_power=4"),
+        ({"dense_depth_resource_input_type": "17"}, "is of raw_depth_maps"),
+    ):
+        with pytest.raises(UserError, match=message) as error:
+            session.run("tsdf", update=True, **flags)
+        assert "\n" not in str(error.value)
+        assert session.vi_map is before
+    for kept in ({}, {"dense_tsdf_voxel_size_m": 0.2}):
+        assert session.run("tsdf", update=True, **kept).as_dict()["grids"][0]["added"] == 0
+
+
+def test_a_full_disk_leaves_the_map_as_it_was(
+    session: Session, room: StereoRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    session.run("import_depth_maps", depth_folder=room.depth())
+    before, files = session.vi_map, sorted(temporary.rglob("*.*"))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PendingFile, "complete", full)
+        for line in ("tsdf", "esdf", "convert_all_depth_maps_to_point_clouds"):
+            with pytest.raises(UserError, match="No space left on device") as error:
+                session.run(line)
+            assert "\n" not in str(error.value)
+            assert session.vi_map is before
+    gc.collect()
+    assert sorted(temporary.rglob("*.*")) == files
 
 
 def test_wrong_values_are_refused(session: Session, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
 
-_BLOCKS_AT_A_TIME = 1024
+_BLOCKS_AT_A_TIME = 128
 _BYTES_PER_BLOCK = 4 * BLOCK_SIDE**3 + 12
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(BLOCK_SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -84,12 +84,12 @@ def distance_field(
         )
     tree = TriangleTree(mesh.p, mesh.faces)
     size_m = grid.settings.voxel_size_m
-    coordinates = _sorted_blocks(grid.coordinates)
+    in_grid = coordinates = _sorted_blocks(grid.coordinates)
     if options.use_clear_sphere:
         around = _blocks_around(cameras, options.clear_sphere_outer_radius, BLOCK_SIDE * size_m)
         coordinates = _sorted_blocks(np.concatenate([coordinates, around]))
     require_memory(len(coordinates) * _BYTES_PER_BLOCK, "the distance field")
-    row = _rows_in(_sorted_blocks(grid.coordinates), coordinates)
+    row = _rows_in(in_grid, coordinates)
     order = np.lexsort(grid.coordinates.T[::-1])
     distance = np.empty((len(coordinates), *(BLOCK_SIDE,) * 3), dtype=np.float32)
     for first in range(0, len(coordinates), _BLOCKS_AT_A_TIME):

@@ -7,9 +7,10 @@ from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
 from maplab_py.algorithms.dense.fusion.options import FusionOptions
 from maplab_py.algorithms.dense.resources import CLOUDS, DEPTH_MAPS
 from maplab_py.array_types import F64, I64
-from maplab_py.errors import UserError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.geometry import se3
 from maplab_py.progress import Progress
+from maplab_py.report import counted
 from maplab_py.storage.resource_types import resource_type
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
@@ -52,6 +53,7 @@ def fuse_views(
 
     Raises:
         MapError: A file is missing, damaged, or of another size than the camera's images.
+        EstimationError: There is no depth in the range of the settings.
         NotEnoughMemory: The grid exceeds the allowed memory.
     """
     grid, count = TsdfGrid(settings), len(resources)
@@ -59,6 +61,12 @@ def fuse_views(
     for done, row in enumerate(resources.tolist()):
         progress.step(done, 2 * count, "making the blocks of the grid")
         grid.allocate(*depth.view(row), matrices[done], with_free_space=with_free_space)
+    if not grid.count:
+        raise EstimationError(
+            f"{counted(count, 'depth map')} without any depth from {settings.min_depth_m:g} m to "
+            f"{settings.max_depth_m:g} m: choose another --dense_tsdf_min_ray_length_m or "
+            "--dense_tsdf_max_ray_length_m"
+        )
     for done, row in enumerate(resources.tolist()):
         progress.step(count + done, 2 * count, "fusing depth")
         grid.integrate(*depth.view(row), matrices[done])

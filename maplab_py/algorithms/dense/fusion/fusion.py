@@ -15,7 +15,7 @@ from maplab_py.algorithms.dense.fusion.depth_inputs import (
     short_id,
 )
 from maplab_py.algorithms.dense.fusion.depth_views import DepthViews
-from maplab_py.algorithms.dense.fusion.grid import TsdfGrid
+from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
 from maplab_py.algorithms.dense.fusion.grid_file import (
     FusedDepth,
     StoredGrid,
@@ -49,6 +49,7 @@ class GridReport:
     depth_maps: int
     added: int
     removed: int
+    voxel_size_m: float
     blocks: int
     megabytes: float
 
@@ -89,6 +90,7 @@ def fuse_depth(
     Raises:
         UserError: There is no depth, or a mission has a grid already.
         MapError: A file is missing, damaged, or of another size than the camera's images.
+        EstimationError: A mission has no depth in the range of the options.
         NotEnoughMemory: A grid exceeds the allowed memory.
     """
     options = options or FusionOptions()
@@ -125,7 +127,9 @@ def update_grids(
     vi_map: VIMap,
     map_folder: Path,
     missions: I64 | None = None,
+    options: FusionOptions | None = None,
     *,
+    input_type: int | None = None,
     threshold_m: float = 0.01,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, FusionReport]:
@@ -137,11 +141,13 @@ def update_grids(
         vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
+        options: What is not at its default must be as in the grids; None = all defaults.
+        input_type: Number of the resource type that must be in the grids; None = any.
         threshold_m: Frames whose points at a distance of 2 m have moved by more are integrated again.
         progress: Is told about every depth map.
 
     Raises:
-        UserError: The missions have no grid.
+        UserError: The missions have no grid, or one of other options.
         MapError: A file is missing or damaged, or a depth map in the grid is not in the map.
     """
     rows = np.array(chosen_missions(vi_map, missions))
@@ -160,9 +166,16 @@ def update_grids(
     for row in grids.tolist():
         owner = int(vi_map.resources.owner[row])
         group = next((group for group in groups if owner in group), [owner])
-        stored = decode_grid(store.load(row), f"grid {to_hex(vi_map.resources.id[row])}")
+        name = f"grid {to_hex(vi_map.resources.id[row])}"
+        stored = decode_grid(store.load(row), name)
+        _check_settings(stored.grid.settings, options or FusionOptions(), name)
         resources = _rows_of(vi_map, stored.fused)
         depth = DepthViews(vi_map, map_folder, int(vi_map.resources.type[resources[0]]))
+        if input_type not in (None, depth.kind):
+            raise UserError(
+                f"{name} is of {resource_type(depth.kind).name}, and --update keeps that: leave out "
+                "--dense_depth_resource_input_type, or fuse again with --overwrite"
+            )
         kinds.add(depth.kind)
         poses = depth.poses(resources, se3.inverse(vi_map.T_G_M[owner]))
         moved = _motion_m(stored.fused.T_M_C, poses) > threshold_m
@@ -181,6 +194,25 @@ def update_grids(
         vi_map = new.attached(kept, np.arange(len(new)), owners, ResourceOwner.MISSION)
     name = ", ".join(resource_type(kind).name for kind in sorted(kinds))
     return vi_map, FusionReport(name, tuple(reports), tuple(notes))
+
+
+def _check_settings(settings: GridSettings, options: FusionOptions, source: str) -> None:
+    """Refuse options that are given and differ from those of a grid."""
+    usual = FusionOptions()
+    for name, value in (
+        ("voxel_size_m", settings.voxel_size_m),
+        ("truncation_distance_m", settings.truncation_m),
+        ("min_ray_length_m", settings.min_depth_m),
+        ("max_ray_length_m", settings.max_depth_m),
+        ("weight_depth_power", settings.depth_power),
+        ("max_weight", settings.max_weight),
+    ):
+        given = getattr(options, name)
+        if given not in (getattr(usual, name), value):
+            raise UserError(
+                f"{source} has --{FusionOptions.flag_prefix}{name}={value:g}, and --update keeps that: "
+                f"leave out {given:g}, or fuse again with --overwrite"
+            )
 
 
 def _follow(
@@ -277,4 +309,6 @@ def _report(
     vi_map: VIMap, group: list[int], grid: TsdfGrid, maps: int, added: int, removed: int
 ) -> GridReport:
     mission_id = to_hex(vi_map.missions.id[group[0]])
-    return GridReport(mission_id, len(group), maps, added, removed, grid.count, grid.nbytes / 1e6)
+    voxel_m = grid.settings.voxel_size_m
+    counts = len(group), maps, added, removed
+    return GridReport(mission_id, *counts, voxel_m, grid.count, grid.nbytes / 1e6)

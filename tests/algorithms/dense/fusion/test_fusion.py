@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
+from maplab_py.algorithms.dense.distance.fields import create_fields
 from maplab_py.algorithms.dense.fusion.fusion import fuse_depth, load_grids, update_grids
 from maplab_py.algorithms.dense.fusion.meshing import map_mesh
 from maplab_py.algorithms.dense.fusion.options import FusionOptions
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, MapError, UserError
+from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.interop.resources.depth_maps import import_depth_maps
 from maplab_py.storage.new_resources import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap
@@ -113,6 +115,9 @@ def test_missions_in_unknown_frames_have_their_own_grids(with_depth: VIMap) -> N
     assert [grid.missions for grid in report.grids] == [1, 1]
     assert "unknown base frames" in report.notes[0]
     assert (apart.resources.owner_kind[resources_of(apart, (18,))] == ResourceOwner.MISSION).all()
+    fields = create_fields(both, Path(), None, fusion=OPTIONS)[1]
+    assert [field.missions for field in fields.fields] == [1, 1]
+    assert "unknown base frames" in fields.notes[0]
     known = both.replace(
         baseframes=both.baseframes.replace(is_known=np.ones(len(both.baseframes), dtype=bool))
     )
@@ -149,3 +154,36 @@ def test_grids_of_other_programs_are_refused(with_depth: VIMap) -> None:
     foreign = new.attached(with_depth, [new.add(18, b"\x0a\x05")], [0], ResourceOwner.MISSION)
     with pytest.raises(MapError, match=r"C\+\+ maplab's are not read"):
         map_mesh(foreign, Path())
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "message"),
+    [
+        (b"".join(encode_ply(PlyCloud(np.ones((9, 3)))))[:-4], MapError, "end early"),
+        (b"hello", MapError, "not a PLY file"),
+        (b"".join(encode_ply(PlyCloud(np.zeros((0, 3))))), EstimationError, "without any depth"),
+        (b"".join(encode_ply(PlyCloud(np.full((9, 3), np.nan)))), EstimationError, "without any"),
+        (
+            b"".join(encode_ply(PlyCloud(np.full((9, 3), 50.0)))),
+            EstimationError,
+            "max_ray_length_m",
+        ),
+    ],
+)
+def test_clouds_without_depth_are_refused_in_one_line(
+    room: StereoRoom, content: bytes, error: type[Exception], message: str
+) -> None:
+    new = NewResources()
+    vi_map = new.attached(room.true_map, [new.add(16, content)], [0])
+    for function in (fuse_depth, create_fields):
+        with pytest.raises(error, match=message) as raised:
+            function(vi_map, Path())
+        assert "\n" not in str(raised.value)
+
+
+def test_depth_maps_of_another_size_are_refused(room: StereoRoom) -> None:
+    new = NewResources()
+    vi_map = new.attached(room.true_map, [new.add_image(np.ones((24, 32), np.uint16), 8)], [0])
+    for function in (fuse_depth, create_fields):
+        with pytest.raises(MapError, match="32 x 24 pixels, the images of its camera 376 x 240"):
+            function(vi_map, Path())
