@@ -27,7 +27,7 @@ from maplab_py.sensors import Distortion, Projection
 from maplab_py.vimap import VIMap
 
 REPROJECTION, INERTIAL = "reprojection", "inertial"
-_CALIBRATING = "calibrating"
+_MOVING = "moving"
 _SHARED: dict[str, tuple[Callable[[], None], Callable[..., Any]]] = {
     "block Cholesky": (block_cholesky.compile_kernels, supernodal.factorise),
     "preintegration": (preintegration.compile_kernels, imu.preintegrate),
@@ -41,7 +41,7 @@ class RigKernels:
     """The kernels for some camera models, with the models in the order of `rig_cameras`."""
 
     models: tuple[CameraModel, ...]
-    calibrating: bool  # the images have a delay
+    moving: bool  # images have a delay, or rows are read one after the other
 
     @classmethod
     def of_map(cls, vi_map: VIMap) -> Self:
@@ -51,23 +51,25 @@ class RigKernels:
             MapError: A mission's rig or IMU is not in sensors.yaml.
         """
         rig = rig_cameras(vi_map, np.arange(len(vi_map.missions), dtype=np.int64))
-        return cls(rig.models, bool(rig.delay_s.any()))
+        return cls(rig.models, rig.is_moving)
 
     @classmethod
     def from_words(cls, words: list[str]) -> Self:
         """Return what `words` described."""
-        pairs = [word.split("-") for word in words if word != _CALIBRATING]
+        pairs = [word.split("-") for word in words if word != _MOVING]
         models = tuple((Projection[p], Distortion[d]) for p, d in pairs)
-        return cls(models, _CALIBRATING in words)
+        return cls(models, _MOVING in words)
 
     @property
     def words(self) -> list[str]:
         """The description as words, for the arguments of another process."""
-        return [f"{p.name}-{d.name}" for p, d in self.models] + [_CALIBRATING] * self.calibrating
+        return [f"{p.name}-{d.name}" for p, d in self.models] + [_MOVING] * self.moving
 
     def jobs(self) -> dict[str, Callable[[], None]]:
         """Return by name what compiles the kernels, in the order in which it is started."""
-        reprojection = partial(visual.compile_kernels, self.models, calibrating=self.calibrating)
+        reprojection = partial(
+            visual.compile_kernels, self.models, calibrating=False, moving=self.moving
+        )
         return {
             REPROJECTION: reprojection,
             INERTIAL: lambda: residual_kernel(INERTIAL, sources.inertial).compile_kernel(),
@@ -79,11 +81,13 @@ class RigKernels:
         if not self.models:
             return ()
         missing = {name for name, (_, kernel) in _SHARED.items() if is_missing_on_disk(kernel)}
-        module = visual_module_name(self.models, calibrating=self.calibrating)
-        if not is_generated(module) or is_missing_on_disk(
-            visual_kernels(self.models, calibrating=self.calibrating).evaluate
-        ):
+        if not is_generated(visual_module_name(self.models)):
             missing.add(REPROJECTION)
+        else:
+            kernels = visual_kernels(self.models)
+            wanted = [kernels.evaluate, *([kernels.pixel_motion] if self.moving else [])]
+            if any(is_missing_on_disk(kernel) for kernel in wanted):
+                missing.add(REPROJECTION)
         if not is_generated(INERTIAL) or is_missing_on_disk(
             residual_kernel(INERTIAL, sources.inertial).evaluate
         ):

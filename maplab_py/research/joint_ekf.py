@@ -118,13 +118,13 @@ class JointFilter:
         self._rig = rig_cameras(vi_map, missions)
         self._cameras = vi_map.sensors.camera_rig(rig_id).cameras
         blocks = [
-            *camera_blocks(self._rig.cameras, self._rig.delay_s),
+            *camera_blocks(self._rig.cameras, self._rig.timing_s[:, 0]),
             *imu_blocks((self._imu,)),
         ]
         self.before = self.blocks = ParameterBlocks(blocks)
-        kept = options.estimated() - {"intrinsics", "time_offset"}
+        kept = options.estimated() - {"intrinsics", "time_offset", "line_delay"}
         if not kept:
-            raise EstimationError("the filter estimates neither intrinsics nor the time offset")
+            raise EstimationError("the filter estimates neither intrinsics nor delays of images")
         options = dataclasses.replace(options, states=",".join(sorted(kept)))
         zero = np.zeros((0, 3))
         states = States(np.zeros((0, 7)), zero, zero, zero, zero, self.blocks)

@@ -90,4 +90,5 @@ def _calibrated_camera(camera: Camera, calibrated: Camera) -> Camera:
         intrinsics=calibrated.intrinsics,
         distortion_parameters=calibrated.distortion_parameters,
         image_delay_s=calibrated.image_delay_s,
+        line_delay_ns=calibrated.line_delay_ns,
     )

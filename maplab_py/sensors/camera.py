@@ -59,8 +59,18 @@ class Camera:
     topic: str = ""
     description: str = ""
     time_offset_ns: int = 0  # t_imu = t_camera + offset
-    image_delay_s: float = 0.0  # images were taken this much after their vertices' times
+    image_delay_s: float = 0.0  # first rows were taken this much after their vertices' times
+    line_delay_ns: int = 0  # from each row of a rolling shutter to the next; 0 = global shutter
     extra: dict[str, Any] = dataclasses.field(default_factory=dict)  # keys not understood
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether pixels are of other times than their vertices."""
+        return self.image_delay_s != 0.0 or self.line_delay_ns != 0
+
+    def delay_s(self, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how much later than its vertex each pixel (N, 2) was taken (N,) [s]."""
+        return self.image_delay_s + 1e-9 * self.line_delay_ns * uv_px[:, 1]
 
     def __post_init__(self) -> None:
         """Check the parameter counts."""

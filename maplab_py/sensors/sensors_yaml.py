@@ -38,6 +38,8 @@ _NOISE_KEYS = (
 )
 _IMU_KEYS = ("saturation_accel_max_mps2", "saturation_gyro_max_radps", "gravity_magnitude_mps2")
 _LIDAR_CAMERA = "camera-3d-lidar"
+_LINE_DELAY = "line-delay-nanoseconds"
+_MAX_READOUT_NS = 1_000_000_000
 _SAME_POSE = 1e-9
 
 
@@ -244,6 +246,11 @@ def _parse_camera(entry: Entry, camera_id: str) -> Camera:
     width, height = entry.integer("image_width"), entry.integer("image_height")
     if min(width, height) <= 0:
         raise MapError(f"{entry.where}: keys 'image_width', 'image_height' must be positive")
+    topic, description = entry.text("topic", "hardware_id"), entry.text("description", "label")
+    extra = entry.rest()
+    line_delay_ns = _line_delay_ns(entry, height)
+    if line_delay_ns != 0:
+        extra.pop(_LINE_DELAY)
     return Camera(
         id=camera_id,
         projection=projection,
@@ -252,10 +259,23 @@ def _parse_camera(entry: Entry, camera_id: str) -> Camera:
         distortion_parameters=parameters,
         width_px=width,
         height_px=height,
-        topic=entry.text("topic", "hardware_id"),
-        description=entry.text("description", "label"),
-        extra=entry.rest(),
+        topic=topic,
+        description=description,
+        line_delay_ns=line_delay_ns,
+        extra=extra,
     )
+
+
+def _line_delay_ns(entry: Entry, height_px: int) -> int:
+    """Return the time between two rows; an entry of zero is one of the keys that are kept."""
+    delay_ns = entry.integer(_LINE_DELAY, 0)
+    if abs(delay_ns) * height_px > _MAX_READOUT_NS:
+        raise MapError(
+            f"{entry.where}: key '{_LINE_DELAY}': {delay_ns} ns between rows are "
+            f"{1e-9 * abs(delay_ns) * height_px:g} s for an image of {height_px}: give the time between two "
+            "rows, in nanoseconds"
+        )
+    return delay_ns
 
 
 def _model(entry: Entry, key: str, kinds: Any) -> Any:
@@ -378,4 +398,6 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
             "parameters": _matrix_entry(np.asarray(camera.distortion_parameters)),
         },
     }
+    if camera.line_delay_ns != 0:
+        entry[_LINE_DELAY] = int(camera.line_delay_ns)
     return _merged(entry, camera.extra)

@@ -150,6 +150,9 @@ def _camera(camera_id: str, row: int, options: CameraOptions) -> Camera:
         options.height_px,
         topic=f"cam{row}",
         description="simulated camera",
+        # vertices are in the middle of the readout
+        image_delay_s=-0.5 * options.line_delay_s * options.height_px,
+        line_delay_ns=round(1e9 * options.line_delay_s),
     )
 
 

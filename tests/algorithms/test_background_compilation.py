@@ -16,7 +16,7 @@ from maplab_py.progress import SILENT, SilentProgress
 from maplab_py.sensors import Distortion, Projection
 from tests.support.waiting import wait_until
 
-RIG = RigKernels(((Projection.PINHOLE, Distortion.RADTAN),), calibrating=False)
+RIG = RigKernels(((Projection.PINHOLE, Distortion.RADTAN),), moving=False)
 QUICK = ("preintegration", "block Cholesky")
 """Jobs that the tests' warmup has stored, so that they take a moment."""
 
@@ -115,7 +115,7 @@ def test_what_was_compiled_is_not_missing_and_new_models_are() -> None:
     for compile_job in RIG.jobs().values():
         compile_job()
     assert RIG.missing() == ()
-    assert RigKernels((), calibrating=False).missing() == ()
+    assert RigKernels((), moving=False).missing() == ()
 
 
 def test_all_is_missing_on_a_fresh_machine(monkeypatch: pytest.MonkeyPatch) -> None:

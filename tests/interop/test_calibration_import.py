@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -233,6 +234,12 @@ def test_a_map_takes_over_what_the_file_has(tmp_path: Path) -> None:
     assert after.intrinsics.tolist() == [400.0, 401.0, 320.5, 240.5]
     assert after.image_delay_s == pytest.approx(0.004)  # stamps of the map have no offset
     assert both.imu(device.imu).acc_noise_density == 0.01
+    rolling = dataclasses.replace(camera, line_delay_ns=50_000)
+    rig = dataclasses.replace(vi_map.sensors.camera_rig(device.rig), cameras=(rolling,))
+    sensors = {**vi_map.sensors.sensors, rig.id: rig}
+    reading = vi_map.replace(sensors=dataclasses.replace(vi_map.sensors, sensors=sensors))
+    read = with_calibration_file(reading, import_calibration(chain, imu)).sensors
+    assert read.camera_rig(device.rig).cameras[0].line_delay_ns == 50_000  # the file has none
     kept = with_calibration_file(vi_map, import_calibration(imu), imu_noise=False).sensors
     assert (
         kept.imu(device.imu).acc_noise_density == vi_map.sensors.imu(device.imu).acc_noise_density

@@ -47,7 +47,7 @@ def filter_jointly_blocks(truth: VIMap) -> ParameterBlocks:
 
     rig = rig_cameras(truth, np.arange(1))
     imu = truth.sensors.imu(device(truth)[0].id)
-    return ParameterBlocks([*camera_blocks(rig.cameras, rig.delay_s), *imu_blocks((imu,))])
+    return ParameterBlocks([*camera_blocks(rig.cameras, rig.timing_s[:, 0]), *imu_blocks((imu,))])
 
 
 def test_without_noise_the_truth_is_a_fixed_point() -> None:

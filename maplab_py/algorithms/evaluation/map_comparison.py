@@ -157,7 +157,8 @@ def _same_sensor(a: Sensor, b: Sensor) -> bool:
 
 def _same_camera(a: Camera, b: Camera) -> bool:
     fixed = [
-        (c.projection, c.distortion, c.width_px, c.height_px, c.time_offset_ns) for c in (a, b)
+        (c.projection, c.distortion, c.width_px, c.height_px, c.time_offset_ns, c.line_delay_ns)
+        for c in (a, b)
     ]
     return fixed[0] == fixed[1] and np.allclose(
         [*a.intrinsics, *a.distortion_parameters],

@@ -49,6 +49,22 @@ def cameras_of(vi_map: VIMap, keypoints: I64) -> Iterator[tuple[Camera, F64, I64
         yield vi_map.sensors.camera_rig(rig_id).cameras[camera], T_I_C, rows
 
 
+def _T_G_I(vi_map: VIMap, keypoints: I64, camera: Camera) -> F64:
+    """Return the poses (O, 7) at the times of pixels of a camera, to first order in the motion."""
+    vertex = vi_map.keypoint_vertex[keypoints]
+    T_G_I = np.asarray(vi_map.T_G_I[vertex])
+    if not camera.is_moving:
+        return T_G_I
+    from maplab_py.estimation.imu.angular_velocity import angular_velocity_at_vertices
+
+    w_I = angular_velocity_at_vertices(vi_map, vertex)[vertex]
+    delay_s = camera.delay_s(vi_map.keypoints.uv_px[keypoints])[:, None]
+    q_G_M = vi_map.T_G_M[vi_map.vertices.mission[vertex], :4]
+    v_G = so3.rotate(q_G_M, vi_map.vertices.v_M[vertex])
+    turned = so3.multiply(T_G_I[:, :4], so3.exp(delay_s * w_I))
+    return se3.make(turned, T_G_I[:, 4:] + delay_s * v_G)
+
+
 def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:
     """Return which landmarks (N,) are observed as 3-D points."""
     if vi_map.keypoints.position_3d.shape[1] != 3:
@@ -59,13 +75,12 @@ def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:
 def rays_in_G(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, Mask]:
     """Return camera centres (O, 3), unit rays (O, 3) in G, and which rays exist (O,).
 
-    Cameras are assumed to be at the pose of their vertex: time offsets between a vertex and its
-    images are below a millisecond in maplab's maps.
+    Cameras whose images have a delay, or a rolling shutter, are where they were at the time of the pixel.
     """
     origins, directions = np.zeros((len(keypoints), 3)), np.zeros((len(keypoints), 3))
     valid = np.zeros(len(keypoints), dtype=np.bool_)
     for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
-        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[keypoints[rows]]], T_I_C)
+        T_G_C = se3.compose(_T_G_I(vi_map, keypoints[rows], camera), T_I_C)
         bearing, ok = back_project(camera, vi_map.keypoints.uv_px[keypoints[rows]])
         origins[rows] = T_G_C[:, 4:]
         directions[rows] = so3.rotate(T_G_C[:, :4], bearing)
@@ -83,7 +98,7 @@ def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
     lidar[observing] = is_lidar(vi_map, table.landmark[keypoints[observing]])
     for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
         camera_keypoints = keypoints[rows]
-        T_G_C = se3.compose(vi_map.T_G_I[vi_map.keypoint_vertex[camera_keypoints]], T_I_C)
+        T_G_C = se3.compose(_T_G_I(vi_map, camera_keypoints, camera), T_I_C)
         p_C = se3.transform(se3.inverse(T_G_C), p_G[rows])
         uv, visible = project(camera, p_C)
         error = np.linalg.norm(uv - table.uv_px[camera_keypoints], axis=1)

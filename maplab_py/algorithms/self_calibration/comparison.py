@@ -69,7 +69,11 @@ def _camera_rows(prefix: str, a: Camera, b: Camera) -> list[ComparedParameter]:
             parameter_names(a.projection, a.distortion), *values, strict=True
         )
     ]
-    return [*rows, _row(f"{prefix}image delay", "s", a.image_delay_s, b.image_delay_s)]
+    rows.append(_row(f"{prefix}image delay", "s", a.image_delay_s, b.image_delay_s))
+    if a.line_delay_ns or b.line_delay_ns:
+        line_delays_s = (1e-9 * a.line_delay_ns, 1e-9 * b.line_delay_ns)
+        rows.append(_row(f"{prefix}line delay", "s", *line_delays_s))
+    return rows
 
 
 def _imu_rows(a: ImuIntrinsics, b: ImuIntrinsics) -> list[ComparedParameter]:

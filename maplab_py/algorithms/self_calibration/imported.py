@@ -33,7 +33,8 @@ def with_calibration_file(
     """Return the map whose device has the calibration of a file; poses are unchanged.
 
     Stamps of a map contain the time offsets that its recording was read with, so another offset becomes
-    an image delay. A file without IMU leaves the first camera where it is on the IMU.
+    an image delay; a file without line delay leaves that of the map. A file without IMU leaves the first
+    camera where it is on the IMU.
 
     Args:
         vi_map: Map.
@@ -70,7 +71,9 @@ def _complete(
             )
     cameras = tuple(
         dataclasses.replace(
-            b, image_delay_s=b.image_delay_s + 1e-9 * (b.time_offset_ns - a.time_offset_ns)
+            b,
+            image_delay_s=b.image_delay_s + 1e-9 * (b.time_offset_ns - a.time_offset_ns),
+            line_delay_ns=b.line_delay_ns or a.line_delay_ns,
         )
         for a, b in zip(map_rig.cameras, rig.cameras, strict=False)
     )

@@ -8,16 +8,23 @@ from typing import ClassVar, Self
 from maplab_py.errors import UserError
 from maplab_py.options import option
 
-STATES = ("intrinsics", "extrinsics_rotation", "extrinsics_translation", "imu", "time_offset")
+STATES = (
+    "intrinsics",
+    "extrinsics_rotation",
+    "extrinsics_translation",
+    "imu",
+    "time_offset",
+    "line_delay",
+)
 """What can be estimated."""
 
 GROUPS = ("imu", "camera", "extrinsics")
-"""Parameter groups, each with its own table of segments; the time offset is an extrinsic parameter."""
+"""Parameter groups, each with its own table of segments; time offset and line delay are extrinsic."""
 
 _STATES_OF = {
     "imu": {"imu"},
     "camera": {"intrinsics"},
-    "extrinsics": {"extrinsics_rotation", "extrinsics_translation", "time_offset"},
+    "extrinsics": {"extrinsics_rotation", "extrinsics_translation", "time_offset", "line_delay"},
 }
 
 METRICS = ("a_optimality", "d_optimality", "e_optimality", "entropy")
@@ -112,6 +119,10 @@ class SelfCalibrationOptions:
     )
     prior_time_offset_s: float = option(
         0.03, help="Prior deviation of the delay of the images.", unit="s"
+    )
+
+    prior_line_delay_us: float = option(
+        100.0, help="Prior deviation of the time between two rows.", unit="us"
     )
 
     prior_gyro_bias_radps: float = option(

@@ -10,7 +10,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import Manifold, ParameterBlock
 from maplab_py.estimation.problem.marginals import Marginals
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIME_OFFSET
+from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATION
 from maplab_py.estimation.terms.pose import MOUNTING
 from maplab_py.sensors import Projection
@@ -25,7 +25,7 @@ def calibration_rows(map_problem: MapProblem, after: States) -> list[CalibratedP
     """Return a row for every calibration parameter that was estimated."""
     names = [
         name
-        for name in (INTRINSICS, EXTRINSICS, TIME_OFFSET, GYRO, ACCEL, ROTATION, MOUNTING)
+        for name in (INTRINSICS, EXTRINSICS, TIMING, GYRO, ACCEL, ROTATION, MOUNTING)
         if name in after.blocks and map_problem.problem.can_move(after.nodes(name)).any()
     ]
     if not names:
@@ -73,8 +73,8 @@ def parameter_names(map_problem: MapProblem, block: ParameterBlock) -> list[list
     if block.name in (GYRO, ACCEL):
         matrix = "T_g" if block.name == GYRO else "T_a"
         return [[matrix + place for place in _MATRIX]] * len(block)
-    if block.name == TIME_OFFSET:
-        return [["image delay [s]"]] * len(block)
+    if block.name == TIMING:
+        return [["image delay [s]", "line delay [s]"]] * len(block)
     assert map_problem.rig is not None
     names = []
     for row in range(len(block)):

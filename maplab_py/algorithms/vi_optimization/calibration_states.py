@@ -10,7 +10,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import CameraModel
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIME_OFFSET, Cameras
+from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING, Cameras
 from maplab_py.estimation.terms.inertial_calibration import GYRO, intrinsics_of
 from maplab_py.estimation.terms.pose import MOUNTING
 from maplab_py.geometry import se3
@@ -28,7 +28,12 @@ class RigCameras:
     models: tuple[CameraModel, ...]
     first_of_mission: I64  # (M,) row of each mission's first camera; -1 = not among the missions
     owner: tuple[tuple[str, str, int], ...]  # per row: IMU id, rig id, camera index
-    delay_s: F64  # (C,)
+    timing_s: F64  # (C, 2) image delay, and time between two rows
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether pixels of some camera are of other times than their vertices."""
+        return bool(self.timing_s.any())
 
 
 def rig_cameras(vi_map: VIMap, missions: I64) -> RigCameras:
@@ -59,8 +64,9 @@ def rig_cameras(vi_map: VIMap, missions: I64) -> RigCameras:
         parameters[row, 0] = ordered.index((camera.projection, camera.distortion))
         parameters[row, 1 : 1 + len(numbers)] = numbers
     T_I_C = np.ascontiguousarray(np.concatenate(poses)) if poses else np.zeros((0, 7))
-    delay_s = np.array([camera.image_delay_s for camera in used])
-    return RigCameras(Cameras(T_I_C, parameters), ordered, first, tuple(owner), delay_s)
+    timing_s = [(camera.image_delay_s, 1e-9 * camera.line_delay_ns) for camera in used]
+    cameras = Cameras(T_I_C, parameters)
+    return RigCameras(cameras, ordered, first, tuple(owner), np.array(timing_s).reshape(-1, 2))
 
 
 def parameter_count(rig: RigCameras) -> I64:
@@ -87,11 +93,13 @@ def with_cameras(sensors: SensorSet, rig: RigCameras, states: States) -> SensorS
         camera = old.cameras[index]
         numbers = states.blocks[INTRINSICS].values[row, : counts[row]]
         size = len(camera.intrinsics)
+        image_delay_s, *line_delay_s = states.blocks[TIMING].values[row].tolist()
         new = dataclasses.replace(
             camera,
             intrinsics=numbers[:size].copy(),
             distortion_parameters=numbers[size:].copy(),
-            image_delay_s=float(states.blocks[TIME_OFFSET].values[row, 0]),
+            image_delay_s=image_delay_s,
+            line_delay_ns=round(1e9 * line_delay_s[0]) if line_delay_s else camera.line_delay_ns,
         )
         T_B_C = np.array(old.T_B_C)
         T_B_C[index] = se3.relative(

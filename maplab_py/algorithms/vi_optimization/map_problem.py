@@ -56,8 +56,9 @@ from maplab_py.estimation.states import (
 from maplab_py.estimation.terms.cameras import (
     EXTRINSICS,
     INTRINSICS,
-    TIME_OFFSET,
+    TIMING,
     camera_blocks,
+    pixel_delay_s,
 )
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
@@ -194,9 +195,9 @@ def _visual(
     used_missions = np.unique(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
     rig = rig_cameras(vi_map, used_missions)
     data, sigma_px = observations(vi_map, selection, options, rig.first_of_mission)
-    calibrating = is_calibrating(options, rig)
+    calibrating, line_delays = is_calibrating(options), not options.fix_ncamera_line_delay
     visual = VisualTerms(
-        visual_kernels(rig.models, progress, calibrating=calibrating),
+        visual_kernels(rig.models, progress, calibrating=calibrating, line_delays=line_delays),
         data,
         rig.cameras,
         len(selection.vertices),
@@ -204,10 +205,15 @@ def _visual(
         move_points=not options.fix_landmark_positions,
         landmark_prior=landmark_prior(states, options),
     )
+    estimated = calibrating + line_delays  # columns of the timing that are states
     if calibrating:
-        states = states.with_blocks(*camera_blocks(rig.cameras, rig.delay_s))
-        if rig.delay_s.any() or not options.fix_ncamera_time_offset:
-            visual.follow_motion(angular_velocity_at_vertices(vi_map)[selection.vertices])
+        states = states.with_blocks(*camera_blocks(rig.cameras, rig.timing_s[:, :estimated]))
+    if rig.is_moving or line_delays or not options.fix_ncamera_time_offset:
+        known_s = np.where(np.arange(2) < estimated, 0.0, rig.timing_s)
+        known_delay_s = pixel_delay_s(known_s, data.camera, data.uv_px[:, 1])
+        angular_velocity_I = angular_velocity_at_vertices(vi_map)[selection.vertices]
+        visual.follow_motion(angular_velocity_I, known_delay_s if known_s.any() else None)
+        visual.refresh(states)
     rejection = OutlierRejection(visual, sigma_px, options)
     rejection.gate(states)
     if options.retriangulate_doubtful and not options.fix_landmark_positions:
@@ -222,13 +228,14 @@ def _visual(
     return visual, rejection, rig, states
 
 
-def is_calibrating(options: FixedStates, rig: RigCameras) -> bool:
-    """Return whether the cameras need the kernels with calibration or time-offset states."""
-    return bool(rig.delay_s.any()) or not (
+def is_calibrating(options: FixedStates) -> bool:
+    """Return whether something of the cameras is estimated, which takes other kernels."""
+    return not (
         options.fix_ncamera_intrinsics
         and options.fix_ncamera_extrinsics_rotation
         and options.fix_ncamera_extrinsics_translation
         and options.fix_ncamera_time_offset
+        and options.fix_ncamera_line_delay
     )
 
 
@@ -255,10 +262,14 @@ def _fix_cameras(problem: Problem, options: FixedStates, states: States, rig: Ri
         (extrinsics[:, 0], options.fix_ncamera_extrinsics_translation),
         (extrinsics[:, 1], options.fix_ncamera_extrinsics_rotation),
         (intrinsics.reshape(-1), options.fix_ncamera_intrinsics),
-        (states.nodes(TIME_OFFSET).reshape(-1), options.fix_ncamera_time_offset),
     ):
         if is_fixed:
             problem.fix(nodes)
+    is_free = [not options.fix_ncamera_time_offset, not options.fix_ncamera_line_delay, False]
+    timing = states.nodes(TIMING).reshape(-1)
+    problem.restrict(
+        timing, np.broadcast_to(np.diag(is_free).astype(np.float64), (len(timing), 3, 3))
+    )
     is_used = np.arange(3 * intrinsics.shape[1]) < parameter_count(rig)[:, None]
     kept = is_used.reshape(-1, 3)[:, :, None] * np.eye(3)
     problem.restrict(intrinsics.reshape(-1), kept)

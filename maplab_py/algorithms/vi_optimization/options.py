@@ -99,6 +99,9 @@ class FixedStates:
     fix_ncamera_time_offset: bool = option(
         True, help="Hold the delay of images relative to their vertices' times fixed."
     )
+    fix_ncamera_line_delay: bool = option(
+        True, help="Hold the time between two rows of rolling-shutter images fixed."
+    )
     fix_imu_intrinsics: bool = option(
         True, help="Hold scale and misalignment of gyroscope and accelerometer, and R_A_I, fixed."
     )

@@ -27,7 +27,11 @@ _FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, fo
 
 
 def visual_kernels(
-    models: tuple[CameraModel, ...], progress: Progress = SILENT, *, calibrating: bool = False
+    models: tuple[CameraModel, ...],
+    progress: Progress = SILENT,
+    *,
+    calibrating: bool = False,
+    line_delays: bool = False,
 ) -> ModuleType:
     """Return the module with `eliminate`, `substitute` and `evaluate` for these camera models.
 
@@ -38,17 +42,22 @@ def visual_kernels(
         models: The models of the cameras.
         progress: Told when something has to be compiled.
         calibrating: Whether the cameras' calibration is estimated too (CAMERA_COLUMNS > 0).
+        line_delays: Whether it includes the time between two rows of a rolling shutter.
     """
     return generated_module(
-        visual_module_name(models, calibrating=calibrating),
-        lambda: _visual_source(models, calibrating=calibrating),
+        visual_module_name(models, calibrating=calibrating, line_delays=line_delays),
+        lambda: _visual_source(models, calibrating=calibrating, line_delays=line_delays),
         progress,
     )
 
 
-def visual_module_name(models: tuple[CameraModel, ...], *, calibrating: bool = False) -> str:
+def visual_module_name(
+    models: tuple[CameraModel, ...], *, calibrating: bool = False, line_delays: bool = False
+) -> str:
     """Return the name of the module that `visual_kernels` returns."""
     name = "__".join(f"{p.name.lower()}_{d.name.lower()}" for p, d in models)
+    if line_delays:
+        return f"calibrating_rows_{name}"
     return f"{'calibrating' if calibrating else 'visual'}_{name}"
 
 
@@ -85,11 +94,14 @@ _POSE, _LANDMARK, _CAMERA = 3, 15, 21
 """Where the Jacobian's columns begin in `out`, after residual (2) and depth; two entries a column."""
 
 
-def _visual_source(models: tuple[CameraModel, ...], *, calibrating: bool) -> str:
+def _visual_source(
+    models: tuple[CameraModel, ...], *, calibrating: bool, line_delays: bool = False
+) -> str:
     from maplab_py.estimation.codegen.lowering import entries
     from maplab_py.estimation.symbolic.residuals import reprojection
 
     widest = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in models)
+    calibrating = calibrating or line_delays
     columns = camera_columns(widest) if calibrating else 0
     end = _CAMERA + 2 * columns
     time_offset = _CAMERA + 2 * CAMERA_TIME_OFFSET_COLUMN
@@ -112,13 +124,15 @@ def _visual_source(models: tuple[CameraModel, ...], *, calibrating: bool) -> str
         parts.append(_reprojection(f"reproject_only_{index}", function, only))
     names = ("reproject", "reproject_only")
     parts += [_dispatcher(name, _REPROJECTION, len(models)) for name in names]
-    templates = ("visual_common", "visual", *(() if calibrating else ("visual_jacobians",)))
+    templates = ["visual_common", "visual", *(() if calibrating else ("visual_jacobians",))]
+    if line_delays:
+        templates.append("visual_rows")
     return "".join(parts) + "\n\n".join(template_source(name) for name in templates)
 
 
 CAMERA_TIME_OFFSET_COLUMN = 6
 CAMERA_INTRINSICS_COLUMN = 9
-"""Columns of a camera: position 3, orientation 3, time offset 1 and 2 of padding, then this."""
+"""Columns of a camera: position 3, orientation 3, image delay, line delay, 1 of padding, then this."""
 
 
 def camera_columns(num_parameters: int) -> int:

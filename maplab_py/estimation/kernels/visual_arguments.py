@@ -22,7 +22,7 @@ class VisualData(NamedTuple):
     uv_px: F64  # (O, 2)
     inverse_sigma: F64  # (O,) [1/px]; 0 = does not take part
     scale2: F64  # (O,) squared scale of the loss
-    uv_motion: F64  # (O, 2) [px/s]; not read where W = 0
+    uv_motion: F64  # (O, 2) [px/s], read where W > 0; with line delays (O, 3), the row v beside it
 
 
 class VisualStates(NamedTuple):
@@ -32,7 +32,7 @@ class VisualStates(NamedTuple):
     T_I_C: F64  # (C, 7)
     parameters: F64  # (C, 1 + widest)
     p_G: F64  # (L, 3)
-    time_offset_s: F64  # (C, 1)
+    timing_s: F64  # (C, 1) image delay, or (C, 2) with the time between two rows as well
 
 
 class VisualRule(NamedTuple):

@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.blocks import Manifold, ParameterBlock
 from maplab_py.estimation.kernels.visual_arguments import VisualSums
 from maplab_py.estimation.states import States, pose_nodes
 
-EXTRINSICS, TIME_OFFSET, INTRINSICS = "camera extrinsics", "camera time offset", "camera intrinsics"
+EXTRINSICS, TIMING, INTRINSICS = "camera extrinsics", "camera timing", "camera intrinsics"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,19 +22,40 @@ class Cameras:
     parameters: F64  # (C, 1 + widest): index of the model, then intrinsics and distortion
 
 
-def camera_blocks(cameras: Cameras, time_offset_s: F64) -> tuple[ParameterBlock, ...]:
-    """Return the blocks of C cameras, in the order of the kernels' columns."""
+def camera_blocks(cameras: Cameras, timing_s: F64) -> tuple[ParameterBlock, ...]:
+    """Return the blocks of C cameras, in the order of the kernels' columns.
+
+    Args:
+        cameras: The cameras.
+        timing_s: Image delays (C,) or (C, 1); (C, 2) with the time between two rows, for kernels that
+            estimate line delays.
+    """
+    timing_s = np.asarray(timing_s, dtype=np.float64).reshape(len(cameras.T_I_C), -1)
     return (
         ParameterBlock(EXTRINSICS, cameras.T_I_C, Manifold.POSE),
-        ParameterBlock(TIME_OFFSET, np.asarray(time_offset_s, dtype=np.float64).reshape(-1, 1)),
+        ParameterBlock(TIMING, timing_s),
         ParameterBlock(INTRINSICS, np.ascontiguousarray(cameras.parameters[:, 1:])),
     )
 
 
 def camera_nodes(states: States) -> I64:
     """Return the nodes (C, n) of each camera, in the order of the kernels' columns."""
-    names = (EXTRINSICS, TIME_OFFSET, INTRINSICS)
+    names = (EXTRINSICS, TIMING, INTRINSICS)
     return np.concatenate([states.nodes(name) for name in names], axis=1)
+
+
+def pixel_delay_s(timing_s: F64, camera: I32, row_px: F64) -> F64:
+    """Return how much later than its vertex each pixel (O,) of a camera (O,) was taken (O,).
+
+    Args:
+        timing_s: Image delays (C, 1), or with the time between two rows (C, 2).
+        camera: Row of the camera (O,).
+        row_px: Row of the image v (O,).
+    """
+    delay_s = timing_s[camera, 0]
+    if timing_s.shape[1] > 1:
+        delay_s = delay_s + timing_s[camera, 1] * row_px
+    return np.asarray(delay_s)
 
 
 def border_places(states: States) -> tuple[I64, I64]:

@@ -27,12 +27,13 @@ from maplab_py.estimation.states import NODES_PER_VERTEX, States
 from maplab_py.estimation.terms.cameras import (
     EXTRINSICS,
     INTRINSICS,
-    TIME_OFFSET,
+    TIMING,
     Cameras,
     border_places,
     border_values,
     camera_blocks,
     camera_nodes,
+    pixel_delay_s,
 )
 from maplab_py.estimation.terms.visual_structure import (
     EliminationPlan,
@@ -129,8 +130,9 @@ class VisualTerms:
         self.num_vertices = num_vertices
         self.chunk_start = landmark_chunks(observations.start)
         self.estimates_cameras = kernels.CAMERA_COLUMNS > 0
-        self._uv_motion = np.zeros((len(observations) if self.estimates_cameras else 0, 2))
+        self._uv_motion = self._no_motion() if self.estimates_cameras else np.zeros((0, 2))
         self._angular_velocity: F64 | None = None
+        self._known_delay_s: F64 | None = None
 
     @cached_property
     def plan(self) -> EliminationPlan:
@@ -169,12 +171,26 @@ class VisualTerms:
         """Exchange weights and losses; the structure must be the same."""
         self.observations = observations
 
-    def follow_motion(self, angular_velocity_I: F64) -> None:
-        """Take time offsets into account, with angular velocities (V, 3) [rad/s] of the vertices.
+    def follow_motion(self, angular_velocity_I: F64, known_delay_s: F64 | None = None) -> None:
+        """Let pixels be of other times than their vertices, to first order in the motion.
 
-        The pixels' velocities are those of the states at the latest `refresh`.
+        The pixels' velocities are those of the states at the latest `refresh`. Known delays only move
+        the measurements, so any kernels will do; delays that are states need those for cameras.
+
+        Args:
+            angular_velocity_I: Angular velocities (V, 3) [rad/s] of the vertices.
+            known_delay_s: How much later than its vertex each observation (O,) was taken, beside the
+                delay that the states have; None = no later.
         """
-        self._angular_velocity = angular_velocity_I
+        self._angular_velocity, self._known_delay_s = angular_velocity_I, known_delay_s
+        self._uv_motion = self._no_motion()
+
+    def _no_motion(self) -> F64:
+        """Return `VisualData.uv_motion` of pixels that stand still."""
+        uv_px = self.observations.uv_px
+        has_rows = getattr(self._kernels, "ESTIMATES_LINE_DELAYS", False)
+        rows = uv_px[:, 1:] if has_rows else uv_px[:, :0]
+        return np.concatenate([np.zeros_like(uv_px), rows], axis=1)
 
     def refresh(self, states: States) -> bool:
         """Compute the pixels' velocities again; tell whether there are any."""
@@ -182,7 +198,8 @@ class VisualTerms:
             return False
         tangent = np.concatenate([states.v_G, self._angular_velocity], axis=1)
         self._kernels.pixel_motion(self._data(), self._at(states), tangent, self._uv_motion)
-        self._uv_motion[~np.isfinite(self._uv_motion).all(axis=1)] = 0.0
+        motion = self._uv_motion[:, :2]
+        motion[~np.isfinite(motion).all(axis=1)] = 0.0
         return True
 
     def block_nodes(self, states: States) -> tuple[I32, I32]:
@@ -269,8 +286,8 @@ class VisualTerms:
         """Return reprojection error [px] and depth [m] (O,) of every observation, used or not."""
         data, at, result = self._data(), self._at(states), np.empty((len(self.observations), 2))
         if self.estimates_cameras:
-            offset_px = self._uv_motion * at.time_offset_s[data.camera]
-            data = data._replace(uv_px=data.uv_px - offset_px)
+            delay_s = pixel_delay_s(at.timing_s, data.camera, self._uv_motion[:, -1])
+            data = data._replace(uv_px=data.uv_px - self._uv_motion[:, :2] * delay_s[:, None])
         self._kernels.evaluate(data, at, result)
         return result[:, 0], result[:, 1]
 
@@ -288,12 +305,14 @@ class VisualTerms:
         return 0.5 * (total + float(np.sum(off * off)))
 
     def _data(self) -> VisualData:
-        data = self.observations
+        data, uv_px = self.observations, self.observations.uv_px
+        if self._known_delay_s is not None:
+            uv_px = uv_px - self._uv_motion[:, :2] * self._known_delay_s[:, None]
         return VisualData(
             data.start,
             data.vertex,
             data.camera,
-            data.uv_px,
+            uv_px,
             data.inverse_sigma,
             data.scale2,
             self._uv_motion,
@@ -301,13 +320,13 @@ class VisualTerms:
 
     def _at(self, states: States) -> VisualStates:
         T_I_C, parameters = self._cameras.T_I_C, self._cameras.parameters
-        time_offset_s = np.zeros((len(T_I_C), 1))
+        timing_s = np.zeros((len(T_I_C), 1))
         if self.estimates_cameras:
             blocks = states.blocks
             T_I_C = np.ascontiguousarray(blocks[EXTRINSICS].values)
             parameters = np.concatenate([parameters[:, :1], blocks[INTRINSICS].values], axis=1)
-            time_offset_s = blocks[TIME_OFFSET].values
-        return VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, time_offset_s)
+            timing_s = blocks[TIMING].values
+        return VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, timing_s)
 
     def _rule(self, damping: float) -> VisualRule:
         return VisualRule(int(self.loss), float(damping), self.moves_points)
@@ -330,9 +349,14 @@ def pose_part(by_node: F64, states: States) -> F64:
     return by_vertex[:, :6]
 
 
-def compile_kernels(models: tuple[CameraModel, ...], *, calibrating: bool) -> None:
-    """Compile reprojection for a rig of camera models."""
+def compile_kernels(
+    models: tuple[CameraModel, ...], *, calibrating: bool, moving: bool = False
+) -> None:
+    """Compile reprojection for a rig of camera models, of moving images if need be."""
     visual, states = sample_terms(models, calibrating=calibrating)
+    if moving:
+        visual.follow_motion(np.zeros((2, 3)), np.zeros(2))
+        visual.refresh(states)
     rows, cols = visual.block_nodes(states)
     solver = SupernodalCholesky(rows, cols, states.num_nodes, 3)
     solver.clear()

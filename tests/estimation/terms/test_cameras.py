@@ -42,8 +42,9 @@ class Scene:
         return INVERSE_SIGMA * np.stack([x, y], axis=1)
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+@pytest.fixture(scope="module", params=[False, True], ids=["offset", "rows"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    """Return a rig whose calibration is estimated, with line delays or without."""
     rng = np.random.default_rng(0)
     T_G_I = se3.make(so3.exp(rng.normal(0, 0.05, (VERTICES, 3))), rng.normal(0, 0.2, (VERTICES, 3)))
     T_I_C = se3.make(so3.exp(rng.normal(0, 0.1, (2, 3))), rng.normal(0, 0.05, (2, 3)))
@@ -60,12 +61,13 @@ def scene() -> Scene:
         inverse_sigma=np.full(count, INVERSE_SIGMA),
         loss_scale=np.full(count, np.sqrt(SCALE2)),
     )
-    kernels = visual_kernels(MODELS, calibrating=True)
+    kernels = visual_kernels(MODELS, calibrating=True, line_delays=request.param)
     visual = VisualTerms(kernels, observations, cameras, VERTICES, loss=Loss.CAUCHY)
     points = rng.uniform([-1, -1, 3], [1, 1, 5], (LANDMARKS, 3))
     zero = np.zeros((VERTICES, 3))
     states = States(T_G_I, rng.normal(0, 1, (VERTICES, 3)), zero, zero, points)
-    states = states.with_blocks(*camera_blocks(cameras, np.array([0.01, -0.02])))
+    timing_s = np.array([[0.01, 4e-5], [-0.02, -3e-5]])[:, : 2 if request.param else 1]
+    states = states.with_blocks(*camera_blocks(cameras, timing_s))
     visual.follow_motion(rng.normal(0, 1, (VERTICES, 3)))
     visual.refresh(states)
     return Scene(visual, states, Problem(states, visual, ()))
@@ -126,8 +128,10 @@ def test_padding_of_narrow_cameras_has_no_effect(scene: Scene) -> None:
     intrinsics = scene.states.nodes("camera intrinsics")
     unused = linear.diagonal[intrinsics].reshape(2, -1)[0, 5:]
     assert not unused.any()
-    offset = scene.states.nodes("camera time offset").reshape(-1)
-    assert not linear.diagonal[offset, 1:].any()
+    offset = scene.states.nodes("camera timing").reshape(-1)
+    used = scene.states.blocks["camera timing"].dimension
+    assert linear.diagonal[offset, :used].all()
+    assert not linear.diagonal[offset, used:].any()
 
 
 def test_without_velocities_time_offsets_change_nothing(scene: Scene) -> None:
@@ -137,6 +141,30 @@ def test_without_velocities_time_offsets_change_nothing(scene: Scene) -> None:
     scene.visual.refresh(still)
     assert not np.array_equal(scene.visual.errors(still)[0], before)
     linear = scene.problem.linearize(still, 0.0)
-    assert not linear.diagonal[still.nodes("camera time offset")].any()
+    assert not linear.diagonal[still.nodes("camera timing")].any()
     scene.visual.follow_motion(np.random.default_rng(1).normal(0, 1, (VERTICES, 3)))
     scene.visual.refresh(scene.states)
+
+
+def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
+    """Kernels without cameras see what those that estimate cameras see at the same delays."""
+    measured, rng = scene.visual.observations, np.random.default_rng(2)
+    timing_s = scene.states.blocks["camera timing"].values
+    delay_s = timing_s[measured.camera, 0].copy()
+    if timing_s.shape[1] > 1:
+        delay_s += timing_s[measured.camera, 1] * measured.uv_px[:, 1]
+    cameras = Cameras(scene.states.blocks["camera extrinsics"].values, np.zeros((2, 9)))
+    cameras.parameters[:, 0] = [0, 1]
+    cameras.parameters[:, 1:] = scene.states.blocks["camera intrinsics"].values
+    plain = VisualTerms(visual_kernels(MODELS), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    velocity = rng.normal(0, 1, (VERTICES, 3))
+    plain.follow_motion(velocity, delay_s)
+    assert plain.refresh(scene.states)
+    scene.visual.follow_motion(velocity)
+    scene.visual.refresh(scene.states)
+    np.testing.assert_allclose(
+        plain.errors(scene.states)[0], scene.visual.errors(scene.states)[0], rtol=1e-12
+    )
+    without = VisualTerms(visual_kernels(MODELS), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    assert not without.refresh(scene.states)
+    assert np.abs(without.errors(scene.states)[0] - plain.errors(scene.states)[0]).max() > 0.1

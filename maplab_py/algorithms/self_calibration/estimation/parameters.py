@@ -12,7 +12,7 @@ from maplab_py.algorithms.vi_optimization.calibration_states import RigCameras, 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.blocks import Manifold, ParameterBlocks
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIME_OFFSET
+from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATION
 from maplab_py.sensors import Projection
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE, parameter_names
@@ -156,5 +156,7 @@ def _extrinsics(
         for k, axis in enumerate("xyz"):
             add(f"rotation about {axis}", "rad", EXTRINSICS, k + 3, turn)
     if "time_offset" in names:
-        add("image delay", "s", TIME_OFFSET, 0, options.prior_time_offset_s)
+        add("image delay", "s", TIMING, 0, options.prior_time_offset_s)
+    if "line_delay" in names:
+        add("line delay", "s", TIMING, 1, 1e-6 * options.prior_line_delay_us)
     return parameters

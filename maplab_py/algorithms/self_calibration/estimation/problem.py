@@ -136,6 +136,7 @@ def vi_options(options: SelfCalibrationOptions, robust: bool = True) -> VIOptimi
         fix_ncamera_extrinsics_rotation=False,
         fix_ncamera_extrinsics_translation=False,
         fix_ncamera_time_offset="time_offset" not in names,
+        fix_ncamera_line_delay="line_delay" not in names,
         fix_imu_intrinsics="imu" not in names,
         loss=options.loss if robust else "none",
         retriangulate_doubtful=robust,
