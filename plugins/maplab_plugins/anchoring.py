@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
 from maplab_py.algorithms.anchoring.reports import AnchoringReport
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
@@ -12,6 +13,7 @@ from maplab_py.errors import UserError
 from maplab_py.plugin import CommandContext, command
 
 _ANCHORING = AnchoringOptions()
+_ABSOLUTE = AbsoluteAnchoringOptions()
 _LOOPS = LoopClosureOptions()
 
 
@@ -25,16 +27,22 @@ def anchor_all_missions(
     context: CommandContext,
     *,
     options: AnchoringOptions = _ANCHORING,
+    absolute_options: AbsoluteAnchoringOptions = _ABSOLUTE,
     loop_options: LoopClosureOptions = _LOOPS,
 ) -> AnchoringReport:
     """Anchor every mission of unknown base frame to the known ones, directly or through other missions.
 
-    Places are recognised by descriptors of one feature type; keypoints with others are left out.
+    Missions with absolute poses are anchored by these first. Places are recognised by descriptors of
+    one feature type; keypoints with others are left out.
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 
     result, report = anchor_missions(
-        context.vi_map, options, loop_options, progress=context.progress
+        context.vi_map,
+        options,
+        loop_options,
+        absolute=absolute_options,
+        progress=context.progress,
     )
     context.commit(result)
     return report
@@ -45,12 +53,13 @@ def anchor_mission(
     context: CommandContext,
     *,
     options: AnchoringOptions = _ANCHORING,
+    absolute_options: AbsoluteAnchoringOptions = _ABSOLUTE,
     loop_options: LoopClosureOptions = _LOOPS,
     map_mission: str = "",
     to: str = "",
     T_G_M: str = "",
 ) -> AnchoringReport:
-    """Anchor one mission of unknown base frame to the known ones.
+    """Anchor one mission of unknown base frame by its absolute poses, or else to the known ones.
 
     Places are recognised by descriptors of one feature type; keypoints with others are left out.
     With --T_G_M a person decides where the mission is: the pose is taken as it is, or with --to as
@@ -81,6 +90,7 @@ def anchor_mission(
         loop_options,
         missions=np.array([row]),
         choice=choice,
+        absolute=absolute_options,
         progress=context.progress,
     )
     context.commit(result)

@@ -12,6 +12,10 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.anchoring.absolute import (
+    AbsoluteAnchoringOptions,
+    anchor_by_absolute_poses,
+)
 from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
 from maplab_py.algorithms.anchoring.hypotheses import described_hypotheses
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
@@ -37,6 +41,7 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 
 _DEFAULT = AnchoringOptions()
+_ABSOLUTE = AbsoluteAnchoringOptions()
 _LOOPS = LoopClosureOptions()
 
 
@@ -47,13 +52,14 @@ def anchor_missions(
     *,
     missions: I64 | None = None,
     choice: AlignmentChoice | None = None,
+    absolute: AbsoluteAnchoringOptions = _ABSOLUTE,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, AnchoringReport]:
-    """Anchor missions of unknown base frame to those of known one.
+    """Anchor missions of unknown base frame by their absolute poses, then to those of known one.
 
     Landmarks, poses in mission frames and known base frames do not change. A mission
     without a trustworthy chain of alignments to a known mission stays unknown. The detected
-    closures are recorded in the map, unless no mission was anchored: then the map does not change.
+    closures are recorded in the map, unless they anchored no mission.
 
     Args:
         vi_map: The map.
@@ -61,6 +67,7 @@ def anchor_missions(
         loop_options: How places are recognised.
         missions: Mission rows to anchor; None = all unknown ones. Others may serve as bridges.
         choice: An alignment that a person has chosen; `options.hypothesis` is one, too.
+        absolute: When the absolute poses of a mission count as agreeing.
         progress: Progress.
 
     Raises:
@@ -69,13 +76,14 @@ def anchor_missions(
     """
     names = [to_hex(words)[:8] for words in vi_map.missions.id]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
-    wanted = ~known
-    if missions is not None:
-        wanted = np.zeros(len(known), dtype=np.bool_)
-        wanted[missions] = True
-        wanted &= ~known
+    wanted = _unknown(known, missions)
+    vi_map, measured, refused = anchor_by_absolute_poses(vi_map, wanted, absolute)
+    by_poses = tuple(names[i] for i in np.flatnonzero(measured))
+    refusals = tuple(f"{names[i]}: {reason}" for i, reason in refused.items())
+    already_known = tuple(names[i] for i in np.flatnonzero(known))
+    known, wanted = known | measured, wanted & ~measured
     if not known.any() or not wanted.any():
-        return vi_map, _nothing_to_do(names, known, wanted)
+        return vi_map, _nothing_to_do(already_known, by_poses, refusals, known, wanted)
     if options.hypothesis:
         choice = AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
@@ -102,15 +110,16 @@ def anchor_missions(
     alignments = [_described(pair, names) for pair in pairs]
     anchored = reached & wanted
     report = AnchoringReport(
-        already_known=tuple(names[i] for i in np.flatnonzero(known)),
-        anchored=tuple(names[i] for i in np.flatnonzero(anchored)),
+        already_known=already_known,
+        anchored=(*by_poses, *(names[i] for i in np.flatnonzero(anchored))),
+        by_absolute_poses=by_poses,
         not_anchored={
             names[i]: _why_not(i, names, alignments, judged, detection, loop_options)
             for i in np.flatnonzero(wanted & ~reached)
         },
         alignments=tuple(alignments),
         hypotheses=described_hypotheses(detection.contests, names),
-        notes=notes,
+        notes=(*refusals, *notes),
     )
     if not anchored.any():
         return vi_map, report
@@ -118,9 +127,21 @@ def anchor_missions(
     return with_closures(result, detection.closures, "anchor"), report
 
 
+def _unknown(known: NDArray[np.bool_], missions: I64 | None) -> NDArray[np.bool_]:
+    """Return which of some missions (rows, None = all) have no known base frame (M,)."""
+    chosen = np.zeros(len(known), dtype=np.bool_)
+    chosen[slice(None) if missions is None else missions] = True
+    return np.asarray(chosen & ~known)
+
+
 def _nothing_to_do(
-    names: list[str], known: NDArray[np.bool_], wanted: NDArray[np.bool_]
+    already_known: tuple[str, ...],
+    by_poses: tuple[str, ...],
+    refusals: tuple[str, ...],
+    known: NDArray[np.bool_],
+    wanted: NDArray[np.bool_],
 ) -> AnchoringReport:
+    """Report what absolute poses did where places have nothing to anchor, or nothing to anchor to."""
     reason = ""
     if not known.any():
         reason = (
@@ -128,11 +149,13 @@ def _nothing_to_do(
             "set_mission_baseframe_to_known"
         )
     return AnchoringReport(
-        already_known=tuple(names[i] for i in np.flatnonzero(known)),
-        anchored=(),
+        already_known=already_known,
+        anchored=by_poses,
         not_anchored={},
         alignments=(),
-        notes=() if wanted.any() else ("all base frames are known already",),
+        by_absolute_poses=by_poses,
+        notes=refusals
+        or (() if wanted.any() or by_poses else ("all base frames are known already",)),
         reason=reason,
     )
 
@@ -199,16 +222,20 @@ def _pair_keys(sightings: Sightings) -> I64:
 def _spread(
     T_G_M: F64, known: NDArray[np.bool_], pairs: list[Pair], options: AnchoringOptions
 ) -> tuple[F64, NDArray[np.bool_], list[Pair]]:
-    """Grow a maximum spanning tree from the known missions (Prim).
+    """Grow a maximum spanning tree from the known missions (Prim), or a star around each of them.
 
     Returns:
         The poses of the missions, a mask of reached missions, and the pairs; pairs that contradict
         the tree over a longer cycle are marked as such.
     """
     T_G_M, reached = T_G_M.copy(), known.copy()
+    # what others may be anchored to: everything in the tree, or the known missions only
+    base = reached if options.add_to_database else known
     ranked = sorted((p for p in pairs if p.verdict == USED), key=lambda p: -p.weight)
     while True:
-        bridge = next((p for p in ranked if reached[p.a] != reached[p.b]), None)
+        bridge = next(
+            (p for p in ranked if reached[p.a] != reached[p.b] and (base[p.a] or base[p.b])), None
+        )
         if bridge is None:
             break
         if reached[bridge.b]:

@@ -26,6 +26,11 @@ class AnchoringOptions:
     ransac_max_position_error_m: float = option(
         1.0, help="Largest difference in position of closures that agree", unit="m"
     )
+    add_to_database: bool = option(
+        True,
+        help="Anchor missions through missions that are anchored by the same command as well",
+        flag="add_anchored_missions_to_database",
+    )
     hypothesis: int = option(
         0,
         help="Number of an alignment in the report of anchor_all_missions that is to be used, whatever "

@@ -40,6 +40,7 @@ class AnchoringReport(Report):
     anchored: tuple[str, ...]
     not_anchored: dict[str, str]  # mission: reason
     alignments: tuple[MissionAlignment, ...]
+    by_absolute_poses: tuple[str, ...] = ()  # of the anchored ones
     hypotheses: tuple[AlignmentHypothesis, ...] = ()  # where there are several, or doubts
     notes: tuple[str, ...] = ()
     reason: str = ""  # why no mission could be anchored

@@ -3,8 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.geometry import se3, yaw
+from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.geometry import se3, so3, yaw
+from maplab_py.vimap import AbsolutePoses
+from maplab_py.vimap.ids import to_hex
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 
@@ -81,6 +85,78 @@ def test_nothing_to_anchor_is_no_failure():
     assert same is vi_map
     assert report.failure == ""
     assert "known already" in report.notes[0]
+
+
+def with_markers(vi_map, mission, *, wrong=0, sigma_rad=0.01):
+    """Return the map with an absolute pose at every vertex of a mission, some of them 20 m off."""
+    rows = np.flatnonzero(vi_map.vertices.mission == mission)
+    T_G_S = np.array(vi_map.vertices.T_M_I[rows])  # missions are drawn where G is
+    T_G_S[:wrong, 4:] += 20.0
+    sigma = np.array([0.05, 0.05, 0.05, *[sigma_rad] * 3])
+    poses = AbsolutePoses.filled(
+        len(rows),
+        vertex=rows,
+        timestamp_ns=vi_map.vertices.timestamp_ns[rows],
+        T_G_S=T_G_S,
+        covariance=np.tile(np.diag(sigma**2), (len(rows), 1, 1)),
+    )
+    return vi_map.replace(absolute_poses=poses)
+
+
+def test_missions_with_absolute_poses_come_first():
+    vi_map = with_markers(scrambled(THREE, known=[], seed=10), 1, wrong=3)
+    anchored, report = anchor_missions(vi_map)
+    assert report.failure == ""
+    assert report.by_absolute_poses == report.anchored[:1] == (to_hex(vi_map.missions.id[1])[:8],)
+    assert anchored.baseframes.is_known.all()
+    error = yaw.from_pose(anchored.T_G_M)
+    assert np.abs(error[1]).max() < 5e-3
+    assert np.abs(error[:, :3]).max() < 0.03
+    # a known mission elsewhere does not hinder it, and stays where it is
+    vi_map = with_markers(scrambled(THREE[:2], known=[0], seed=11), 1)
+    anchored, report = anchor_missions(vi_map, missions=np.array([1]))
+    assert len(report.already_known) == 1
+    np.testing.assert_array_equal(anchored.T_G_M[0], vi_map.T_G_M[0])
+
+
+def test_absolute_poses_that_disagree_anchor_nothing():
+    few = AbsoluteAnchoringOptions(min_number_of_constraints=13)
+    turned = with_markers(scrambled(THREE[:1], known=[], seed=12), 0)
+    q = so3.multiply(so3.exp([0.0, 0.0, 0.5]), turned.absolute_poses.T_G_S[:, :4])
+    T_G_S = se3.make(q, turned.absolute_poses.T_G_S[:, 4:])
+    turned = turned.replace(absolute_poses=turned.absolute_poses.replace(T_G_S=T_G_S))
+    for vi_map, options, message in (
+        (
+            with_markers(scrambled(THREE[:1], known=[], seed=12), 0),
+            few,
+            "min_number_of_constraints=13",
+        ),
+        (turned, AbsoluteAnchoringOptions(), "0 of 12 absolute poses agree"),
+    ):
+        same, report = anchor_missions(vi_map, absolute=options)
+        assert same is vi_map
+        assert message in report.notes[0]
+        assert "set_mission_baseframe_to_known" in report.failure
+    # orientations that were not measured do not count
+    loose = turned.absolute_poses.replace(
+        covariance=np.tile(np.diag([0.01] * 3 + [1e6] * 3), (12, 1, 1))
+    )
+    anchored, report = anchor_missions(turned.replace(absolute_poses=loose))
+    assert len(report.by_absolute_poses) == 1
+    assert np.abs(yaw.from_pose(anchored.T_G_M)).max() < 1e-3
+
+
+def test_missions_that_are_anchored_need_not_anchor_others():
+    walks = [
+        Walk(room=1),
+        Walk(room=1, mission=1),
+        Walk(room=2, mission=1, start_s=30.0, room_at=(0.0, 8.0, 0.0)),
+        Walk(room=2, mission=2, room_at=(0.0, 8.0, 0.0)),
+    ]
+    vi_map = scrambled(walks, known=[0], seed=6)
+    anchored, report = anchor_missions(vi_map, AnchoringOptions(add_to_database=False))
+    assert anchored.baseframes.is_known.tolist() == [True, True, False]
+    assert len(report.not_anchored) == 1
 
 
 def test_order_of_missions_does_not_matter():
