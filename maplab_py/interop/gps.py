@@ -69,12 +69,21 @@ def read_gps(path: Path, date: str = "") -> GpsTrack:
         raise MapError(f"cannot read {path}: {reason}") from error
     is_nmea = text.lstrip().startswith(("$", "!"))
     track = _from_nmea(text, str(path), date) if is_nmea else _from_csv(text, str(path))
+    return check_track(track)
+
+
+def check_track(track: GpsTrack) -> GpsTrack:
+    """Return a track whose stamps increase.
+
+    Raises:
+        MapError: They do not.
+    """
     backwards = np.flatnonzero(np.diff(track.times_ns) <= 0)
     if len(backwards):
         row = int(backwards[0]) + 1
         raise MapError(
-            f"{path}: fix {row + 1} is not after the one before it ({track.times_ns[row]} ns): sort the "
-            "file by time"
+            f"{track.source}: fix {row + 1} is not after the one before it ({track.times_ns[row]} ns): sort "
+            "the file by time"
         )
     return track
 

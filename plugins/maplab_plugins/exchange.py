@@ -253,17 +253,18 @@ def import_gps(
     mission's base frame moves by yaw and position. optvi then observes yaw and position.
 
     Args:
-        gps_file: CSV with time, latitude, longitude [deg] and ellipsoidal altitude [m], or NMEA.
+        gps_file: CSV with time, latitude, longitude [deg] and ellipsoidal altitude [m], NMEA, or a bag of
+            ROS 1 or ROS 2 with sensor_msgs/NavSatFix.
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
     from maplab_py.algorithms.external_poses.reports import GpsImport
-    from maplab_py.interop.gps import read_gps
+    from maplab_py.interop.gps_bags import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
     options.check()
     mission = context.mission_row(map_mission)
-    track = read_gps(gps_file, options.date)
+    track = read_fixes(gps_file, options.date, options.topic)
     result = attach_fixes(context.vi_map, mission, track, options)
     context.commit(result.vi_map)
     return GpsImport(

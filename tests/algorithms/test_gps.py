@@ -15,6 +15,8 @@ from maplab_py.algorithms.external_poses.gps import origin_of
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
 from maplab_py.algorithms.external_poses.trajectories import as_mission
 from maplab_py.algorithms.vi_optimization.absolute_outliers import absolute_outliers
+from maplab_py.algorithms.vi_optimization.map_problem import build
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MaplabError, UserError
@@ -156,6 +158,27 @@ def test_a_drifting_loop_with_outliers(seed: int, tmp_path: Path) -> None:
         session.run("save", map_folder=tmp_path / "map")
         session.run("load", map_folder=tmp_path / "map", map_key="again")
         assert origin_of(session.vi_map) == ORIGIN
+
+
+def test_positions_say_nothing_of_orientation(tmp_path: Path) -> None:
+    """Whitened, an error of one radian weighs as much as a thousandth of a deviation."""
+    truth = loop(60, 2, 20.0)
+    p = fixes(truth, 2, 1)[0]
+    path = write_csv(tmp_path / "track.csv", truth.times_ns[::2], p)
+    with Session(load_registry()) as session:
+        session.maps.add("walk", map_of(truth))
+        session.run("import_gps", gps_file=path, gps_sigma_m=0.5, gps_sigma_vertical_m=1.0)
+        vi_map = session.vi_map
+    options = VIOptimizationOptions(
+        include_visual=False, include_inertial=False, include_absolute_pose_constraints=True
+    )
+    problem = build(vi_map, options)
+    (term,) = problem.problem.factors
+    _, jacobian = term.evaluate(problem.states)
+    weight = np.linalg.norm(jacobian.reshape(len(jacobian), -1, 6), axis=1)  # of every direction
+    np.testing.assert_allclose(weight[:, :3], np.tile([2.0, 2.0, 1.0], (len(weight), 1)), rtol=1e-9)
+    assert weight[:, 3:].max() <= 1.5e-3
+    assert problem.gauge.startswith("nothing of")
 
 
 def test_g_becomes_east_north_up(tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ class GpsOptions:
         True,
         help="Move the base frame of the mission by yaw and position so that it fits the fixes",
     )
+    topic: str = option("", help="Topic of a bag with sensor_msgs/NavSatFix; empty = the only one")
     replace: bool = option(False, help="Replace the absolute poses that the mission has")
 
     def check(self) -> None:
