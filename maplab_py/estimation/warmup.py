@@ -19,6 +19,8 @@ _RESIDUALS = (
     "inertial_with_intrinsics",
     "relative_pose",
     "relative_pose_with_mounting",
+    "scaled_relative_pose",
+    "scaled_relative_pose_with_mounting",
     "switched_relative_pose",
     "absolute_pose",
     "absolute_pose_with_mounting",

@@ -11,6 +11,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
 from maplab_py.simulation.recording import Recording
 from maplab_py.simulation.scenario import OtherSensorOptions
+from maplab_py.simulation.wheels import wheel_mounting
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.tables import AbsolutePoses, LoopClosureEdges, TransformationEdges
@@ -60,9 +61,10 @@ def add_other_sensors(
         edges.append(_odometry(T_G_I, T_I_S, sensor, TransformationKind.ODOMETRY, options, rng))
     if wanted[MissionSensor.WHEEL_ODOMETRY]:
         kind, sensor = MissionSensor.WHEEL_ODOMETRY, ids[MissionSensor.WHEEL_ODOMETRY]
-        vi_map = _with_sensor(vi_map, kind, sensor, imu_id, se3.identity())
+        T_I_W = wheel_mounting(options)
+        vi_map = _with_sensor(vi_map, kind, sensor, imu_id, T_I_W)
         wheel = TransformationKind.WHEEL_ODOMETRY
-        edges.append(_odometry(T_G_I, se3.identity(), sensor, wheel, options, rng))
+        edges.append(_odometry(T_G_I, T_I_W, sensor, wheel, options, rng))
     if edges:
         vi_map = vi_map.replace(transformation_edges=TransformationEdges.concatenate(edges))
     if options.loop_edges == 0:

@@ -26,8 +26,9 @@ from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scene import make_scene
 from maplab_py.simulation.simulate import RecordedSession, SimulatedData
+from maplab_py.simulation.wheels import wheel_velocities, write_wheel_velocities
 
-_SCENE_STREAM, _REPAINT_STREAM = 21, 24
+_SCENE_STREAM, _REPAINT_STREAM, _WHEEL_STREAM = 21, 24, 25
 _DISTORTION_NAMES = {
     Distortion.NONE: "none",
     Distortion.RADTAN: "radial-tangential",
@@ -65,6 +66,12 @@ def write_raw_data(
         name = f"session_{number + 1}"
         target = folder / "raw" / name
         _write_session(scenario, session, target / "mav0", overwrite=overwrite)
+        if scenario.other_sensors.wheel_odometry:
+            rng = np.random.default_rng([scenario.seeds.measurement, _WHEEL_STREAM, number])
+            wheels = wheel_velocities(session.recording, scenario.other_sensors, rng)
+            path = target / "mav0" / "wheel0" / "data.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_wheel_velocities(wheels, path, overwrite=overwrite)
         truth = folder / "truth" / name
         _write_trajectory(session, truth / "ground_truth.csv", overwrite=overwrite)
         states = target / "mav0" / "state_groundtruth_estimate0"

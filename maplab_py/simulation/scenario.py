@@ -171,10 +171,12 @@ class OtherSensorOptions:
     absolute_pose_sigma_m: float = 0.05
     absolute_pose_sigma_deg: float = 0.5
     odometry: bool = False  # an edge of S between neighbouring vertices
-    wheel_odometry: bool = False  # likewise, of the IMU
+    wheel_odometry: bool = False  # likewise of the wheels; raw data have their velocities
     odometry_sigma_m: float = 0.005  # per edge, both kinds
     odometry_sigma_deg: float = 0.05
     wheel_scale: float = 1.0  # of the distance that the wheels report; not stated in the map
+    wheel_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the wheel sensor in I
+    wheel_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector, in I
     sensor_position_m: tuple[float, float, float] = (0.1, 0.0, 0.2)  # of S in I
     sensor_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
     loop_edges: int = 0  # per session

@@ -6,7 +6,11 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.external_poses.options import GpsOptions, TrajectoryOptions
+from maplab_py.algorithms.external_poses.options import (
+    GpsOptions,
+    TrajectoryOptions,
+    WheelOptions,
+)
 from maplab_py.interop.recordings.options import DeviceOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
@@ -18,12 +22,17 @@ from maplab_py.plugin import (
 )
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.external_poses.reports import GpsImport, TrajectoryImport
+    from maplab_py.algorithms.external_poses.reports import (
+        GpsImport,
+        TrajectoryImport,
+        WheelImport,
+    )
     from maplab_py.algorithms.self_calibration.reports import ComparedParameter
     from maplab_py.interop.calibration_import import CalibrationFile
     from maplab_py.interop.trajectories import Trajectory
 
-_TRAJECTORY, _GPS, _DEVICE = TrajectoryOptions(), GpsOptions(), DeviceOptions()
+_TRAJECTORY, _GPS, _WHEELS = TrajectoryOptions(), GpsOptions(), WheelOptions()
+_DEVICE = DeviceOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,4 +286,48 @@ def import_gps(
         *result.origin,
         *result.movement,
         result.median_error_m,
+    )
+
+
+@command(
+    "import_wheel_odometry",
+    example="import_wheel_odometry wheels.csv --map_mission=59f0 --wheel_position_m=-0.2,0,-0.3",
+    see_also=("import_trajectory", "optimize_visual_inertial"),
+)
+def import_wheel_odometry(
+    context: CommandContext,
+    wheel_file: Path,
+    *,
+    map_mission: str = "",
+    options: WheelOptions = _WHEELS,
+) -> WheelImport:
+    """Join the vertices of a mission by wheel odometry.
+
+    The file has poses, motions or velocities, told apart by the names of its columns. optvi can estimate
+    the scale of the distances, which tyres and their pressure change.
+
+    Args:
+        wheel_file: CSV with a header: time, then x, y, yaw or dx, dy, dyaw or vx, vy, wz [m, rad, s]; poses
+            with qx, qy, qz, qw and velocities with wx, wy, wz are of all six directions.
+        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
+    """
+    from maplab_py.algorithms.external_poses.reports import WheelImport
+    from maplab_py.algorithms.external_poses.wheels import attach_wheels
+    from maplab_py.interop.wheel_odometry import read_wheel_odometry
+    from maplab_py.vimap.queries import mission_labels
+
+    options.check()
+    mission = context.mission_row(map_mission)
+    track = read_wheel_odometry(wheel_file)
+    result = attach_wheels(context.vi_map, mission, track, options)
+    context.commit(result.vi_map)
+    return WheelImport(
+        wheel_file,
+        track.kind,
+        mission_labels(result.vi_map)[mission],
+        result.sensor_id,
+        len(track),
+        result.added,
+        result.missing,
+        result.distance_ratio,
     )

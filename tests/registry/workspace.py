@@ -171,6 +171,7 @@ def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
     save_with_resources(first, folder / "with_resources" / "office")
     _write_closures(first, second, folder / "closures.yaml")
     _write_fixes(first, folder / "track.csv")
+    _write_wheels(first, folder / "wheels.csv")
     sensors = next((folder / "maps" / "v1_01").rglob("sensors.yaml"))
     (folder / "sensors.yaml").write_bytes(sensors.read_bytes())
     (folder / "images").mkdir()
@@ -197,6 +198,17 @@ def _write_fixes(vi_map: VIMap, path: Path) -> None:
     rows = zip(vi_map.vertices.timestamp_ns.tolist(), *positions, strict=True)
     lines = [f"{time_ns},{lat:.10f},{lon:.10f},{alt:.4f}" for time_ns, lat, lon, alt in rows]
     path.write_text("\n".join(["timestamp,latitude,longitude,altitude", *lines]))
+
+
+def _write_wheels(vi_map: VIMap, path: Path) -> None:
+    """Write the poses of wheels that are on the IMU where the example says."""
+    T_I_S = se3.make(se3.identity()[:4], np.array([-0.2, 0.0, -0.3]))
+    T = se3.compose(vi_map.vertices.T_M_I, T_I_S)
+    lines = [
+        ",".join([str(time_ns), *map(repr, [*row[4:], *row[:4]])])
+        for time_ns, row in zip(vi_map.vertices.timestamp_ns.tolist(), T.tolist(), strict=True)
+    ]
+    path.write_text("\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *lines]))
 
 
 def _write_closures(first: VIMap, second: VIMap, path: Path) -> None:

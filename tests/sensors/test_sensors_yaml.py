@@ -26,6 +26,7 @@ from maplab_py.sensors.sensors_yaml import (
     read_sensors,
     write_sensors,
 )
+from maplab_py.sensors.wheels import wheel_scale, with_wheel_scale
 from maplab_py.sensors.yaml_text import dump_yaml, parse_yaml
 from tests.support.data import shared_data
 
@@ -130,6 +131,44 @@ def test_unknown_keys_survive_at_every_level() -> None:
     assert "T_B_C" not in camera
     assert written["extrinsics"] == given["extrinsics"]
     assert write_sensors(parse_sensors(text, "again")) == text
+
+
+def test_line_delays_are_read_and_written() -> None:
+    text = FULL.replace("line-delay-nanoseconds: 0", "line-delay-nanoseconds: 62500")
+    sensors = parse_sensors(text, "sensors.yaml")
+    rig = sensors.camera_rig(RIG_ID)
+    assert rig.cameras[0].line_delay_ns == 62_500
+    assert parse_sensors(write_sensors(sensors), "again").camera_rig(RIG_ID).cameras[0].is_moving
+    for delay_ns in (70_000, -70_000, 0):
+        camera = dataclasses.replace(rig.cameras[0], line_delay_ns=delay_ns)
+        changed = {**sensors.sensors, RIG_ID: dataclasses.replace(rig, cameras=(camera,))}
+        written = write_sensors(dataclasses.replace(sensors, sensors=changed))
+        again = parse_sensors(written, "again").camera_rig(RIG_ID).cameras[0]
+        assert again.line_delay_ns == delay_ns
+        assert again.is_moving == (delay_ns != 0)
+    for wrong, message in (
+        ("6.25e-5", "must be a whole number"),
+        ("62500000", r"30 s for an image of 480: give the time between two rows, in nanoseconds"),
+    ):
+        with pytest.raises(
+            MapError, match=f"camera {CAMERA_ID}.*line-delay-nanoseconds.*{message}"
+        ):
+            parse_sensors(text.replace("62500", wrong), "sensors.yaml")
+
+
+def test_wheel_scales_are_keys_of_their_sensor() -> None:
+    sensors = parse_sensors(FULL, "sensors.yaml")
+    assert wheel_scale(sensors, WHEEL_ID) == wheel_scale(sensors, IMU_ID) == 1.0
+    scaled = with_wheel_scale(sensors, WHEEL_ID, 1.0 + 1e-13)
+    again = parse_sensors(write_sensors(scaled), "again")
+    assert wheel_scale(again, WHEEL_ID) == 1.0 + 1e-13
+    assert wheel_scale(sensors, WHEEL_ID) == 1.0
+    for value in (0.0, -1.0, float("nan")):
+        wrong = with_wheel_scale(sensors, WHEEL_ID, value)
+        with pytest.raises(MapError, match=f"sensor {WHEEL_ID}: key 'wheel_scale'"):
+            wheel_scale(wrong, WHEEL_ID)
+    with pytest.raises(MapError, match="no wheel sensor"):
+        with_wheel_scale(sensors, RIG_ID, 1.0)
 
 
 def test_other_yaml_readers_agree_on_the_written_text() -> None:

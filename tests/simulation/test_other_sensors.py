@@ -10,6 +10,9 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
+from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.wheel_odometry import read_wheel_odometry
+from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario import OtherSensorOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SimulatedData, simulate
@@ -112,3 +115,35 @@ def test_the_scenario_of_false_edges() -> None:
     data = simulate(load_scenario("false_loop_edges"))
     assert len(data.truth.loop_edge_is_true) == 60
     assert data.truth.loop_edge_is_true.sum() == 40
+
+
+def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
+    options = OtherSensorOptions(
+        wheel_odometry=True,
+        wheel_scale=1.5,
+        wheel_position_m=(-0.2, 0.1, -0.3),
+        wheel_turn_rad=(0.0, 0.0, 0.2),
+        odometry_sigma_m=1e-6,
+        odometry_sigma_deg=1e-5,
+    )
+    scenario = dataclasses.replace(
+        SMALL,
+        world=dataclasses.replace(SMALL.world, rooms=2),
+        other_sensors=options,
+        sessions=(SessionOptions(kind="vehicle", duration_s=8.0, turns=0.2),),
+    )
+    data = simulate(scenario)
+    (folder,) = write_raw_data(scenario, data, tmp_path)
+    track = read_wheel_odometry(folder / "mav0" / "wheel0" / "data.csv")
+    assert track.kind == "velocities"
+    edges = data.maps[0].transformation_edges
+    stamps = data.maps[0].vertices.timestamp_ns
+    T_O_S, covered = interpolate_poses(track.times_ns, track.T_O_S, stamps)
+    first = np.flatnonzero(covered[:-1] & covered[1:])
+    assert len(first) >= len(edges) - 1
+    found = se3.relative(T_O_S[first], T_O_S[first + 1])
+    assert np.linalg.norm(edges.T_A_B[:, 4:], axis=1).sum() > 1.0
+    np.testing.assert_allclose(found[:, 4:], edges.T_A_B[first, 4:], atol=1e-3)
+    np.testing.assert_allclose(
+        se3.log(se3.relative(found, edges.T_A_B[first]))[:, 3:], 0.0, atol=1e-3
+    )

@@ -1,4 +1,4 @@
-"""Flags of import_trajectory and import_gps."""
+"""Flags of import_trajectory, import_gps and import_wheel_odometry."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import FlagError
+from maplab_py.geometry import se3
 from maplab_py.options import option
+
+_UNIT_TOLERANCE = 1e-2
+"""By which the length of a quaternion in a flag may differ from one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,11 +90,11 @@ class GpsOptions:
     date: str = option(
         "", help="Day of the first fix as YYYY-MM-DD, for NMEA files without RMC sentences"
     )
+    topic: str = option("", help="Topic of a bag with sensor_msgs/NavSatFix; empty = the only one")
     align: bool = option(
         True,
         help="Move the base frame of the mission by yaw and position so that it fits the fixes",
     )
-    topic: str = option("", help="Topic of a bag with sensor_msgs/NavSatFix; empty = the only one")
     replace: bool = option(False, help="Replace the absolute poses that the mission has")
 
     def check(self) -> None:
@@ -128,13 +132,96 @@ class GpsOptions:
         return times_ns + round(self.time_offset_s * 1e9)
 
 
-def _three(flag: str, text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError:
-        x = y = z = float("nan")
-    if not np.all(np.isfinite([x, y, z])):
-        raise FlagError(
-            f"--{flag}={text}: wants three numbers separated by commas, as in 0.1,0,-0.05"
+@dataclasses.dataclass(frozen=True)
+class WheelOptions:
+    """How far wheel odometry is trusted, and where its sensor is."""
+
+    flag_prefix: ClassVar[str] = "wheel_"
+
+    position_sigma_m: float = option(
+        0.02,
+        help="Standard deviation along and across after one metre, growing with the root of the distance",
+        unit="m",
+    )
+    yaw_sigma_deg: float = option(
+        0.5, help="Standard deviation of the heading, likewise", unit="deg"
+    )
+    vertical_sigma_m: float = option(
+        0.05, help="Standard deviation of height, likewise, where the file has none", unit="m"
+    )
+    tilt_sigma_deg: float = option(
+        2.0,
+        help="Standard deviation of roll and pitch, likewise, where the file has none",
+        unit="deg",
+    )
+    sensor_id: str = option(
+        "",
+        help="Sensor WHEEL_ODOMETRY of sensors.yaml, of which extrinsics and covariance are taken; empty = "
+        "a new one",
+    )
+    position_m: str = option(
+        "0,0,0", help="Position x,y,z of a new sensor, the middle of the axle, on the IMU", unit="m"
+    )
+    orientation_xyzw: str = option(
+        "0,0,0,1",
+        help="Orientation of a new sensor on the IMU as a quaternion x,y,z,w; its x points forwards, its z "
+        "upwards",
+    )
+    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    max_gap_s: float = option(
+        0.5, help="Rows of the file are not interpolated over longer gaps", unit="s"
+    )
+    replace: bool = option(False, help="Replace the wheel odometry edges that the mission has")
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A deviation or gap is not positive, or the mounting is none.
+        """
+        names = (
+            "position_sigma_m",
+            "yaw_sigma_deg",
+            "vertical_sigma_m",
+            "tilt_sigma_deg",
+            "max_gap_s",
         )
+        for name in names:
+            if not 0.0 < getattr(self, name) < 1e9:
+                raise FlagError(f"--wheel_{name}={getattr(self, name):g}: must be positive")
+        if not abs(self.time_offset_s) < 1e10:
+            raise FlagError(
+                f"--wheel_time_offset_s={self.time_offset_s:g}: wants seconds below 1e10"
+            )
+        _ = self.T_I_S
+
+    @property
+    def T_I_S(self) -> F64:
+        """Mounting (7,) of a new sensor on the IMU."""
+        q = np.array(_numbers("wheel_orientation_xyzw", self.orientation_xyzw, 4))
+        length = float(np.linalg.norm(q))
+        if not abs(length - 1.0) < _UNIT_TOLERANCE:
+            raise FlagError(
+                f"--wheel_orientation_xyzw={self.orientation_xyzw}: a quaternion of length 1 is wanted, not "
+                f"{length:g}"
+            )
+        return se3.make(q / length, np.array(_three("wheel_position_m", self.position_m)))
+
+
+def _three(flag: str, text: str) -> tuple[float, float, float]:
+    x, y, z = _numbers(flag, text, 3)
     return x, y, z
+
+
+def _numbers(flag: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.all(np.isfinite(values)):
+        words = {3: "three", 4: "four"}[count]
+        example = {3: "0.1,0,-0.05", 4: "0,0,0.707,0.707"}[count]
+        raise FlagError(
+            f"--{flag}={text}: wants {words} numbers separated by commas, as in {example}"
+        )
+    return values

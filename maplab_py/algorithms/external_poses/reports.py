@@ -53,3 +53,22 @@ class GpsImport(Report):
     def advice(self) -> str:
         """Name the flag that makes optvi use the positions."""
         return "optvi --ba_include_absolute_pose_constraints uses them and leaves out outliers"
+
+
+@dataclasses.dataclass(frozen=True)
+class WheelImport(Report):
+    """Wheel odometry that became edges of a mission."""
+
+    file: Path
+    kind: str  # poses, motions or velocities
+    mission: str
+    sensor_id: str
+    rows_in_file: int
+    added: int  # edges
+    without_edge: int  # pairs of neighbouring vertices that the file does not cover
+    distance_ratio: float  # of the wheels, at the scale known before, and the mission
+
+    @property
+    def advice(self) -> str:
+        """Name the flags that make optvi use the edges."""
+        return "optvi --ba_include_wheel_odometry uses them, --ba_fix_wheel_scale=false estimates their scale"

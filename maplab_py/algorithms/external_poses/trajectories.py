@@ -25,7 +25,7 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
-from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.tables import (
     AbsolutePoses,
     Backbone,
@@ -115,7 +115,8 @@ def as_odometry(
         UserError: Nothing of the trajectory is at the time of the mission, or the mission has odometry
             edges and `options.replace` is not set.
     """
-    vi_map = _without_odometry(vi_map, mission, trajectory.source, replace=options.replace)
+    kind = TransformationKind.ODOMETRY
+    vi_map = without_edges(vi_map, mission, kind, trajectory.source, replace=options.replace)
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     stamps = vi_map.vertices.timestamp_ns[rows]
     T_R_S, covered = _at(trajectory, stamps, options)
@@ -237,27 +238,61 @@ def without_absolute_poses(
     )
 
 
-def _without_odometry(vi_map: VIMap, mission: int, source: str, *, replace: bool) -> VIMap:
+def without_edges(
+    vi_map: VIMap,
+    mission: int,
+    kind: TransformationKind,
+    source: str,
+    *,
+    replace: bool,
+    flag: str = "replace",
+    keep: str = "",
+) -> VIMap:
+    """Remove the edges of a kind of a mission (row) and the sensors that nothing else needs.
+
+    Args:
+        vi_map: Map.
+        mission: Row of the mission.
+        kind: Kind of the edges.
+        source: Name of the file that has others.
+        replace: Whether edges may be removed.
+        flag: Flag that allows it.
+        keep: Id of a sensor that stays.
+
+    Raises:
+        UserError: There are some, and `replace` is not set.
+    """
     table = vi_map.transformation_edges
-    of_mission = (vi_map.vertices.mission[table.from_vertex] == mission) & (
-        table.kind == TransformationKind.ODOMETRY
-    )
+    of_mission = (vi_map.vertices.mission[table.from_vertex] == mission) & (table.kind == kind)
     if of_mission.any() and not replace:
+        name = kind.name.lower().replace("_", " ")
         raise UserError(
-            f"{source}: the mission has {np.count_nonzero(of_mission)} odometry edges already: give "
-            "--replace to remove them first"
+            f"{source}: the mission has {np.count_nonzero(of_mission)} {name} edges already: give --{flag} "
+            "to remove them first"
         )
     kept = vi_map.replace(transformation_edges=table.take(~of_mission))
     measured = kept.transformation_edges.sensor_id
-    return _without_unused(kept, mission, table.sensor_id[of_mission], measured)
+    removed = table.sensor_id[of_mission]
+    if keep:
+        removed = removed[~np.all(removed == from_hex(keep), axis=1)]
+    return _without_unused(kept, mission, removed, measured)
 
 
 def _without_unused(vi_map: VIMap, mission: int, removed: U64, measured: U64) -> VIMap:
-    """Remove those of some sensors (N, 2) without measurements that no other mission has."""
+    """Remove those of some sensors (N, 2) without measurements that nothing else needs.
+
+    Other missions may have them, and other sensors may be mounted on them.
+    """
+    mounts = vi_map.sensors.extrinsics.items()
+    bases = {mount.base_sensor_id for sensor, mount in mounts if mount.base_sensor_id != sensor}
     others = np.delete(vi_map.missions.sensor_id, mission, axis=0).reshape(-1, 2)
     used = set(map(tuple, np.concatenate([measured, others]).tolist()))
     words = [row for row in np.unique(removed, axis=0).tolist() if any(row)]
-    unused = [row for row in words if tuple(row) not in used]
+    unused = [
+        row
+        for row in words
+        if tuple(row) not in used and to_hex(np.array(row, dtype=np.uint64)) not in bases
+    ]
     return without_sensors(vi_map, np.array(unused, dtype=np.uint64).reshape(-1, 2))
 
 

@@ -12,7 +12,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3, so3
 from maplab_py.report import counted
-from maplab_py.vimap import Backbone, VIMap
+from maplab_py.vimap import Backbone, TransformationKind, VIMap
 from maplab_py.vimap.tables import LoopClosureEdges
 
 _FLOOR_M_PER_SQRT_S = 0.005  # a standing device drifts too
@@ -53,10 +53,11 @@ def has_odometry_backbone(vi_map: VIMap) -> Mask:
 
 
 def _with_odometry(vi_map: VIMap, edges: RelativePoses) -> RelativePoses:
-    """Replace edges by those that odometry measured."""
+    """Replace edges by those that odometry measured; wheels may have another scale."""
     odometry = vi_map.transformation_edges
     chosen = has_odometry_backbone(vi_map)[odometry.from_vertex]
     chosen &= odometry.to_vertex == odometry.from_vertex + 1
+    chosen &= odometry.kind != TransformationKind.WHEEL_ODOMETRY
     covariance = _symmetric(odometry.covariance)
     chosen &= np.linalg.eigvalsh(covariance).min(axis=1, initial=np.inf) > 0.0
     rows = np.flatnonzero(chosen)

@@ -13,6 +13,7 @@ from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATION
 from maplab_py.estimation.terms.pose import MOUNTING
+from maplab_py.estimation.terms.wheel import WHEEL_SCALE
 from maplab_py.sensors import Projection
 from maplab_py.sensors.camera import DISTORTION_NAMES
 
@@ -25,7 +26,7 @@ def calibration_rows(map_problem: MapProblem, after: States) -> list[CalibratedP
     """Return a row for every calibration parameter that was estimated."""
     names = [
         name
-        for name in (INTRINSICS, EXTRINSICS, TIMING, GYRO, ACCEL, ROTATION, MOUNTING)
+        for name in (INTRINSICS, EXTRINSICS, TIMING, GYRO, ACCEL, ROTATION, MOUNTING, WHEEL_SCALE)
         if name in after.blocks and map_problem.problem.can_move(after.nodes(name)).any()
     ]
     if not names:
@@ -73,6 +74,8 @@ def parameter_names(map_problem: MapProblem, block: ParameterBlock) -> list[list
     if block.name in (GYRO, ACCEL):
         matrix = "T_g" if block.name == GYRO else "T_a"
         return [[matrix + place for place in _MATRIX]] * len(block)
+    if block.name == WHEEL_SCALE:
+        return [["scale, reported / driven distance"]] * len(block)
     if block.name == TIMING:
         return [["image delay [s]", "line delay [s]"]] * len(block)
     assert map_problem.rig is not None
@@ -90,6 +93,8 @@ def parameter_names(map_problem: MapProblem, block: ParameterBlock) -> list[list
 def _owner(map_problem: MapProblem, name: str, row: int) -> str:
     if name in (GYRO, ACCEL, ROTATION):
         return f"IMU {map_problem.factors.imus[row].id[:8]}"
+    if name == WHEEL_SCALE:
+        return f"wheel sensor {map_problem.factors.wheels[row][:8]}"
     if name == MOUNTING:
         return f"sensor {map_problem.factors.mounted.owner[row][1][:8]}"
     assert map_problem.rig is not None

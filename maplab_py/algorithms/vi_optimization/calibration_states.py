@@ -13,9 +13,11 @@ from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING, Cameras
 from maplab_py.estimation.terms.inertial_calibration import GYRO, intrinsics_of
 from maplab_py.estimation.terms.pose import MOUNTING
+from maplab_py.estimation.terms.wheel import WHEEL_SCALE
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, Imu, SensorSet
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.sensors.wheels import with_wheel_scale
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
 
@@ -91,9 +93,9 @@ def with_cameras(sensors: SensorSet, rig: RigCameras, states: States) -> SensorS
                 "calibrate the missions of one IMU at a time (--map_mission_list)"
             )
         camera = old.cameras[index]
+        image_delay_s, *line_delay_s = states.blocks[TIMING].values[row].tolist()
         numbers = states.blocks[INTRINSICS].values[row, : counts[row]]
         size = len(camera.intrinsics)
-        image_delay_s, *line_delay_s = states.blocks[TIMING].values[row].tolist()
         new = dataclasses.replace(
             camera,
             intrinsics=numbers[:size].copy(),
@@ -120,6 +122,15 @@ def with_imus(sensors: SensorSet, imus: tuple[Imu, ...], states: States) -> Sens
         for imu, intrinsics in zip(imus, intrinsics_of(states.blocks), strict=True)
     }
     return dataclasses.replace(sensors, sensors={**sensors.sensors, **changed})
+
+
+def with_wheels(sensors: SensorSet, wheels: tuple[str, ...], states: States) -> SensorSet:
+    """Return the sensors with the scales of wheel sensors (ids) taken from the states."""
+    for sensor_id, (scale,) in zip(
+        wheels, states.blocks[WHEEL_SCALE].values if wheels else (), strict=True
+    ):
+        sensors = with_wheel_scale(sensors, sensor_id, scale)
+    return sensors
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from maplab_py.algorithms.vi_optimization.options import (
     PriorOptions,
     VIOptimizationOptions,
 )
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu.inertial_data import InertialData
@@ -35,11 +35,17 @@ from maplab_py.estimation.terms.pose import (
 )
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.wheel import (
+    WHEEL_SCALE,
+    ScaledRelativePoseTerm,
+    wheel_scale_block,
+)
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import Progress
 from maplab_py.sensors import Imu
+from maplab_py.sensors.wheels import wheel_scale
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import from_hex, to_hex
 from maplab_py.vimap.queries import mission_sensor_id
 
 
@@ -51,6 +57,7 @@ class MapFactors:
     states: States
     imus: tuple[Imu, ...] = ()  # rows of the IMU blocks
     mounted: MountedSensors = dataclasses.field(default_factory=MountedSensors)
+    wheels: tuple[str, ...] = ()  # ids of the rows of the block of wheel scales
     switched_edges: I64 = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     absolute_poses_rejected: int = 0  # outliers that are left out
 
@@ -67,6 +74,8 @@ def factor_terms(
     if options.include_inertial:
         result = _with_inertial(result, vi_map, selection, options, progress)
     result = _with_mountings(result, vi_map, selection, options)
+    if options.include_wheel_odometry and not options.fix_wheel_scale:
+        result = _with_wheel_scales(result, vi_map, selection)
     for wanted, kind, name, is_fixed in (
         (
             options.include_6dof_odometry,
@@ -185,8 +194,7 @@ def _with_mountings(
             options.include_wheel_odometry and not options.fix_wheel_odometry_extrinsics,
         ),
     ):
-        ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
-        rows = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind) & is_free)
+        rows = _edges_of(vi_map, selection, kind) if is_free else np.zeros(0, dtype=np.int64)
         keys.append(_sensor_keys(vi_map, table.from_vertex[rows], table.sensor_id[rows]))
     if options.include_absolute_pose_constraints and not (
         options.fix_absolute_pose_sensor_extrinsics
@@ -201,6 +209,25 @@ def _with_mountings(
     return dataclasses.replace(so_far, states=states, mounted=MountedSensors(tuple(owners)))
 
 
+def _with_wheel_scales(so_far: MapFactors, vi_map: VIMap, selection: Selection) -> MapFactors:
+    """Add a block with the scale of every wheel sensor."""
+    rows = _edges_of(vi_map, selection, TransformationKind.WHEEL_ODOMETRY)
+    words = np.unique(vi_map.transformation_edges.sensor_id[rows], axis=0)
+    wheels = tuple(to_hex(row) for row in words)
+    if not wheels:
+        return so_far
+    scales = np.array([wheel_scale(vi_map.sensors, sensor_id) for sensor_id in wheels])
+    states = so_far.states.with_blocks(wheel_scale_block(scales))
+    return dataclasses.replace(so_far, states=states, wheels=wheels)
+
+
+def _edges_of(vi_map: VIMap, selection: Selection, kind: TransformationKind) -> I64:
+    """Return the edges (rows) of a kind between selected vertices."""
+    table = vi_map.transformation_edges
+    ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
+    return np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind))
+
+
 def _odometry(
     so_far: MapFactors,
     vi_map: VIMap,
@@ -210,25 +237,42 @@ def _odometry(
     is_fixed: bool,
     progress: Progress,
 ) -> list[FactorTerm]:
-    from maplab_py.estimation.symbolic.sources import relative_pose, relative_pose_with_mounting
+    from maplab_py.estimation.symbolic import sources
 
     table = vi_map.transformation_edges
-    ends = selection.row_of_vertex[[table.from_vertex, table.to_vertex]]
-    edges = np.flatnonzero((ends >= 0).all(axis=0) & (table.kind == kind))
+    edges = _edges_of(vi_map, selection, kind)
     if not len(edges):
         return []
     T_I_S, rows = _mounting(
         vi_map, so_far.mounted, table.from_vertex[edges], table.sensor_id[edges]
     )
-    W = whitening(table.covariance[edges])
-    measured = table.T_A_B[edges]
-    first, second = ends[:, edges]
-    if is_fixed:
-        kernel = residual_kernel("relative_pose", relative_pose, progress)
-        return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W)]
-    kernel = residual_kernel("relative_pose_with_mounting", relative_pose_with_mounting, progress)
-    mounting = Mounting.of(so_far.states, rows)
-    return [RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)]
+    W, measured = whitening(table.covariance[edges]), np.array(table.T_A_B[edges])
+    first = selection.rows(table.from_vertex[edges])
+    second = selection.rows(table.to_vertex[edges])
+    has_scale = kind == TransformationKind.WHEEL_ODOMETRY and bool(so_far.wheels)
+    if kind == TransformationKind.WHEEL_ODOMETRY and not has_scale:
+        measured, W = _unscaled(vi_map, table.sensor_id[edges], measured, W)
+    kernel_name = f"{'scaled_' if has_scale else ''}relative_pose"
+    kernel_name += "" if is_fixed else "_with_mounting"
+    kernel = residual_kernel(kernel_name, getattr(sources, kernel_name), progress)
+    mounting = None if is_fixed else Mounting.of(so_far.states, rows)
+    term = RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)
+    if not has_scale:
+        return [term]
+    wheels = np.stack([from_hex(sensor_id) for sensor_id in so_far.wheels])
+    sensor = np.argmax((table.sensor_id[edges][:, None] == wheels).all(axis=2), axis=1)
+    return [ScaledRelativePoseTerm(term, sensor, so_far.states.nodes(WHEEL_SCALE)[sensor])]
+
+
+def _unscaled(vi_map: VIMap, sensor_id: U64, measured: F64, W: F64) -> tuple[F64, F64]:
+    """Return measurements (N, 7) of wheels with true distances, and their whitening (N, 6, 6)."""
+    words, row = np.unique(sensor_id, axis=0, return_inverse=True)
+    scales = np.array([wheel_scale(vi_map.sensors, to_hex(word)) for word in words])
+    if np.all(scales == 1.0):
+        return measured, W
+    scale = scales[row.reshape(-1), None]
+    measured[:, 4:] /= scale
+    return measured, np.concatenate([W[:, :, :3] * scale[:, None], W[:, :, 3:]], axis=2)
 
 
 def _with_loop_closures(

@@ -13,6 +13,7 @@ from maplab_py.estimation.terms.inertial import InertialTerm
 from maplab_py.estimation.terms.pose import AbsolutePoseTerm
 from maplab_py.estimation.terms.prior import PosePrior
 from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.wheel import ScaledRelativePoseTerm
 from maplab_py.report import counted
 
 
@@ -49,7 +50,7 @@ def fix_gauge(
     if has_fixed_landmarks or has_prior:
         anchored |= set(np.unique(labels[_observing(problem)]).tolist())
     inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
-    scaled = _labels_of(labels, problem, object) | _labels_of_rigs(labels, problem)
+    scaled = _labels_with_scale(labels, problem) | _labels_of_rigs(labels, problem)
     counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}
     for first in gauge.first_of_each(labels).tolist():
         label = int(labels[first])
@@ -108,6 +109,18 @@ def _labels_of_rigs(labels: I64, problem: Problem) -> set[int]:
     seen = np.zeros((len(labels), int(data.camera.max(initial=0)) + 1), dtype=np.bool_)
     seen[data.vertex[used], data.camera[used]] = True
     return set(np.unique(labels[seen.sum(axis=1) > 1]).tolist())
+
+
+def _labels_with_scale(labels: I64, problem: Problem) -> set[int]:
+    """Return the clusters with factors that know distances; wheels of unknown scale do not."""
+    result: set[int] = set()
+    for term in problem.factors:
+        if isinstance(term, ScaledRelativePoseTerm):
+            continue
+        vertices = _vertices_of(term, len(labels))
+        if vertices is not None:
+            result.update(np.unique(labels[vertices]).tolist())
+    return result
 
 
 def _vertices_of(term: FactorTerm, num_vertices: int) -> I64 | None:

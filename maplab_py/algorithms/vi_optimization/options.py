@@ -111,6 +111,9 @@ class FixedStates:
     fix_wheel_odometry_extrinsics: bool = option(
         True, help="Hold the wheel sensor's mounting fixed."
     )
+    fix_wheel_scale: bool = option(
+        True, help="Hold the scale of the wheel sensor, reported / driven distance, fixed."
+    )
     fix_absolute_pose_sensor_extrinsics: bool = option(
         True, help="Hold the mounting of the absolute pose sensor fixed."
     )

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.vi_optimization.calibration_states import with_cameras, with_imus
+from maplab_py.algorithms.vi_optimization.calibration_states import (
+    with_cameras,
+    with_imus,
+    with_wheels,
+)
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem
 from maplab_py.algorithms.vi_optimization.options import FixedStates
 from maplab_py.estimation.states import States
@@ -40,6 +44,7 @@ def with_estimated_sensors(map_problem: MapProblem, states: States) -> SensorSet
     if map_problem.rig is not None and EXTRINSICS in states.blocks:
         sensors = with_cameras(sensors, map_problem.rig, states)
     sensors = with_imus(sensors, map_problem.factors.imus, states)
+    sensors = with_wheels(sensors, map_problem.factors.wheels, states)
     return map_problem.factors.mounted.written(sensors, states)
 
 

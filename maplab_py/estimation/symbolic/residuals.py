@@ -137,6 +137,28 @@ def relative_pose(*, with_mounting: bool = False) -> Any:
     return ca.Function("relative_pose", arguments, ca.cse([value, jacobian]))
 
 
+def scaled_relative_pose(*, with_mounting: bool = False) -> Any:
+    """Return `relative_pose` of a sensor whose reported positions are s times the true ones.
+
+    f(T_A, T_B, T_I_S, T_SA_SB, s): e = [s p - p_measured, Log(R_measured^T R)]; tangents [T_A 6, T_B 6],
+    with the mounting [T_I_S 6], and [s 3], of which only the first means anything. The measured position
+    is not divided by s, so that its covariance does not depend on s.
+    """
+    T_A, T_B, T_I_S = PerturbedPose("T_A"), PerturbedPose("T_B"), PerturbedPose("T_I_S")
+    measured, s = ca.SX.sym("T_SA_SB", 7), PerturbedVector("s", 3)
+    p_A_SB = T_A.R.T @ (T_B.R @ T_I_S.p + T_B.p - T_A.p)
+    position = s.x[0] * (T_I_S.R.T @ (p_A_SB - T_I_S.p)) - measured[4:]
+    q_A_B = multiply(conjugate(T_A.q), T_B.q)
+    q = multiply(conjugate(T_I_S.q), multiply(q_A_B, T_I_S.q))
+    orientation = log(multiply(conjugate(measured[:4]), q))
+    tangents = [T_A.tangent, T_B.tangent, T_I_S.tangent, s.tangent]
+    value, jacobian = with_jacobian(ca.vertcat(position, orientation), tangents)
+    if not with_mounting:
+        jacobian = ca.horzcat(jacobian[:, :12], jacobian[:, 18:])
+    arguments = [T_A.values, T_B.values, T_I_S.values, measured, s.values]
+    return ca.Function("scaled_relative_pose", arguments, ca.cse([value, jacobian]))
+
+
 def absolute_pose(*, with_mounting: bool = False) -> Any:
     """Return the residual (6: position, orientation) of a measured T_G_S.
 

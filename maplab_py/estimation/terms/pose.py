@@ -81,12 +81,15 @@ class RelativePoseTerm(FixedMeasurements):
         more = [] if self.mounting is None else [self.mounting.nodes]
         return np.concatenate([pose_nodes(self.first), pose_nodes(self.second), *more], axis=1)
 
-    def evaluate(self, states: States) -> tuple[F64, F64]:
-        """Return whitened residuals (N, 6) and Jacobians (N, 6, 12 or 18)."""
+    def arguments(self, states: States) -> F64:
+        """Return what the kernel is called with (N, 28)."""
         poses = states.T_G_I
         T_I_S = self.T_I_S if self.mounting is None else self.mounting.T_I_S(states)
-        arguments = np.concatenate([poses[self.first], poses[self.second], T_I_S, self.T_SA_SB], 1)
-        return evaluated(self.kernel, arguments, self.whitening)
+        return np.concatenate([poses[self.first], poses[self.second], T_I_S, self.T_SA_SB], 1)
+
+    def evaluate(self, states: States) -> tuple[F64, F64]:
+        """Return whitened residuals (N, 6) and Jacobians (N, 6, 12 or 18)."""
+        return evaluated(self.kernel, self.arguments(states), self.whitening)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

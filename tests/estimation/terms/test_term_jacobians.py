@@ -24,6 +24,11 @@ from maplab_py.estimation.terms.pose import (
 )
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms.wheel import (
+    WHEEL_SCALE,
+    ScaledRelativePoseTerm,
+    wheel_scale_block,
+)
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.sensors.imu import ImuIntrinsics
@@ -83,6 +88,21 @@ def test_poses_of_mounted_sensors(rng: np.random.Generator, angle: float) -> Non
     check(RelativePoseTerm(relative, "odometry", *ends, T_I_S, measured, W, mounting=mounting), at)
     absolute = residual_kernel("absolute_pose_with_mounting", sources.absolute_pose_with_mounting)
     check(AbsolutePoseTerm(absolute, ends[0], T_I_S, measured, W, mounting=mounting), at)
+
+
+@pytest.mark.parametrize("has_mounting", [False, True])
+def test_wheels_of_unknown_scale(rng: np.random.Generator, has_mounting: bool) -> None:
+    T_I_S = se3.make(so3.exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
+    at = states(rng).with_blocks(mounting_block(T_I_S), wheel_scale_block(np.array([1.02, 0.9])))
+    W = rng.normal(size=(2, 6, 6))
+    measured = se3.make(so3.exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
+    name = "scaled_relative_pose" + ("_with_mounting" if has_mounting else "")
+    kernel = residual_kernel(name, getattr(sources, name))
+    mounting = Mounting.of(at, np.array([1, 0])) if has_mounting else None
+    ends = np.array([0, 1]), np.array([1, 2])
+    poses = RelativePoseTerm(kernel, "wheels", *ends, T_I_S, measured, W, mounting=mounting)
+    sensor = np.array([1, 0])
+    check(ScaledRelativePoseTerm(poses, sensor, at.nodes(WHEEL_SCALE)[sensor]), at)
 
 
 def test_switched_relative_poses(rng: np.random.Generator) -> None:
