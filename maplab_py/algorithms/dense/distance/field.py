@@ -18,6 +18,8 @@ from maplab_py.progress import SILENT, Progress
 
 _BLOCKS_AT_A_TIME = 128
 _BYTES_PER_BLOCK = 4 * BLOCK_SIDE**3 + 12
+_BYTES_PER_NEIGHBOUR = 100
+"""Memory of a block near a camera while blocks are collected."""
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(BLOCK_SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
 """Places (512, 3) of the voxels in a block."""
@@ -143,8 +145,9 @@ def _blocks_around(cameras: F64, radius_m: float, block_m: float) -> I32:
     """Return blocks (B, 3) that a sphere about a camera (K, 3) may touch."""
     home = np.unique(np.floor(cameras / block_m).astype(np.int64), axis=0)
     reach = int(np.ceil(radius_m / block_m))
+    count = len(home) * (2.0 * reach + 1.0) ** 3
+    require_memory(count * _BYTES_PER_NEIGHBOUR, "the spheres around the cameras")
     steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), -1)
-    require_memory(len(home) * steps.size * 8.0, "the spheres around the cameras")
     blocks = np.unique((home[:, None] + steps.reshape(-1, 3)).reshape(-1, 3), axis=0)
     distance = cKDTree(cameras).query((blocks + 0.5) * block_m)[0]
     near = distance <= radius_m + _HALF_DIAGONAL * block_m

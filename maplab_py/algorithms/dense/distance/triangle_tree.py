@@ -33,7 +33,7 @@ class TriangleTree:
         if not len(faces):
             raise EstimationError("a mesh without triangles has no distances")
         require_memory(len(faces) * _BYTES_PER_TRIANGLE, "the search tree of a mesh")
-        corners = _with_needles_as_segments(np.array(p[faces], dtype=np.float64))
+        corners = _with_slivers_as_segments(np.array(p[faces], dtype=np.float64))
         leaves = 1 << int(np.ceil(np.log2(max(len(faces) / _LEAF, 1.0))))
         size = -(-len(faces) // leaves)  # rounded up
         # repeated triangles fill the last leaves
@@ -54,7 +54,7 @@ class TriangleTree:
         return distance
 
 
-def _with_needles_as_segments(corners: F64) -> F64:
+def _with_slivers_as_segments(corners: F64) -> F64:
     """Reduce triangles (F, 3, 3) without area to their longest side: the third corner is the first.
 
     The kernel would otherwise choose any of their sides.
@@ -62,10 +62,10 @@ def _with_needles_as_segments(corners: F64) -> F64:
     sides = np.roll(corners, -1, axis=1) - corners
     lengths = np.sum(sides**2, axis=2)
     area = np.sum(np.cross(sides[:, 0], sides[:, 1]) ** 2, axis=1)
-    needles = np.flatnonzero(area <= _MIN_SQUARED_SINE * np.max(lengths, axis=1) ** 2)
-    first = np.argmax(lengths[needles], axis=1)
-    a, b = corners[needles, first], corners[needles, (first + 1) % 3]
-    corners[needles] = np.stack([a, b, a], axis=1)
+    slivers = np.flatnonzero(area <= _MIN_SQUARED_SINE * np.max(lengths, axis=1) ** 2)
+    first = np.argmax(lengths[slivers], axis=1)
+    a, b = corners[slivers, first], corners[slivers, (first + 1) % 3]
+    corners[slivers] = np.stack([a, b, a], axis=1)
     return corners
 
 
