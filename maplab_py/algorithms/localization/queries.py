@@ -12,6 +12,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.array_types import I64
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import sizes_of_type
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.projection import DescriptorProjection
 
@@ -32,8 +33,14 @@ def query_vertices(vi_map: VIMap, missions: I64, projection: DescriptorProjectio
     Raises:
         EstimationError: The map has no descriptors, or others than the projection takes.
     """
+    kind = projection.kind
+    has_kind = sizes_of_type(vi_map.frames, kind.feature_type, kind.depth) == kind.size
     features, _ = map_features(
-        vi_map, missions, projection=projection, feature_type=projection.kind.feature_type
+        vi_map,
+        missions,
+        projection=projection,
+        feature_type=kind.feature_type,
+        sizes=(kind.size,) if has_kind.any() else (),
     )
     counts = np.bincount(features.vertex, minlength=len(vi_map.vertices))
     chosen = np.isin(vi_map.vertices.mission, missions)

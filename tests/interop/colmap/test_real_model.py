@@ -181,6 +181,9 @@ def test_the_other_images_are_localised_in_it(model: Model, tmp_path: Path) -> N
             results.append(report)
     for report in results:
         assert report.queries == len(model.held_out) == 10
-        assert report.localized >= 8
-        assert report.position_error_m.largest < 0.1
-        assert report.orientation_error_deg.largest < 2.0
+    for where in ("model", "summary"):
+        answers = np.genfromtxt(
+            tmp_path / f"{where}.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+        )
+        close = (answers["position_error_m"] < 0.1) & (answers["orientation_error_deg"] < 2.0)
+        assert np.count_nonzero(close) >= 8, where
