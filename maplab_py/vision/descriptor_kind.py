@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import I8, U8, U64
+from maplab_py.array_types import F64, I8, U8, U64, Mask
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, type_name
 from maplab_py.vision.descriptors import pack_words
 
+_ROWS_AT_ONCE = 16_384
 STEPS_PER_UNIT = 254
 """Steps of a signed byte per unit of length: single numbers up to half the length are kept."""
 
@@ -47,18 +48,31 @@ class DescriptorKind(NamedTuple):
         """Return descriptors (N, size) that are not binary as vectors of signed bytes (N, dimensions).
 
         They have unit length, that is `STEPS_PER_UNIT`. Vectors without a length, or with a number
-        that is not finite, become zero, which is far from all others.
+        that is not finite, become zero; see `has_content`.
         """
-        values = np.ascontiguousarray(raw)
-        if self.depth == DescriptorDepth.FLOAT32:
-            values = values.view("<f4")
-        vectors = values.astype(np.float64)
+        steps = np.empty((len(raw), self.dimensions), dtype=np.int8)
+        for begin in range(0, len(raw), _ROWS_AT_ONCE):
+            rows = slice(begin, begin + _ROWS_AT_ONCE)
+            values = np.ascontiguousarray(raw[rows])
+            if self.depth == DescriptorDepth.FLOAT32:
+                values = values.view("<f4")
+            steps[rows] = self._rounded(values.astype(np.float64))
+        return steps
+
+    def _rounded(self, vectors: F64) -> I8:
+        """Return vectors (N, dimensions) of any length as signed bytes of unit length."""
         largest = np.abs(vectors).max(axis=1, initial=0.0, keepdims=True)
         usable = np.isfinite(largest) & (largest > 0.0)  # a NaN makes the largest one NaN
         vectors = np.where(usable, vectors, 0.0) / np.where(usable, largest, 1.0)
         length = np.sqrt(np.einsum("nd,nd->n", vectors, vectors))[:, None]
         vectors *= STEPS_PER_UNIT / np.where(length > 0.0, length, 1.0)
         return np.clip(np.rint(vectors), -127, 127).astype(np.int8)
+
+    def has_content(self, raw: U8) -> Mask:
+        """Return which descriptors (N, size) can be compared: binary ones, and vectors with a length."""
+        if self.is_binary:
+            return np.ones(len(raw), dtype=np.bool_)
+        return np.asarray(self.steps(raw).any(axis=1))
 
     def comparable(self, raw: U8) -> U64 | I8:
         """Return descriptors (N, size) as indices compare them: packed bits, or signed bytes."""

@@ -50,7 +50,9 @@ def test_what_has_no_length_matches_nothing() -> None:
     distance = differences(steps, np.arange(3), steps, np.full(3, 3))
     # a single number of unit length is kept up to half of it
     assert (distance == 127**2).all()
-    assert SIFT.steps(np.zeros((1, 128), dtype=np.uint8)).any() == 0
+    assert FLOAT.has_content(raw(numbers)).tolist() == [False, False, False, True]
+    assert not SIFT.has_content(np.zeros((1, 128), dtype=np.uint8)).any()
+    assert DescriptorKind(8).has_content(np.zeros((1, 8), dtype=np.uint8)).all()
 
 
 def test_limits_are_in_the_unit_of_differences() -> None:

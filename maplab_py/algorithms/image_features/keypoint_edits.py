@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import DescriptorBlock
-from maplab_py.vimap.edits import remove_landmarks
+from maplab_py.vimap.keypoint_removal import remove_keypoints
 from maplab_py.vimap.table import object_column, starts_of_counts
 from maplab_py.vimap.tables import DescriptorLayout, FrameField, Keypoints
 from maplab_py.vision.descriptor_kind import DescriptorKind
@@ -43,35 +43,13 @@ def without_kind(vi_map: VIMap, frames: Mask, kind: DescriptorKind) -> VIMap:
 
     Landmarks that lose their last observation are removed.
     """
-    blocks, removed = list(vi_map.frames.descriptor_blocks), []
-    counts = vi_map.frames.keypoint_count.tolist()
-    for row, count in enumerate(counts):
-        frame_blocks = blocks[row] or (DescriptorBlock(count, 0),)
-        dropped = [
-            bool(frames[row]) and (_is(block, kind) or not block.size) for block in frame_blocks
-        ]
-        removed.append(np.repeat(dropped, [block.keypoints for block in frame_blocks]))
-        if any(dropped) and blocks[row]:
-            blocks[row] = tuple(
-                b for b, is_dropped in zip(frame_blocks, dropped, strict=True) if not is_dropped
-            )
-    mask = np.concatenate(removed) if removed else np.zeros(0, dtype=np.bool_)
-    if not mask.any():
-        return vi_map
-    landmark = vi_map.keypoints.landmark
-    size = len(vi_map.landmarks)
-    before = np.bincount(landmark[landmark >= 0], minlength=size)
-    left = landmark[~mask]
-    after = np.bincount(left[left >= 0], minlength=size)
-    lost = np.bincount(vi_map.keypoint_frame[mask], minlength=len(vi_map.frames))
-    reduced = vi_map.replace(
-        frames=vi_map.frames.replace(
-            keypoint_count=vi_map.frames.keypoint_count - lost,
-            descriptor_blocks=object_column(blocks),
-        ),
-        keypoints=vi_map.keypoints.take(np.flatnonzero(~mask)),
-    )
-    return remove_landmarks(reduced, (before > 0) & (after == 0))
+    removed = []
+    for row, blocks in enumerate(vi_map.frames.descriptor_blocks):
+        of_frame = blocks or (DescriptorBlock(int(vi_map.frames.keypoint_count[row]), 0),)
+        dropped = [bool(frames[row]) and (_is(block, kind) or not block.size) for block in of_frame]
+        removed.append(np.repeat(dropped, [block.keypoints for block in of_frame]))
+    none: Mask = np.zeros(0, dtype=np.bool_)
+    return remove_keypoints(vi_map, np.concatenate([none, *removed]))
 
 
 def with_features(

@@ -160,7 +160,9 @@ def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    count = len(vi_map.keypoints)
+    track = np.full(len(vi_map.keypoints), -1, dtype=np.int64)
+    if not len(links.first):
+        return track, np.zeros(0, dtype=np.bool_)
     order = np.lexsort((links.second, links.first, links.difference))
     first, second = links.first[order], links.second[order]
     rows, index = np.unique(np.concatenate([first, second]), return_inverse=True)
@@ -176,7 +178,6 @@ def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
     graph = csr_array((ones, (a[accepted], b[accepted])), shape=(len(rows), len(rows)))
     _, part = connected_components(graph, directed=False)
     size = np.bincount(part, minlength=1)
-    track = np.full(count, -1, dtype=np.int64)
     linked = size[part] >= 2
     track[rows[linked]] = _numbers(vi_map, rows[linked], part[linked])
     return track, accepted

@@ -83,6 +83,7 @@ def map_features(
         float(len(keypoint)) * (_BYTES_PER_KEYPOINT + 2 * size), "reading the descriptors"
     )
     origin, ray, rad_per_px, seen = keypoint_rays(vi_map, keypoint)
+    seen &= kind.has_content(vi_map.keypoints.descriptor[keypoint, :size])
     keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)

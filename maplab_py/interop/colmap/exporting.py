@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.errors import UserError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.interop.colmap.binary_writing import binary_files
 from maplab_py.interop.colmap.child import TEXT
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
@@ -22,6 +22,8 @@ from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.colmap.undistortion import undistorted
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.descriptors import type_name, type_of_name, types_of
+from maplab_py.vimap.keypoint_removal import remove_keypoints
 
 DATABASE = "database.db"
 _CHUNK_BYTES = 1 << 24
@@ -46,6 +48,8 @@ def export_colmap(
     names = _check_folder(folder, options, overwrite=overwrite)
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
     lost = 0
+    if options.colmap_feature_type:
+        vi_map = _of_type(vi_map, options.colmap_feature_type)
     if options.undistort:
         vi_map, lost = undistorted(vi_map, rows)
     exported = model_of_map(vi_map, rows, quality=options.quality)
@@ -77,6 +81,25 @@ def export_colmap(
         observations_lost_by_undistortion=lost,
         files=tuple(folder / file for file in names),
     )
+
+
+def _of_type(vi_map: VIMap, name: str) -> VIMap:
+    """Return the map with the keypoints of a feature type alone.
+
+    Raises:
+        UserError: It has none, or there is no such type.
+    """
+    try:
+        feature_type = type_of_name(name)
+    except FlagError as error:
+        raise FlagError(f"--colmap_feature_type: {error}") from None
+    other = vi_map.feature_type != feature_type
+    if other.all():
+        types = ", ".join(type_name(kind) for kind in sorted(types_of(vi_map.frames))) or "none"
+        raise UserError(
+            f"--colmap_feature_type={name}: the map has no such keypoints; its types: {types}"
+        )
+    return remove_keypoints(vi_map, other)
 
 
 def _check_folder(

@@ -18,6 +18,11 @@ class ColmapExportOptions:
     """What is written of a map."""
 
     quality: str = option("not_bad", help="Landmarks to write, by their quality", choices=QUALITIES)
+    colmap_feature_type: str = option(
+        "",
+        help="Write keypoints of this feature type only, and what they observe: Binary, SIFT, ... or a "
+        "number; a database has one kind of descriptors in an image; empty = all keypoints",
+    )
     undistort: bool = option(
         False,
         help="Write perspective cameras and undistorted keypoints, as omni cameras need it",

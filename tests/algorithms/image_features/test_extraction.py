@@ -135,6 +135,19 @@ def test_tracks_show_one_point_of_the_room(room: StereoRoom, sift: VIMap) -> Non
         track_features(sift, FeatureTrackOptions(feature_type="orb"))
 
 
+def test_frames_that_share_nothing_have_no_tracks(sift: VIMap) -> None:
+    tracked, report = track_features(sift, FeatureTrackOptions(max_descriptor_distance=1e-6))
+    assert (report.matches, report.tracks, report.mean_track_length) == (0, 0, 0.0)
+    assert same_tables(tracked, sift)
+
+
+def test_all_tracked_keypoints_are_left_alone(sift: VIMap) -> None:
+    ids = np.arange(len(sift.keypoints), dtype=np.int32)
+    numbered = sift.replace(keypoints=sift.keypoints.replace(track_id=ids))
+    with pytest.raises(EstimationError, match="SIFT of 128 bytes have a track or a landmark"):
+        track_features(numbered, FeatureTrackOptions())
+
+
 def test_a_cancelled_extraction_ends_at_once(with_images: VIMap) -> None:
     class Impatient(SilentProgress):
         def step(self, done: float, total: float, what: str = "") -> None:
