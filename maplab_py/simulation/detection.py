@@ -123,10 +123,14 @@ def _visible(
         mover = world.objects[number - 1] if number else None
         for first in range(0, len(poses.time_s), _FRAMES_AT_ONCE):
             frames = slice(first, first + _FRAMES_AT_ONCE)
-            p_G = world.p_G[rows][None]
+            low, high = _reach(poses.T_G_C[frames, 4:], options.max_distance_m)
+            near = rows
+            if mover is None:
+                near = rows[np.all((world.p_G[rows] > low) & (world.p_G[rows] < high), axis=1)]
+            p_G = world.p_G[near][None]
             if mover is not None:
                 p_G = p_G + mover.displacement(poses.time_s[frames])[:, None]
-            seen = _seen(camera, poses, frames, p_G, world.normal_G[rows], options)
+            seen = _seen(camera, poses, frames, p_G, world.normal_G[near], options)
             frame, local, uv, view, distance = seen
             inside = np.all(
                 (uv >= margin) & (uv < [camera.width_px - margin, camera.height_px - margin]),
@@ -135,15 +139,21 @@ def _visible(
             eye = poses.T_G_C[first + frame, 4:]
             place = p_G[np.minimum(frame, len(p_G) - 1), local]
             free = np.flatnonzero(inside)
-            free = free[~is_hidden(world.boxes, eye[free], place[free])]
+            between = np.all((world.boxes[:, 1] > low) & (world.boxes[:, 0] < high), axis=1)
+            free = free[~is_hidden(world.boxes[between], eye[free], place[free])]
             parts.append(
-                (first + frame[free], rows[local[free]], uv[free], view[free], distance[free])
+                (first + frame[free], near[local[free]], uv[free], view[free], distance[free])
             )
     frame, point, uv, view, distance = (
         np.concatenate(columns) for columns in zip(*parts, strict=True)
     )
     order = np.lexsort((point, frame))
     return frame[order], point[order], uv[order], view[order], distance[order]
+
+
+def _reach(eyes: F64, distance_m: float) -> tuple[F64, F64]:
+    """Return the lower and upper corner of the box that lines of sight from eyes (F, 3) stay in."""
+    return eyes.min(axis=0) - distance_m, eyes.max(axis=0) + distance_m
 
 
 def _seen(

@@ -9,6 +9,7 @@ import pytest
 
 from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
+from maplab_py.simulation import detection
 from maplab_py.simulation.scenario import (
     CameraOptions,
     MeasurementOptions,
@@ -150,3 +151,20 @@ def test_objects_stay_inside_and_keep_their_speed() -> None:
         assert np.all(p.max(axis=0) + moved.max(axis=0) < world.bounds[1] + 1e-5)
         speed = np.linalg.norm(np.diff(moved, axis=0), axis=1).mean() / 0.05
         assert speed < 0.6
+
+
+def test_what_is_out_of_reach_is_left_out_without_a_difference(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    city = WorldOptions(
+        layout="city", blocks=(4, 1), room_size_m=(18.0, 14.0, 9.0), corridor_width_m=6.0
+    )
+    walk = SessionOptions(kind="streets", duration_s=20.0, turns=0.2, last_block=(3, 0))
+    scenario = dataclasses.replace(SMALL, world=city, sessions=(walk,))
+    data = simulate(scenario)
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    monkeypatch.setattr(detection, "_reach", lambda eyes, distance_m: everywhere)
+    keypoints = simulate(scenario).maps[0].keypoints
+    assert len(keypoints) > 1000
+    np.testing.assert_array_equal(data.maps[0].keypoints.uv_px, keypoints.uv_px)
+    np.testing.assert_array_equal(data.maps[0].keypoints.descriptor, keypoints.descriptor)

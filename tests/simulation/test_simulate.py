@@ -12,7 +12,7 @@ from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
 from maplab_py.simulation.scenario import CameraOptions, Scenario, Seeds, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.simulate import SimulatedData, simulate
+from maplab_py.simulation.simulate import SessionSimulator, SimulatedData, simulate
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.merge import merge_maps
@@ -201,3 +201,13 @@ def test_straight_turns_in_both_directions() -> None:
     ]
     assert angle[0][-1] > angle[0][0]
     assert angle[1][-1] < angle[1][0]
+
+
+def test_a_session_alone_is_that_of_the_whole_scenario() -> None:
+    data = simulated()
+    simulator = SessionSimulator(SMALL)
+    for number in (1, 0):  # in any order
+        session = simulator.session(number)
+        assert _tables(session.vi_map) == _tables(data.maps[number])
+        rows = data.truth.vertex_mission == number
+        np.testing.assert_array_equal(session.truth.T_G_I, data.truth.T_G_I[rows])
