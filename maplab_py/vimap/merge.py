@@ -80,8 +80,10 @@ def with_compatible_sensors(
         The other map, the ids of shared sensors, and (old id, new id) of renamed ones.
     """
     conflicts = conflicting_sensors(base.sensors, other.sensors)
-    new_ids = random_ids(len(conflicts), content_rng(base, "sensors", other))
-    renamed = tuple(zip(conflicts, to_hex_list(new_ids), strict=True))
+    renamed: tuple[tuple[str, str], ...] = ()
+    if conflicts:
+        new_ids = random_ids(len(conflicts), content_rng(base, "sensors", other))
+        renamed = tuple(zip(conflicts, to_hex_list(new_ids), strict=True))
     shared = tuple(
         sensor_id
         for sensor_id in other.sensors.sensors

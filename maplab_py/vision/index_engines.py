@@ -13,7 +13,12 @@ _SHORT = DescriptorKind(8)
 
 
 def make_index(
-    engine: str, database: DescriptorSet, *, seed: int, words_per_query: int
+    engine: str,
+    database: DescriptorSet,
+    *,
+    seed: int,
+    words_per_query: int,
+    max_difference: float = np.inf,
 ) -> DescriptorIndex:
     """Build an index.
 
@@ -23,6 +28,8 @@ def make_index(
         database: What to search in.
         seed: Seed of the vocabulary.
         words_per_query: Cells of the multi-index that are searched per query.
+        max_difference: Neighbours that differ by more are not wanted, which saves "imi" time; the others
+            may return them.
     """
     if engine == "hamming":
         from maplab_py.vision.hamming_index import HammingIndex
@@ -34,7 +41,9 @@ def make_index(
         return TreeIndex(database)
     from maplab_py.vision.multi_index import InvertedMultiIndex
 
-    return InvertedMultiIndex(database, seed=seed, cells_per_query=words_per_query)
+    return InvertedMultiIndex(
+        database, seed=seed, cells_per_query=words_per_query, max_distance=max_difference
+    )
 
 
 def compile_kernels(kind: DescriptorKind = _SHORT) -> None:

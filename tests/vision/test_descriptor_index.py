@@ -75,6 +75,20 @@ def test_each_label_once_nearest_first(features, engine):
         assert database.label[query] not in labels
 
 
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_a_bound_on_differences_leaves_out_nothing_that_is_nearer(features, share):
+    _, database = features
+    queries = database.take(np.arange(300))
+    index = make_index("imi", database, seed=0, words_per_query=32)
+    whole = index.nearest(queries, 4, MatchRule())
+    bits = float(np.floor(np.quantile(whole.distance, share)))
+    index = make_index("imi", database, seed=0, words_per_query=32, max_difference=bits)
+    bounded = index.nearest(queries, 4, MatchRule())
+    within = whole.distance <= bits
+    assert 0 < within.sum() < within.size
+    np.testing.assert_array_equal(bounded.row, np.where(within, whole.row, -1))
+
+
 @pytest.mark.parametrize("engine", INDEX_ENGINES)
 def test_rule_keeps_near_times_and_own_session_out(engine):
     descriptors, label = tracks(200, 6, flips=0.08, seed=8)

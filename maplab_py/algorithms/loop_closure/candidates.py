@@ -8,6 +8,7 @@ Places of each mission are verified separately because only a single mission is 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ _QUERIES_AT_ONCE = 1024
 _BYTES_PER_LANDMARK, _BYTES_PER_MATCH = 48, 77
 """Memory per listed landmark of a place and per match of a query [bytes]."""
 _SAMPLE = 64
+_PART_BYTES = 5e7
+"""Memory of the landmarks and matches of the places that are looked at together."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,40 +71,92 @@ def find_candidates(
     vi_map: VIMap, features: MapFeatures, matches: Matches, rule: CandidateRule
 ) -> Candidates:
     """Return the candidate places in every mission for each query vertex."""
-    from scipy.sparse import csr_array
-
-    vertices, landmarks = len(vi_map.vertices), len(vi_map.landmarks)
     seen = _observers(vi_map)  # (L, V)
-    query_vertex = features.vertex[matches.query]
-    landmark = features.descriptors.label[matches.database]
-    pair = np.divmod(np.unique(query_vertex * landmarks + landmark), max(landmarks, 1))
-    matched = csr_array((np.ones(len(pair[0]), dtype=np.int32), pair), shape=(vertices, landmarks))
-    shared = (seen.T @ seen).tocsr()
-    near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int8).tocsr()
-    near.sort_indices()
-    queries = np.unique(query_vertex)
-    places: list[I64] = []
+    near = _near(seen)
+    matched = _matched(vi_map, features, matches)
+    queries = np.flatnonzero(np.diff(matched.indptr))
+    places: list[I64] = [np.zeros((0, 3), dtype=np.int64)]
     for begin in range(0, len(queries), _QUERIES_AT_ONCE):
         chunk = queries[begin : begin + _QUERIES_AT_ONCE]
         places.append(_best_places(vi_map, chunk, matched[chunk] @ seen, near, rule))
-    picks = np.concatenate(places) if places else np.zeros((0, 3), dtype=np.int64)
+    del matched
+    picks = np.concatenate(places)
     picks = picks[np.lexsort((picks[:, 1], picks[:, 0]))]
-    is_near = near[picks[:, 1]]
-    _require_memory(picks, is_near, seen, query_vertex)
-    place = (is_near @ seen.T).tocsr()  # (P, L) landmarks of the place
-    return _with_matches(picks, place, query_vertex, landmark, rule)
+    by_vertex = _MatchesByVertex.of(features, matches, len(vi_map.vertices))
+    cuts = _cuts(picks, near, seen, by_vertex)
+    parts = [
+        _with_matches(picks[begin:end], near, seen, by_vertex, rule)
+        for begin, end in itertools.pairwise(cuts)
+    ]
+    return _joined(parts)
 
 
-def _require_memory(picks: I64, is_near: Any, seen: Any, query_vertex: I64) -> None:
-    """Check that the landmarks and matches of all places fit into memory.
+def _near(seen: Any) -> Any:
+    """Return the matrix (V, V) of ones where two vertices belong to one place."""
+    shared = (seen.T @ seen).tocsr()
+    near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int8).tocsr()
+    near.sort_indices()
+    return near
 
-    The number of distinct landmarks in a place is estimated from some of the places.
+
+def _matched(vi_map: VIMap, features: MapFeatures, matches: Matches) -> Any:
+    """Return the matrix (V, L) of ones where a query vertex is matched with a landmark."""
+    from scipy.sparse import csr_array
+
+    shape = len(vi_map.vertices), len(vi_map.landmarks)
+    key = features.vertex[matches.query] * shape[1]
+    key += features.descriptors.label[matches.database]
+    pair = np.divmod(np.unique(key), max(shape[1], 1))
+    return csr_array((np.ones(len(pair[0]), dtype=np.int32), pair), shape=shape)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _MatchesByVertex:
+    """Matches ordered by their query vertex (V of them)."""
+
+    start: I64  # (V + 1,)
+    row: I64  # (M,) of `Matches`
+    landmark: I64  # (M,)
+
+    @classmethod
+    def of(cls, features: MapFeatures, matches: Matches, vertices: int) -> _MatchesByVertex:
+        """Order matches (M,)."""
+        vertex = features.vertex[matches.query]
+        order = np.argsort(vertex, kind="stable")
+        landmark = features.descriptors.label[matches.database[order]]
+        return cls(starts_of_counts(np.bincount(vertex, minlength=vertices)), order, landmark)
+
+
+def _cuts(picks: I64, near: Any, seen: Any, matches: _MatchesByVertex) -> I64:
+    """Return where picks are divided so that each part takes a bounded amount of memory.
+
+    The number of distinct landmarks of a place is estimated from some of the places.
     """
-    sample = np.unique(np.linspace(0, len(picks) - 1, _SAMPLE).astype(np.int64))[: len(picks)]
-    landmarks = (is_near[sample] @ seen.T).nnz * len(picks) / max(len(sample), 1)
-    matches = np.bincount(query_vertex, minlength=is_near.shape[1])[picks[:, 0]].sum()
-    needed = _BYTES_PER_LANDMARK * landmarks + _BYTES_PER_MATCH * float(matches)
-    require_memory(needed, f"looking at {len(picks)} pairs of places")
+    if not len(picks):
+        return np.zeros(1, dtype=np.int64)
+    sample = np.unique(np.linspace(0, len(picks) - 1, _SAMPLE).astype(np.int64))
+    landmarks = (near[picks[sample, 1]] @ seen.T).nnz / len(sample)
+    of_pick = np.diff(matches.start)[picks[:, 0]]
+    needed = np.cumsum(_BYTES_PER_LANDMARK * landmarks + _BYTES_PER_MATCH * of_pick)
+    part = (needed / _PART_BYTES).astype(np.int64)
+    begins = np.flatnonzero(np.diff(part, prepend=-1))
+    largest = float(np.diff(np.append(np.append(0.0, needed[begins[1:] - 1]), needed[-1])).max())
+    require_memory(largest, f"looking at {len(picks)} pairs of places")
+    return np.append(begins, len(picks))
+
+
+def _joined(parts: list[Candidates]) -> Candidates:
+    """Join the candidates of parts of the picks."""
+    none = np.zeros(0, dtype=np.int64)
+    parts = [*parts, Candidates(none, none, none, np.zeros(1, dtype=np.int64), none)]
+    counts = [np.diff(part.start) for part in parts]
+    return Candidates(
+        query_vertex=np.concatenate([part.query_vertex for part in parts]),
+        place_vertex=np.concatenate([part.place_vertex for part in parts]),
+        votes=np.concatenate([part.votes for part in parts]),
+        start=starts_of_counts(np.concatenate(counts)),
+        match=np.concatenate([part.match for part in parts]),
+    )
 
 
 def _observers(vi_map: VIMap) -> Any:
@@ -165,29 +220,26 @@ def _contains(matrix: Any, row: I64, column: I64) -> Mask:
 
 
 def _with_matches(
-    picks: I64, place: Any, query_vertex: I64, landmark: I64, rule: CandidateRule
+    picks: I64, near: Any, seen: Any, matches: _MatchesByVertex, rule: CandidateRule
 ) -> Candidates:
     """Return the matches of each query vertex with the landmarks of its place."""
-    order = np.argsort(query_vertex, kind="stable")
-    size = int(query_vertex.max(initial=-1)) + 1
-    of_vertex = starts_of_counts(np.bincount(query_vertex, minlength=size))
-    rows = order[ragged_rows(of_vertex, picks[:, 0])]
-    pick = np.repeat(np.arange(len(picks)), np.diff(of_vertex)[picks[:, 0]])
-    # is landmark[row] in place[pick]: look the pair up among the matrix' sorted entries
+    place = (near[picks[:, 1]] @ seen.T).tocsr()  # (P, L) landmarks of the place
     place.sort_indices()
+    row = ragged_rows(matches.start, picks[:, 0])
+    pick = np.repeat(np.arange(len(picks)), np.diff(matches.start)[picks[:, 0]])
+    # is landmark[row] in place[pick]: look the pair up among the matrix' sorted entries
     width = place.shape[1]
-    entry = np.repeat(np.arange(len(picks)), np.diff(place.indptr)) * width + place.indices
-    wanted = pick * width + landmark[rows]
+    entry = np.repeat(np.arange(len(picks)) * width, np.diff(place.indptr)) + place.indices
+    wanted = pick * width + matches.landmark[row]
     where = np.searchsorted(entry, wanted)
     inside = np.append(entry, -1)[where] == wanted
-    rows, pick = rows[inside], pick[inside]
+    row, pick = matches.row[row[inside]], pick[inside]
     count = np.bincount(pick, minlength=len(picks))
     enough = count >= rule.min_matches
-    kept = enough[pick]
     return Candidates(
         query_vertex=picks[enough, 0],
         place_vertex=picks[enough, 1],
         votes=picks[enough, 2],
         start=starts_of_counts(count[enough]),
-        match=rows[kept],
+        match=row[enough[pick]],
     )

@@ -24,7 +24,7 @@ from maplab_py.array_types import I64
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.index import MatchRule
 from maplab_py.vision.projection import DescriptorProjection
 from maplab_py.vision.projection_file import load_projection
@@ -157,8 +157,6 @@ def _closures(
     place = _most_seen(vi_map, search, candidates.place_vertex)
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe] & trust_base_frames
     judgement = judge(vi_map, query, place, s, options, is_known=is_known, choice=choice)
-    inlier = np.flatnonzero(s.is_inlier)
-    problem = np.repeat(np.arange(len(query)), np.diff(search.start))[inlier]
     closures = Closures(
         id=closure_ids(vi_map, query, place),
         query_vertex=query,
@@ -173,19 +171,18 @@ def _closures(
         correction_deg=judgement.correction_deg,
         verdict=judgement.verdict,
         support=judgement.support,
-        start=starts_of_counts(np.bincount(problem, minlength=len(query))),
-        keypoint=features.keypoint[search.feature[inlier]],
-        landmark=search.landmark[inlier],
-        bits=search.bits[inlier],
+        start=search.start,
+        keypoint=features.keypoint[search.feature],
+        landmark=search.landmark,
+        bits=search.bits,
     )
     return closures, tuple(judgement.contests)
 
 
 def _most_seen(vi_map: VIMap, search: PoseSearch, place: I64) -> I64:
     """Return, per candidate, the vertex of the place's mission that observes most inliers."""
-    inlier = np.flatnonzero(search.solutions.is_inlier)
-    problem = np.repeat(np.arange(len(place)), np.diff(search.start))[inlier]
-    landmark = search.landmark[inlier]
+    problem = np.repeat(np.arange(len(place)), np.diff(search.start))
+    landmark = search.landmark
     rows = vi_map.observations[ragged_rows(vi_map.observation_start, landmark)]
     of_row = np.repeat(problem, np.diff(vi_map.observation_start)[landmark])
     vertex = vi_map.keypoint_vertex[rows].astype(np.int64)

@@ -27,6 +27,7 @@ from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_
 
 _BYTES_PER_KEYPOINT = 300
 """Memory per keypoint [bytes] without its descriptor, which is stored twice."""
+_RAYS_AT_ONCE = 1 << 18
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,9 +83,11 @@ def map_features(
     require_memory(
         float(len(keypoint)) * (_BYTES_PER_KEYPOINT + 2 * size), "reading the descriptors"
     )
-    origin, ray, rad_per_px, seen = keypoint_rays(vi_map, keypoint)
+    origin, ray, rad_per_px, seen = _rays(vi_map, keypoint)
     seen &= kind.has_content(vi_map.keypoints.descriptor[keypoint, :size])
-    keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
+    if not seen.all():
+        keypoint, origin, ray = keypoint[seen], origin[seen], ray[seen]
+        rad_per_px = rad_per_px[seen]
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
     if projection is None or projection.kind != kind:
@@ -104,7 +107,7 @@ def map_features(
         in_database=np.append(findable_landmarks(vi_map), False)[landmark],
         origin_I=origin,
         ray_I=ray,
-        rad_per_px=rad_per_px[seen],
+        rad_per_px=rad_per_px,
         kind=kind,
     )
     return features, projection
@@ -170,6 +173,19 @@ def _no_descriptors(vi_map: VIMap, feature_type: int, sizes: tuple[int, ...], fl
         "the map has no descriptors: places cannot be recognised; extract_features makes some from "
         "images"
     )
+
+
+def _rays(vi_map: VIMap, keypoint: I64) -> tuple[F64, F64, F64, Mask]:
+    """Return `keypoint_rays`, computed in parts, which bounds the memory."""
+    count = len(keypoint)
+    origin, ray, rad_per_px = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    seen = np.empty(count, dtype=np.bool_)
+    for begin in range(0, count, _RAYS_AT_ONCE):
+        part = slice(begin, begin + _RAYS_AT_ONCE)
+        origin[part], ray[part], rad_per_px[part], seen[part] = keypoint_rays(
+            vi_map, keypoint[part]
+        )
+    return origin, ray, rad_per_px, seen
 
 
 def _check_missions_match(vi_map: VIMap, sizes: I32, size: int) -> None:

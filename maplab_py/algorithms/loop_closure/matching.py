@@ -13,12 +13,15 @@ import numpy as np
 from maplab_py.algorithms.loop_closure.candidates import Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.search_memory import nearest_rows
-from maplab_py.array_types import I64
+from maplab_py.algorithms.loop_closure.search_memory import nearest_rows, remembered
+from maplab_py.array_types import I32, I64
 from maplab_py.vision.descriptors import differences
 from maplab_py.vision.index import MatchRule
+from maplab_py.vision.index_engines import make_index
 
 _NEIGHBOURS = 3
+_QUERIES_AT_ONCE = 1 << 18
+"""Queries whose descriptors are copied together."""
 _MIN_VOTES = 2
 """Matched keypoints of a query with a mission for it to be chosen."""
 
@@ -38,15 +41,25 @@ def match_features(
         return Matches(empty, empty, empty.astype(np.int32)), 0
     d = features.descriptors
     missions = np.unique(d.session[database])
-    queries = np.arange(len(features))
     if len(missions) > options.max_missions_per_query + 1:
-        query, matched = _in_chosen_missions(features, options, rule, database)
-    else:
-        query, matched = _in_all_missions(features, options, rule, apart, queries, database)
-    bits = differences(d.words, query, d.words, matched)
-    matches = Matches(query, matched, bits)
-    largest = features.kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
-    return matches.take(bits <= largest), landmarks
+        return _in_chosen_missions(features, options, rule, database), landmarks
+    query, matched = _in_all_missions(features, options, rule, apart, database)
+    return _similar(features, options, query, matched), landmarks
+
+
+def _similar(
+    features: MapFeatures, options: LoopClosureOptions, query: I64, matched: I64
+) -> Matches:
+    """Return the matches whose descriptors differ little enough."""
+    words = features.descriptors.words
+    bits = differences(words, query, words, matched)
+    kept = bits <= _largest(features, options)
+    return Matches(query[kept], matched[kept], bits[kept])
+
+
+def _largest(features: MapFeatures, options: LoopClosureOptions) -> float:
+    """Return the largest difference of a match, as `differences` counts it."""
+    return features.kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
 
 
 def _in_all_missions(
@@ -54,53 +67,107 @@ def _in_all_missions(
     options: LoopClosureOptions,
     rule: MatchRule,
     apart: bool,
-    query: I64,
     database: I64,
 ) -> tuple[I64, I64]:
-    """Return the pairs of query features and their nearest database features."""
+    """Return the pairs of features and their nearest database features."""
     d = features.descriptors
     others = MatchRule(rule.min_time_ns, True)
     rows = nearest_rows(
         options.detector_engine,
         d.take(database),
-        d.take(query),
-        options.num_neighbors if options.num_neighbors > 0 else _NEIGHBOURS,
+        d,
+        _neighbours(options),
         [rule, others] if apart else [rule],
         seed=options.seed,
         words_per_query=options.num_words_for_nn_search,
+        max_difference=_largest(features, options),
     )
     row = rows[0]
     if apart:
-        same_session = (row >= 0) & (d.session[database][row] == d.session[query][:, None])
+        same_session = (row >= 0) & (d.session[database][row] == d.session[:, None])
         row = np.concatenate([np.where(same_session, row, -1), rows[1]], axis=1)
-    i, j = np.nonzero(row >= 0)
-    return query[i], database[row[i, j]]
+    query, column = np.nonzero(row >= 0)
+    return query, database[row[query, column]]
 
 
 def _in_chosen_missions(
     features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, database: I64
-) -> tuple[I64, I64]:
-    """Return the pairs of query features and their nearest features in the missions chosen for them.
+) -> Matches:
+    """Return the matches of each query with the missions chosen for it; see `remembered`."""
+    setting = (
+        f"chosen missions {options.detector_engine} {options.num_neighbors} {options.seed} "
+        f"{options.num_words_for_nn_search} {options.max_missions_per_query} "
+        f"{_largest(features, options)!r} {features.kind!r} {rule!r}"
+    )
+    columns = (features.vertex, features.in_database)
+    query, matched, bits = remembered(
+        features.descriptors,
+        columns,
+        setting,
+        lambda: _searched_missions(features, options, rule, database),
+    )
+    return Matches(query.astype(np.int64), matched.astype(np.int64), bits)
+
+
+def _searched_missions(
+    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, database: I64
+) -> I32:
+    """Return the matches (3, M) with the nearest features in chosen missions: query, feature, bits.
 
     A query's mission is always searched: it reveals places that look alike.
     """
     d = features.descriptors
     queries = np.arange(len(features))
     other = MatchRule(rule.min_time_ns, True)
-    nearest = _in_all_missions(features, options, other, False, queries, database)
+    nearest = _nearest(features, options, other, queries, database, max_difference=np.inf)
     size = int(d.session.max()) + 1
     chosen = _chosen_missions(features, *nearest, options.max_missions_per_query, size)
+    del nearest
     parts = []
     for mission in range(size):
         in_mission = database[d.session[database] == mission]
-        wants = (d.session == mission) | np.isin(features.vertex * size + mission, chosen)
-        asked = np.flatnonzero(wants)
+        wants = np.zeros(int(features.vertex.max()) + 1, dtype=np.bool_)
+        wants[chosen[chosen % size == mission] // size] = True
+        asked = np.flatnonzero((d.session == mission) | wants[features.vertex])
         if len(in_mission) and len(asked):
-            parts.append(_in_all_missions(features, options, rule, False, asked, in_mission))
-    query = np.concatenate([part[0] for part in parts])
-    matched = np.concatenate([part[1] for part in parts])
-    order = np.argsort(query, kind="stable")
-    return query[order], matched[order]
+            pairs = _nearest(
+                features, options, rule, asked, in_mission, _largest(features, options)
+            )
+            matches = _similar(features, options, *pairs)
+            parts.append(np.stack([matches.query, matches.database, matches.bits]).astype(np.int32))
+    result = np.concatenate(parts, axis=1)
+    return result[:, np.argsort(result[0], kind="stable")]
+
+
+def _nearest(
+    features: MapFeatures,
+    options: LoopClosureOptions,
+    rule: MatchRule,
+    query: I64,
+    database: I64,
+    max_difference: float,
+) -> tuple[I64, I64]:
+    """Return the pairs of query features and their nearest database features, not remembered."""
+    d = features.descriptors
+    index = make_index(
+        options.detector_engine,
+        d.take(database),
+        seed=options.seed,
+        words_per_query=options.num_words_for_nn_search,
+        max_difference=max_difference,
+    )
+    parts = []
+    for begin in range(0, len(query), _QUERIES_AT_ONCE):
+        some = query[begin : begin + _QUERIES_AT_ONCE]
+        row = index.nearest(d.take(some), _neighbours(options), rule).row
+        i, j = np.nonzero(row >= 0)
+        parts.append((some[i], database[row[i, j]]))
+    asked, matched = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return asked, matched
+
+
+def _neighbours(options: LoopClosureOptions) -> int:
+    return options.num_neighbors if options.num_neighbors > 0 else _NEIGHBOURS
 
 
 def _chosen_missions(features: MapFeatures, query: I64, matched: I64, most: int, size: int) -> I64:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,15 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 
+_MATCHES_AT_ONCE = 400_000
+"""Matches whose rays and points are in memory together, about 200 bytes each."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseSearch:
-    """Pose problems and solutions, and the match of each row of a problem."""
+    """Estimated poses of candidates (P,), and the inliers (N,) of each."""
 
-    solutions: PoseSolutions
+    solutions: PoseSolutions  # of all candidates; `is_inlier` is that of the rows here: true
     start: I64  # (P + 1,)
     feature: I64  # (N,) query feature
     landmark: I64  # (N,)
@@ -38,28 +42,76 @@ def search_poses(
     max_iterations: int,
     hypotheses: str,
 ) -> PoseSearch:
-    """Estimate each candidate's pose T_M_I, where M is the frame of the place's mission."""
-    problem = np.repeat(np.arange(len(candidates.query_vertex)), np.diff(candidates.start))
-    feature = matches.query[candidates.match]
-    landmark = features.descriptors.label[matches.database[candidates.match]]
-    bits = matches.bits[candidates.match]
+    """Estimate each candidate's pose T_M_I, where M is the frame of the place's mission.
+
+    Candidates are solved in parts, which bounds the memory; none has an influence on another.
+    """
+    start = candidates.start
+    part = start[:-1] // _MATCHES_AT_ONCE
+    begins = np.flatnonzero(np.diff(part, prepend=-1))
+    cuts = np.append(begins, len(part)) if len(part) else np.zeros(2, dtype=np.int64)
+    parts = []
+    for begin, end in itertools.pairwise(cuts.tolist()):
+        problems, landmark, bits = _problems(
+            vi_map, features, matches, candidates, slice(begin, end), tolerance_px
+        )
+        solutions = solve_poses(
+            problems, seed=seed, max_iterations=max_iterations, hypotheses=hypotheses
+        )
+        parts.append(_inliers(problems, solutions, landmark, bits))
+    return _joined(parts)
+
+
+def _problems(
+    vi_map: VIMap,
+    features: MapFeatures,
+    matches: Matches,
+    candidates: Candidates,
+    which: slice,
+    tolerance_px: float,
+) -> tuple[PoseProblems, I64, NDArray[np.int32]]:
+    """Return the pose problems of some candidates, and landmark and bits of each row."""
+    query, place = candidates.query_vertex[which], candidates.place_vertex[which]
+    start = candidates.start[which.start : which.stop + 1]
+    match = candidates.match[start[0] : start[-1]]
+    problem = np.repeat(np.arange(len(query)), np.diff(start))
+    feature = matches.query[match]
+    landmark = features.descriptors.label[matches.database[match]]
+    bits = matches.bits[match]
     order = np.lexsort((bits, landmark, feature, problem))
     problem, feature = problem[order], feature[order]
     landmark, bits = landmark[order], bits[order]
-    mission = vi_map.vertices.mission[candidates.place_vertex].astype(np.int64)
+    mission = vi_map.vertices.mission[place].astype(np.int64)
     problems = PoseProblems(
         start=starts_of_counts(np.bincount(problem, minlength=len(mission))),
-        key=closure_ids(vi_map, candidates.query_vertex, candidates.place_vertex)[:, 0].view(
-            np.int64
-        ),
-        q_M_I=vi_map.vertices.T_M_I[candidates.query_vertex, :4],
+        key=closure_ids(vi_map, query, place)[:, 0].view(np.int64),
+        q_M_I=vi_map.vertices.T_M_I[query, :4],
         origin_I=features.origin_I[feature],
         ray_I=features.ray_I[feature],
         point_M=points_in_mission(vi_map, landmark, mission[problem]),
         keypoint=feature,
         tolerance=tolerance_px * features.rad_per_px[feature],
     )
-    solutions = solve_poses(
-        problems, seed=seed, max_iterations=max_iterations, hypotheses=hypotheses
+    return problems, landmark, bits
+
+
+def _inliers(
+    problems: PoseProblems, solutions: PoseSolutions, landmark: I64, bits: NDArray[np.int32]
+) -> PoseSearch:
+    """Keep the inliers of solved problems."""
+    rows = np.flatnonzero(solutions.is_inlier)
+    start = np.searchsorted(rows, problems.start)
+    solutions = dataclasses.replace(solutions, is_inlier=solutions.is_inlier[rows])
+    return PoseSearch(solutions, start, problems.keypoint[rows], landmark[rows], bits[rows])
+
+
+def _joined(parts: list[PoseSearch]) -> PoseSearch:
+    names = [field.name for field in dataclasses.fields(PoseSolutions)]
+    columns = {n: np.concatenate([getattr(part.solutions, n) for part in parts]) for n in names}
+    return PoseSearch(
+        PoseSolutions(**columns),
+        starts_of_counts(np.concatenate([np.diff(part.start) for part in parts])),
+        np.concatenate([part.feature for part in parts]),
+        np.concatenate([part.landmark for part in parts]),
+        np.concatenate([part.bits for part in parts]),
     )
-    return PoseSearch(solutions, problems.start, feature, landmark, bits)

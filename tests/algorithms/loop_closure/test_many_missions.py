@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.loop_closure import candidates, matching, verification
+from maplab_py.algorithms.loop_closure import features as features_module
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.search_memory import SearchMemory
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.geometry import yaw
 from maplab_py.vision.index import MatchRule
 from tests.algorithms.anchoring.test_anchoring import scrambled
@@ -70,3 +74,35 @@ def test_all_missions_are_anchored_although_each_query_sees_two():
     assert report.failure == ""
     assert len(report.anchored) == 5
     assert np.abs(yaw.from_pose(anchored.T_G_M)).max() < 0.05
+
+
+def test_a_repeated_search_of_chosen_missions_builds_no_index(room, monkeypatch):
+    _, features = room
+    monkeypatch.setattr(matching.remembered, "__defaults__", (SearchMemory(),))
+    first, _ = match_features(features, LIMITED, RULE, apart=True)
+    monkeypatch.delattr(matching, "make_index")
+    again, _ = match_features(features, LIMITED, RULE, apart=False)  # both are searched anyway
+    np.testing.assert_array_equal(first.database, again.database)
+    half = np.arange(len(features)) % 2 == 0
+    changed = dataclasses.replace(features, in_database=features.in_database & half)
+    with pytest.raises(NameError):
+        match_features(changed, LIMITED, RULE, apart=True)
+    with pytest.raises(NameError):
+        match_features(features, dataclasses.replace(LIMITED, seed=1), RULE, apart=True)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "size"),
+    [
+        (features_module, "_RAYS_AT_ONCE", 1000),
+        (candidates, "_PART_BYTES", 1e5),
+        (verification, "_MATCHES_AT_ONCE", 500),
+    ],
+)
+def test_places_that_are_looked_at_in_parts_are_the_same(room, monkeypatch, module, name, size):
+    whole = search_loops(room[0])[0].closures
+    monkeypatch.setattr(module, name, size)
+    parts = search_loops(room[0])[0].closures
+    assert len(whole) > 50
+    for field in dataclasses.fields(whole):
+        np.testing.assert_array_equal(getattr(whole, field.name), getattr(parts, field.name))

@@ -41,10 +41,22 @@ class _Counted:
         monkeypatch.setattr(search_memory, "make_index", self)
 
     def __call__(
-        self, engine: str, database: DescriptorSet, *, seed: int, words_per_query: int
+        self,
+        engine: str,
+        database: DescriptorSet,
+        *,
+        seed: int,
+        words_per_query: int,
+        max_difference: float,
     ) -> DescriptorIndex:
         self.built += 1
-        return make_index(engine, database, seed=seed, words_per_query=words_per_query)
+        return make_index(
+            engine,
+            database,
+            seed=seed,
+            words_per_query=words_per_query,
+            max_difference=max_difference,
+        )
 
 
 @pytest.fixture
@@ -58,9 +70,18 @@ def _search(
     queries: DescriptorSet,
     rules: list[MatchRule],
     k: int = 2,
+    max_difference: float = np.inf,
 ) -> list[I32]:
     return nearest_rows(
-        "hamming", database, queries, k, rules, seed=0, words_per_query=4, memory=memory
+        "hamming",
+        database,
+        queries,
+        k,
+        rules,
+        seed=0,
+        words_per_query=4,
+        max_difference=max_difference,
+        memory=memory,
     )
 
 
@@ -98,9 +119,10 @@ def test_any_change_is_searched(descriptors: DescriptorSet, counted: _Counted, c
     _search(memory, changed, descriptors, [ANY])
     _search(memory, descriptors, changed, [ANY])
     _search(memory, descriptors, descriptors, [ANY], k=3)
+    _search(memory, descriptors, descriptors, [ANY], max_difference=20.0)
     _search(memory, descriptors, descriptors, [MatchRule(10**9)])
-    assert counted.built == 5
-    assert len(memory) == 5
+    assert counted.built == 6
+    assert len(memory) == 6
 
 
 def test_the_oldest_results_are_dropped(descriptors: DescriptorSet, counted: _Counted) -> None:
