@@ -24,6 +24,9 @@ DURATION_S = 200.0
 LANDMARKS_PER_BLOCK = 8000
 _SIZES = ((3, 2), (2, 2), (2, 3), (3, 1), (1, 4), (4, 1), (1, 3))
 """Columns and rows of the blocks that the sessions walk round: 1.0 to 1.3 m/s."""
+_WALKS = 11
+"""One of so many walks goes clockwise: who walks a street the other way sees other facades, and without such
+walks a large city falls into parts."""
 _PLASTIC = 1.32471795724474602596
 """Its powers give the most even points of a plane (the R2 sequence of M. Roberts)."""
 
@@ -52,6 +55,7 @@ def _session(number: int, side: int, duration_s: float) -> SessionOptions:
         duration_s=duration_s,
         turns=turns,
         start_turn=start,
+        reverse=number % _WALKS == _WALKS - 1,
         first_block=(int(first[0]), int(first[1])),
         last_block=(int(last[0]), int(last[1])),
     )
