@@ -2,7 +2,7 @@
 
 Binary descriptors are compared by the number of different bits. All others are vectors of numbers,
 scaled to unit length, so that Euclidean distance and cosine order them alike; they are compared as
-signed bytes, whose rounding (0.05 for 256 numbers) lies far below the noise of descriptors.
+signed bytes, whose rounding moves a vector of 256 numbers by 0.018, far less than descriptors vary.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.storage.native import is_map_folder, load_map
 from maplab_py.storage.summary_map import SummaryMap, read_summary_map, summary_map_file
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import type_name
+from maplab_py.vimap.descriptors import FeatureType, type_name, types_of
 
 _FLAG = "--vio_localization_map_folder"
 _SMALLEST_SIGMA_M = 1e-3
@@ -60,6 +60,9 @@ def open_map(path: Path, *, with_covariances: bool = False) -> SearchedMap:
 
 def of_map(vi_map: VIMap, name: str, *, with_covariances: bool = False) -> SearchedMap:
     """Take a map in memory; see `open_map`."""
+    types = types_of(vi_map.frames)
+    if types and FeatureType.BINARY not in types:
+        raise UserError(_wrong_type(name, ", ".join(type_name(kind) for kind in sorted(types))))
     try:
         database = database_of_map(vi_map)
     except MaplabError as error:
@@ -91,6 +94,13 @@ def of_summary(summary: SummaryMap, name: str, *, with_covariances: bool = False
     return _checked(SearchedMap(name, database, covariance, summary.sensors))
 
 
+def _wrong_type(name: str, types: str) -> str:
+    return (
+        f"{name}: its descriptors are {types}, those of recordings are Binary: choose a map with Binary "
+        "descriptors"
+    )
+
+
 def check_descriptors(searched: SearchedMap, size: int) -> None:
     """Check that descriptors of this many bytes can be matched.
 
@@ -100,10 +110,7 @@ def check_descriptors(searched: SearchedMap, size: int) -> None:
     kind = searched.database.projection.kind
     wanted = kind.size
     if not kind.is_binary:
-        raise UserError(
-            f"{searched.name}: its descriptors are {type_name(kind.feature_type)}, those of recordings are "
-            "Binary: choose a map with Binary descriptors"
-        )
+        raise UserError(_wrong_type(searched.name, type_name(kind.feature_type)))
     if size != wanted:
         raise UserError(
             f"{searched.name}: its descriptors have {wanted} bytes, those of the recording {size}: "
