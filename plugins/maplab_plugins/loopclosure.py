@@ -207,7 +207,7 @@ def lc_report(
 
 def closure_values(session: Session) -> list[tuple[str, str]]:
     """Return the ids of the recorded closures with what was decided on them."""
-    from maplab_py.algorithms.loop_closure.listing import described_ids
+    from maplab_py.algorithms.loop_closure.closure_ids import described_ids
 
     return described_ids(session.vi_map)
 

@@ -122,8 +122,8 @@ def read_record(vi_map: VIMap) -> LoopRecord:
     Raises:
         MapError: The record is damaged.
     """
-    parts = [_decode(read_extension(b, FIELD_NUMBER)) for b in vi_map.missions.unknown]
-    record = LoopRecord.concatenate(parts)
+    contents = (read_extension(field, FIELD_NUMBER) for field in vi_map.missions.unknown)
+    record = LoopRecord.concatenate([_decode(part) for part in contents if part is not None])
     closures = record.closures
     alive = (vi_map.vertex_index.rows(closures.query) >= 0) & (
         vi_map.vertex_index.rows(closures.place) >= 0
@@ -175,9 +175,7 @@ def _encode(record: LoopRecord) -> bytes:
     return PACKED + zlib.compress(plain, 6)
 
 
-def _decode(content: bytes | None) -> LoopRecord:
-    if content is None:
-        return LoopRecord()
+def _decode(content: bytes) -> LoopRecord:
     try:
         plain = unpacked(content)
         place = 4 + int.from_bytes(plain[:4], "little")

@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import io
 import json
-import weakref
 from pathlib import Path
 
 import numpy as np
@@ -112,27 +111,6 @@ def _near_misses(vi_map: VIMap, record: LoopRecord) -> F64:
     total = shortfalls(gates)
     failed = np.sum([gate.failed for gate in gates], axis=0)
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)
-
-
-_DESCRIBED: weakref.WeakKeyDictionary[VIMap, list[tuple[str, str]]] = weakref.WeakKeyDictionary()
-"""Descriptions of the closures of maps, which do not change as maps are values."""
-
-
-def described_ids(vi_map: VIMap) -> list[tuple[str, str]]:
-    """Return the beginnings of the ids of all recorded closures, with inliers and verdict."""
-    if vi_map not in _DESCRIBED:
-        c = read_record(vi_map).closures
-        _DESCRIBED[vi_map] = [
-            (id_[:8], f"{inliers} of {matches} matches, {VERDICTS[verdict].value}")
-            for id_, inliers, matches, verdict in zip(
-                to_hex_list(c.id),
-                c.inliers.tolist(),
-                c.matches.tolist(),
-                c.verdict.tolist(),
-                strict=True,
-            )
-        ]
-    return _DESCRIBED[vi_map]
 
 
 def describe_closure(vi_map: VIMap, row: int) -> ClosureLine:

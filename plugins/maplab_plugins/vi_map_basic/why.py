@@ -27,7 +27,7 @@ _QUALITY = LandmarkQualityOptions()
 
 def subjects(session: Session) -> list[tuple[str, str]]:
     """Return what can be asked about: the missions, then the recorded closures."""
-    from maplab_py.algorithms.loop_closure.listing import described_ids
+    from maplab_py.algorithms.loop_closure.closure_ids import described_ids
     from maplab_py.vimap.queries import mission_labels
 
     missions = [(label, "mission") for label in mission_labels(session.vi_map)]

@@ -80,3 +80,18 @@ def test_completion_latency(session: Session, line: str, at_least: int) -> None:
         seconds.append(time.process_time() - start)
         assert len(found) >= at_least
     assert sorted(seconds)[3] <= MOST_SECONDS * slowness()
+
+
+def test_the_first_key_on_many_closures_does_not_wait(session: Session) -> None:
+    """Nothing is remembered of this value of the map: it is read and described for the first time."""
+    completer = CommandCompleter(session)
+    list(completer.get_completions(Document("remove_loopclosure "), CompleteEvent()))  # imports
+    seconds = []
+    for number in range(5):
+        changed = session.vi_map.replace(missions=session.vi_map.missions.replace())
+        session.maps.add(f"changed_{number}", changed)
+        start = time.process_time()
+        found = list(completer.get_completions(Document("remove_loopclosure "), CompleteEvent()))
+        seconds.append(time.process_time() - start)
+        assert len(found) == 1000
+    assert sorted(seconds)[2] <= MOST_SECONDS * slowness()
