@@ -87,6 +87,10 @@ def _demo(folder: Path) -> None:
             viewer.set_layer("landmarks", False)
             viewer.look_at_everything()
             _take(page, "viewer_difference.png")
+            session.run("visualize_difference", with_map_key="odometry", side_by_side=True)
+            viewer.set_layer("landmarks", True)
+            viewer.look_at_everything()
+            _take(page, "viewer_side_by_side.png")
 
 
 def _recording(folder: Path) -> None:
@@ -98,8 +102,10 @@ def _recording(folder: Path) -> None:
         viewer = _viewer(session)
         with _page(viewer) as page:
             _take(page, "viewer_height.png")
+            viewer.open_time_line()
             viewer.set_step(110)
             _take(page, "viewer_playback.png")
+            viewer.playback.time_line.panel.minimize()
             viewer.set_step(10_000)
             viewer.set_dark(False)
             viewer.set_colouring("observations")

@@ -102,7 +102,8 @@ def _start(arguments: Arguments, terminal: ConsoleTerminal) -> Status:
     if arguments.mode == "batch":
         return _run_batches(arguments, terminal, registry)
     runner = make_runner(arguments, terminal, registry)
-    starts_tour = arguments.mode == "command" and arguments.words[0] == _TOUR
+    asks_for_help = not {"--help", "-h"}.isdisjoint(arguments.words)
+    starts_tour = arguments.mode == "command" and arguments.words[0] == _TOUR and not asks_for_help
     if (arguments.mode == "prompt" or starts_tour) and sys.stdin.isatty():
         from maplab_py.console.prompt.loop import run_prompt
 

@@ -6,8 +6,10 @@ python -m tests.benchmarks.viewer
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,7 +35,9 @@ from maplab_py.vimap import (
     VIMap,
 )
 from maplab_py.vimap.ids import random_ids
+from tests.support.machine import descendants_cpu_s
 from tests.viewer.display.browsing import Page, chromium, is_blank
+from tests.viewer.display.page_messages import Message, decoded, is_replayed, open_page
 
 PAIRS = 5
 
@@ -76,19 +80,35 @@ def big_map(vertices: int, landmarks: int, observations: int, missions: int = 4)
 def opening(subject: Subject, layer: str) -> dict[str, float]:
     """Return the seconds from the command to a page that shows a layer, and of its parts."""
     with chromium() as browser:
-        began = time.perf_counter()
+        began, cpu = time.perf_counter(), descendants_cpu_s()
         viewer = Viewer(0)
         scene = viewer.show(subject)
         served = time.perf_counter()
         page = Page(browser, viewer.url)
         shown = page.wait_until(lambda: not is_blank(page.picture()), 60.0)
-        done = time.perf_counter()
+        done, page_cpu = time.perf_counter(), descendants_cpu_s() - cpu
+        sent = sent_bytes(viewer)
         viewer.stop()
     drawn = scene.layer(layer).drawn
     return {
         "drawn": drawn, "shown": float(shown), "served_s": served - began, "page_s": done - served,
-        "total_s": done - began,
+        "total_s": done - began, "page_cpu_s": page_cpu, "sent_megabytes": 1e-6 * sent,
+        "load": os.getloadavg()[0],
     }  # fmt: skip
+
+
+def sent_bytes(viewer: Viewer) -> int:
+    """Return how many bytes a page that is opened now is sent, the page itself included."""
+    packed = {"Accept-Encoding": "gzip"}
+    with urllib.request.urlopen(urllib.request.Request(viewer.url, headers=packed)) as answer:
+        total = len(answer.read())
+    with open_page(viewer) as page:
+        messages: list[Message] = []
+        while not any(is_replayed(message) for message in messages):
+            data = page.recv(timeout=60.0)
+            total += len(data)
+            messages = decoded(bytes(data))
+    return total
 
 
 def frame_rate(landmarks: int, seconds: float = 10.0) -> dict[str, float]:
@@ -182,6 +202,9 @@ def main() -> None:
         print(json.dumps({"turning the view, in software": frame_rate(landmarks)}))
     print(json.dumps({"picking among 150k landmarks [s]": picking(keyframes)}))
     for folder in sys.argv[1:]:
+        with open_map(Path(folder)) as session:
+            recorded = Subject(session.vi_map, Path(folder).name)
+        print(json.dumps({f"first picture of {recorded.title}": opening(recorded, "landmarks")}))
         print(json.dumps({f"optvi on {Path(folder).name}": following(Path(folder))}))
 
 

@@ -13,7 +13,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.options import VisualizationOptions
 from tests.benchmarks.viewer import big_map
+from tests.support.machine import descendants_cpu_s
 from tests.viewer.display.browsing import Page, chromium, is_blank
 
 FRAMES = 6
@@ -118,25 +118,6 @@ def frame_costs(landmarks: int, *, is_antialiased: bool = True) -> Iterator[dict
                 "cpu_ms": round(cpu_ms), "ratio": round(cpu_ms / whole, 2),
                 "shortest_ms": round(min(took_ms)), "load": round(os.getloadavg()[0], 1),
             }  # fmt: skip
-
-
-def descendants_cpu_s() -> float:
-    """Return the processor time of all processes that this one has started [s]."""
-    children: dict[int, list[tuple[int, int]]] = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            text = path.read_text()
-        except OSError:
-            continue  # it has ended
-        fields = text[text.rindex(")") + 2 :].split()
-        ticks = int(fields[11]) + int(fields[12])
-        children.setdefault(int(fields[1]), []).append((int(text.split()[0]), ticks))
-    total, left = 0, [os.getpid()]
-    while left:
-        for pid, ticks in children.get(left.pop(), []):
-            total += ticks
-            left.append(pid)
-    return total / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:

@@ -6,10 +6,16 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.loop_closure.acceptance import Acceptance, acceptance
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.detection import detect
-from maplab_py.algorithms.loop_closure.gate_values import GateValues, gate_values, shortfalls
+from maplab_py.algorithms.loop_closure.gate_values import (
+    YES_NO,
+    GateValues,
+    gate_values,
+    shortfalls,
+)
 from maplab_py.algorithms.loop_closure.listing import describe_closure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
@@ -21,6 +27,11 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex, to_hex_list
 
 _NEAREST = 5
+_REASONS = {
+    Verdict.CONTRADICTED: "closures nearby disagree",
+    Verdict.AMBIGUOUS: "another place looks the same",
+}
+"""Why a closure is refused that passes all gates on its own pose."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +135,9 @@ def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> Clo
         use=line.use,
         weight=line.weight,
         gates=tuple(lines),
-        summary=_summary_of_closure(verdict, failed, line.merged),
+        summary=_summary_of_closure(
+            verdict, failed, line.merged, acceptance(vi_map, closures, row, gates, options)
+        ),
     )
 
 
@@ -251,7 +264,9 @@ def _without_candidates(
     return PairExplanation(names, 0, 0, (line,), (), summary)
 
 
-def _summary_of_closure(verdict: Verdict, failed: list[GateValues], merged: int) -> str:
+def _summary_of_closure(
+    verdict: Verdict, failed: list[GateValues], merged: int, acceptance: Acceptance | None
+) -> str:
     if verdict is Verdict.ACCEPTED:
         pairs = counted(merged, "pair") if merged else "no pair"
         text = f"Accepted; {pairs} of landmarks merged by it."
@@ -261,11 +276,16 @@ def _summary_of_closure(verdict: Verdict, failed: list[GateValues], merged: int)
         if verdict in OF_CLOUDS:
             return f"Refused: {verdict.value}. The flags are those of register_point_clouds."
         return f"Refused: {verdict.value}. With these flags and poses it would pass."
-    flags = [gate.flag for gate in failed if gate.flag]
     text = f"Refused: {verdict.value}."
-    if len(flags) == len(failed):
-        return f"{text} To accept it, change {' and '.join(dict.fromkeys(flags))}."
-    return f"{text} No flag accepts it."
+    if acceptance is None:
+        return f"{text} No flag accepts it."
+    flags = " ".join(acceptance.flags)
+    if acceptance.verdict is Verdict.ACCEPTED:
+        return f"{text} {flags} would accept it."
+    return (
+        f"{text} {flags} would not suffice: it would then be refused because "
+        f"{_REASONS[acceptance.verdict]}, and no flag moves that."
+    )
 
 
 def _near_misses(closures: ClosureRecord, gates: list[GateValues]) -> tuple[NearMiss, ...]:
@@ -293,6 +313,9 @@ def _pair_gate(gate: GateValues) -> PairGate:
 
 
 def _gate_line(gate: GateValues, row: int) -> GateLine:
+    if gate.unit == YES_NO:
+        words = [("yes" if x else "no") for x in (gate.value[row], gate.threshold[row])]
+        return GateLine(gate.name, *words, "failed" if gate.failed[row] else "passed", gate.flag)
     unit = f" {gate.unit}" if gate.unit else ""
     side = "at least" if gate.is_minimum else "at most"
     return GateLine(

@@ -31,8 +31,11 @@ from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 
+YES_NO = "yes or no"
+"""Unit of gates whose value is 1 = yes or 0 = no."""
+
 _DRIFT_OFFSET_M = 0.5
-_RIVAL_SHARE = 0.5
+RIVAL_SHARE = 0.5
 """Share of inliers from which on another place makes a query ambiguous."""
 
 
@@ -48,6 +51,7 @@ class GateValues:
     applies: Mask  # (N,)
     flag: str  # moves the threshold; empty = none does
     verdict: Verdict  # of closures that fail
+    flag_value: F64  # (N,) of the flag, with which the closure just passes
 
     @property
     def failed(self) -> Mask:
@@ -62,6 +66,7 @@ class GateValues:
             value=self.value[rows],
             threshold=self.threshold[rows],
             applies=self.applies[rows],
+            flag_value=self.flag_value[rows],
         )
 
     @property
@@ -82,28 +87,31 @@ def gate_values(
         closures: All recorded closures (N): places look alike in comparison with others.
         options: Thresholds.
     """
-    geometry = _geometric_gates(vi_map, closures, options)
+    geometry = geometric_gates(vi_map, closures, options)
     geometric = np.asarray(~np.any([gate.failed for gate in geometry], axis=0))
     return geometry + _gates_among_closures(vi_map, closures, options, geometric)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Relations:
+class Relations:
     """How the ends of closures (N) are related."""
 
     same: Mask  # in one mission
     related: Mask  # in one mission, or in two of known base frame
+    between_m: F64  # length of the path between the ends, in one mission
     drift_m: F64  # plausible drift between the ends, in one mission
 
     @classmethod
-    def of(cls, vi_map: VIMap, c: ClosureRecord, options: LoopClosureOptions) -> _Relations:
+    def of(cls, vi_map: VIMap, c: ClosureRecord, options: LoopClosureOptions) -> Relations:
+        """Return the relations of the ends of recorded closures."""
         query, place = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
         mission, way = vi_map.vertices.mission, path_lengths(vi_map)
         same = np.asarray(mission[query] == mission[place])
         known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
         related = same | (known[mission[query]] & known[mission[place]])
         between = np.abs(way[query] - way[place])
-        return cls(same, related, _DRIFT_OFFSET_M + options.max_drift_ratio * between)
+        drift = _DRIFT_OFFSET_M + options.max_drift_ratio * between
+        return cls(same, related, between, drift)
 
 
 def _gate(
@@ -116,25 +124,28 @@ def _gate(
     *,
     is_minimum: bool = False,
     applies: Mask | None = None,
+    flag_value: F64 | None = None,
 ) -> GateValues:
     count = len(value)
+    values = np.asarray(value, dtype=np.float64)
     limits = np.broadcast_to(np.asarray(threshold, dtype=np.float64), (count,))
     everywhere = np.ones(count, dtype=np.bool_)
     return GateValues(
         name,
         unit,
-        np.asarray(value, dtype=np.float64),
+        values,
         limits,
         is_minimum,
         everywhere if applies is None else applies,
         flag,
         verdict,
+        values if flag_value is None else flag_value,
     )
 
 
-def _geometric_gates(vi_map: VIMap, c: ClosureRecord, o: LoopClosureOptions) -> list[GateValues]:
+def geometric_gates(vi_map: VIMap, c: ClosureRecord, o: LoopClosureOptions) -> list[GateValues]:
     """Return the gates on the pose of a closure and on its correction."""
-    relations = _Relations.of(vi_map, c, o)
+    relations = Relations.of(vi_map, c, o)
     # the record has the deviations about three axes; their largest and their norm are bounds of that
     # about the worst axis, and the verdict tells which of them applies
     sigma_rad = np.where(
@@ -163,6 +174,7 @@ def _geometric_gates(vi_map: VIMap, c: ClosureRecord, o: LoopClosureOptions) -> 
         _gate(
             "correction", c.correction_m, relations.drift_m, Verdict.IMPLAUSIBLE,
             "--lc_max_drift_ratio", "m", applies=relations.same,
+            flag_value=(c.correction_m - _DRIFT_OFFSET_M) / np.maximum(relations.between_m, 1e-9),
         ),
         _gate(
             "correction of the position", c.correction_m, o.max_delta_position_m,
@@ -181,15 +193,15 @@ def _gates_among_closures(
     vi_map: VIMap, c: ClosureRecord, o: LoopClosureOptions, geometric: Mask
 ) -> list[GateValues]:
     """Return the gates that compare a closure with others; `geometric` (N) passed those before."""
-    relations = _Relations.of(vi_map, c, o)
+    relations = Relations.of(vi_map, c, o)
     is_far = relations.same & (c.correction_m > relations.drift_m)
-    rivals = _rival_shares(vi_map, c, geometric, is_far, o)
+    rivals = rival_shares(vi_map, c, geometric, is_far, o)
     is_alike = c.verdict == VERDICTS.index(Verdict.AMBIGUOUS)
     contest = _contest_values(vi_map, c, geometric, is_far, ~relations.related, o)
     is_contested = is_alike & ~relations.related
     return [
         _gate(
-            "inliers of another place / of the best", rivals, np.nextafter(_RIVAL_SHARE, 0.0),
+            "inliers of another place / of the best", rivals, np.nextafter(RIVAL_SHARE, 0.0),
             Verdict.AMBIGUOUS, applies=is_alike & relations.related,
         ),
         _gate(
@@ -198,12 +210,12 @@ def _gates_among_closures(
             applies=is_contested,
         ),
         _gate(
-            "an alignment of the missions wins (1 = yes)", contest.is_decided, 1.0,
-            Verdict.AMBIGUOUS, is_minimum=True, applies=is_contested,
+            "an alignment of the missions wins", contest.is_decided, 1.0,
+            Verdict.AMBIGUOUS, unit=YES_NO, is_minimum=True, applies=is_contested,
         ),
         _gate(
-            "agrees with the best alignment (1 = yes)", contest.follows, 1.0, Verdict.AMBIGUOUS,
-            is_minimum=True, applies=is_contested,
+            "agrees with the best alignment", contest.follows, 1.0, Verdict.AMBIGUOUS,
+            unit=YES_NO, is_minimum=True, applies=is_contested,
         ),
         _gate(
             "query vertices nearby that agree", c.support, o.min_support, Verdict.NO_SUPPORT,
@@ -211,17 +223,18 @@ def _gates_among_closures(
             applies=c.verdict == VERDICTS.index(Verdict.NO_SUPPORT),
         ),
         _gate(
-            "contradicted by closures nearby (1 = yes)",
+            "contradicted by closures nearby",
             c.verdict == VERDICTS.index(Verdict.CONTRADICTED), 0.0, Verdict.CONTRADICTED,
+            unit=YES_NO,
         ),
         _gate(
-            "removed by hand (1 = yes)", c.verdict == VERDICTS.index(Verdict.REMOVED), 0.0,
-            Verdict.REMOVED,
+            "removed by hand", c.verdict == VERDICTS.index(Verdict.REMOVED), 0.0,
+            Verdict.REMOVED, unit=YES_NO,
         ),
     ]  # fmt: skip
 
 
-def _rival_shares(
+def rival_shares(
     vi_map: VIMap,
     c: ClosureRecord,
     geometric: Mask,

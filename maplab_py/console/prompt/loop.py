@@ -114,23 +114,34 @@ def prompt_parts(session: Session) -> StyleAndTextTuples:
     return [*parts, ("", ":/$ ")]
 
 
-def toolbar_text(session: Session) -> str:
-    """Return the line below the prompt: what is selected, unsaved, running and announced."""
-    facts = []
+def toolbar_text(session: Session, columns: int = 0) -> str:
+    """Return the line below the prompt: what is selected, unsaved, running and announced.
+
+    Args:
+        session: The session.
+        columns: Width of the terminal; counts are left out where it is too narrow. 0 = any.
+    """
+    facts: list[str] = []
+    counts: list[str] = []  # the first ones are the first to go
     if session.maps.selected_key:
         entry = session.maps.selected
-        facts += [
-            f"map {entry.key}",
-            _missions(entry),
-            counted(len(entry.vi_map.vertices), "vertex", "vertices"),
+        missions = _missions(entry)
+        facts += [f"map {entry.key}", missions]
+        counts = [
             counted(len(entry.vi_map.landmarks), "landmark"),
-            "saved" if entry.is_saved else "unsaved",
+            counted(len(entry.vi_map.vertices), "vertex", "vertices"),
+            missions,
         ]
+        facts += [*counts[1::-1], "saved" if entry.is_saved else "unsaved"]
         others = len(session.maps) - 1
         facts += [f"{others} other map{'' if others == 1 else 's'}"] if others else []
     running = ", ".join(f"[{job.number}] {job.call.command.name}" for job in session.jobs.running)
     facts += [f"running {running}"] if running else []
     facts += [f"{topic} {text}" for topic, text in session.marks.items() if text and topic != SHEEP]
+    for count in counts:
+        if not 0 < columns < len(" · ".join(facts)):
+            break
+        facts.remove(count)
     return " · ".join(facts)
 
 
@@ -160,7 +171,9 @@ def run_prompt(runner: Runner, first_line: str = "") -> Status:
         complete_while_typing=Condition(lambda: session.settings.is_on("complete_while_typing")),
         style=_STYLE,
         color_depth=ColorDepth.DEPTH_1_BIT if plain else None,
-        bottom_toolbar=None if plain else lambda: toolbar_text(session) or None,
+        bottom_toolbar=None
+        if plain
+        else lambda: toolbar_text(session, shutil.get_terminal_size().columns) or None,
         refresh_interval=0 if plain else 1.0,
     )
     runner.terminal.is_prompt = True

@@ -14,7 +14,9 @@ _SIGNIFICANT_DIGITS = 4
 _LEAST_SIGNIFICANT_DIGITS = 3
 _MORE_DECIMALS = 2
 _MAX_DECIMALS = 6
-_FIXED_POINT_RANGE = (1e-4, 1e6)
+_FIXED_POINT_RANGE = (1e-4, 1e9)
+_ROUNDING_NOISE = 1e-12
+"""A column whose numbers are all smaller is one of zeros."""
 
 
 def format_cell(value: Any) -> str:
@@ -40,21 +42,26 @@ def format_column(values: Sequence[Any]) -> list[str]:
     """Format the cells of a column; its numbers with fractions have the same number of decimals.
 
     The largest number has at least four significant digits, and up to two decimals more if the
-    smallest needs them. Columns of very large or very small numbers use exponents.
+    smallest needs them. Where the largest would be too long or too small all numbers have exponents.
     """
     numbers = [abs(float(v)) for v in values if isinstance(v, (float, np.floating))]
     sizes = [number for number in numbers if number > 0 and math.isfinite(number)]
-    if not sizes or not _is_fixed_point(sizes):
-        return [_format_plain(value) for value in values]
+    if not sizes or max(sizes) < _ROUNDING_NOISE:
+        return [_format_plain(0.0 if _is_number(value) else value) for value in values]
+    if not _is_fixed_point(sizes):
+        return [f"{value:.3e}" if _is_number(value) else _format_plain(value) for value in values]
     largest = max(_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(max(sizes))), 0)
     smallest = _LEAST_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(min(sizes)))
     decimals = min(max(largest, min(smallest, largest + _MORE_DECIMALS)), _MAX_DECIMALS)
     return [
-        f"{float(value):.{decimals}f}"
-        if isinstance(value, (float, np.floating)) and math.isfinite(value)
-        else _format_plain(value)
+        f"{float(value):.{decimals}f}" if _is_number(value) else _format_plain(value)
         for value in values
     ]
+
+
+def _is_number(value: Any) -> bool:
+    """Tell whether a cell is a finite number with a fraction."""
+    return isinstance(value, (float, np.floating)) and math.isfinite(value)
 
 
 def _is_fixed_point(sizes: list[float]) -> bool:

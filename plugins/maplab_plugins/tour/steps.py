@@ -142,7 +142,7 @@ def _results(folder: Path) -> tuple[Step, ...]:
             "The sessions are simulated, so the true poses are known.",
             f"evaluate_map {_path(folder / 'sessions', 'truth.npz')}",
             ("evaluate_map",),
-            "`ate_m` is the error of all sessions together, in metres: one map, accurate to millimetres.",
+            "`ATE [m]` at the top is the error of all sessions together: one map, accurate to millimetres.",
         ),
         Step(
             "Save",

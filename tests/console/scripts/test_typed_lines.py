@@ -194,6 +194,11 @@ def test_the_toolbar_tells_what_is_selected(runner: Runner) -> None:
         "map a · 2 missions · 0 vertices · 0 landmarks · unsaved · 1 other map · "
         "viewer http://localhost:8080"
     )
+    for columns in range(60, 130):
+        assert toolbar_text(session, columns).endswith("viewer http://localhost:8080")
+        assert len(toolbar_text(session, columns)) <= columns or columns < 64
+    assert "0 vertices" in toolbar_text(session, 90)
+    assert "landmarks" not in toolbar_text(session, 90)
 
 
 def test_the_pager_gets_what_is_longer_than_the_screen(

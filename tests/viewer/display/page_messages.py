@@ -100,9 +100,15 @@ def read_until(connection: ClientConnection, is_last: Callable[[Message], bool])
     while not any(is_last(message) for message in messages):
         data = connection.recv(timeout=20.0)
         assert isinstance(data, bytes)
-        end = _HEADER + int.from_bytes(data[8:_HEADER], "little")
-        content = zstandard.ZstdDecompressor().decompress(data[_HEADER:end])
-        messages += msgspec.msgpack.decode(content)["messages"]
+        messages += decoded(data)
+    return messages
+
+
+def decoded(data: bytes) -> list[Message]:
+    """Return the messages of one frame of the connection."""
+    end = _HEADER + int.from_bytes(data[8:_HEADER], "little")
+    content = zstandard.ZstdDecompressor().decompress(data[_HEADER:end])
+    messages: list[Message] = msgspec.msgpack.decode(content)["messages"]
     return messages
 
 
