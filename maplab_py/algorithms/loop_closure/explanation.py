@@ -314,8 +314,9 @@ def _pair_gate(gate: GateValues) -> PairGate:
 
 def _gate_line(gate: GateValues, row: int) -> GateLine:
     if gate.unit == YES_NO:
-        words = [("yes" if x else "no") for x in (gate.value[row], gate.threshold[row])]
-        return GateLine(gate.name, *words, "failed" if gate.failed[row] else "passed", gate.flag)
+        value, wanted = ("yes" if x else "no" for x in (gate.value[row], gate.threshold[row]))
+        result = "failed" if gate.failed[row] else "passed"
+        return GateLine(gate.name, value, wanted, result, gate.flag)
     unit = f" {gate.unit}" if gate.unit else ""
     side = "at least" if gate.is_minimum else "at most"
     return GateLine(
