@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import Mask
+from maplab_py.errors import MapError
 from maplab_py.report import Report, counted
+from maplab_py.sensors.wheels import wheel_scale
 from maplab_py.vimap.descriptors import NO_DESCRIPTOR
 from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import has_link, mission_sensor_id
@@ -397,6 +399,12 @@ def _check_sensors(vi_map: VIMap, findings: _Findings) -> None:
             name = to_hex(vi_map.missions.id[row])
             rule = f"mission whose {', '.join(missing)} is not in sensors.yaml"
             findings.errors.append(Violation(rule, 1, (name,)))
+    for sensor_id in known:
+        try:
+            wheel_scale(vi_map.sensors, sensor_id)
+        except MapError:
+            rule = "wheel sensor whose scale in sensors.yaml is no positive number"
+            findings.errors.append(Violation(rule, 1, (sensor_id,)))
     edges = vi_map.transformation_edges
     for words in np.unique(edges.sensor_id[is_valid(edges.sensor_id)], axis=0):
         if to_hex(words) not in known:

@@ -203,6 +203,17 @@ def test_files_merging_and_keyframes_keep_wheels(session: Session, tmp_path: Pat
     np.testing.assert_allclose(pairs.T_A_B, se3.relative(T_M_S[first], T_M_S[second]), atol=1e-9)
 
 
+def test_scales_that_are_no_positive_numbers_are_found(session: Session, tmp_path: Path) -> None:
+    session.run("import_wheel_odometry", wheel_file=write_poses(tmp_path / "w.csv"), **FLAGS)
+    vi_map = session.vi_map
+    sensor_id = to_hex(vi_map.missions.sensor_id[0, MissionSensor.WHEEL_ODOMETRY])
+    wrong = vi_map.replace(sensors=with_wheel_scale(vi_map.sensors, sensor_id, -1.0))
+    more = set(check_consistency(wrong).errors) - set(check_consistency(vi_map).errors)
+    assert [violation.rule for violation in more] == [
+        "wheel sensor whose scale in sensors.yaml is no positive number"
+    ]
+
+
 def test_relaxation_does_not_take_wheels_for_the_body(session: Session, tmp_path: Path) -> None:
     vi_map = session.vi_map
     missions = vi_map.missions.replace(backbone=np.array([Backbone.ODOMETRY]))
