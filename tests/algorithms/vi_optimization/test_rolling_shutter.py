@@ -107,26 +107,39 @@ def test_line_delays_survive_the_files_of_a_map(exact: SimulatedData, tmp_path: 
     )
 
 
+OPTIONS = VIOptimizationOptions(num_iterations=60)
+
+
+def ate_m(start: VIMap, data: SimulatedData, **free: bool) -> tuple[float, Camera]:
+    """Return the absolute trajectory error of the optimised map, and its camera."""
+    result, report = optimize(start, dataclasses.replace(OPTIONS, **free))
+    assert all(row.sigma > 0.0 for row in report.calibration)
+    return evaluate_map(result, data.truth).ate_m, camera_of(result)
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_is_as_good_as_a_global_one() -> None:
+    """Over twelve walks; those of one seed have different noise, and differ by up to a factor of three."""
+    squares = np.zeros(3)  # global shutter; rolling, known; rolling, ignored
+    for seed in range(1, 13):
+        reference, rolling = (simulate(scenario(seed, 20.0, line)) for line in (0.0, LINE_DELAY_S))
+        vi_map = rolling.maps[0]
+        still = with_timing(vi_map, image_delay_s=0.0, line_delay_ns=0)
+        known_m, camera = ate_m(vi_map, rolling)
+        assert camera.line_delay_ns == 62_500
+        errors_m = [ate_m(reference.maps[0], reference)[0], known_m, ate_m(still, rolling)[0]]
+        squares += np.square(errors_m)
+    global_m, known_m, ignored_m = np.sqrt(squares / 12)
+    assert known_m <= 1.2 * global_m
+    assert ignored_m > 2.0 * known_m
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_rolling_shutter_is_as_good_as_a_global_one(seed: int) -> None:
-    options = VIOptimizationOptions(num_iterations=60)
-    seconds = 20.0
-    data = simulate(scenario(seed, seconds, 0.0))
-    reference_m = evaluate_map(optimize(data.maps[0], options)[0], data.truth).ate_m
-    rolling = simulate(scenario(seed, seconds))
+def test_line_delays_are_estimated_from_nothing(seed: int) -> None:
+    rolling = simulate(scenario(seed, 20.0))
     vi_map = rolling.maps[0]
-
-    def ate_m(start: VIMap, **free: bool) -> tuple[float, Camera]:
-        result, report = optimize(start, dataclasses.replace(options, **free))
-        assert all(row.sigma > 0.0 for row in report.calibration)
-        return evaluate_map(result, rolling.truth).ate_m, camera_of(result)
-
-    known_m, camera = ate_m(vi_map)
-    assert known_m <= 1.2 * reference_m
-    assert camera.line_delay_ns == 62_500
-    ignored_m, _ = ate_m(with_timing(vi_map, image_delay_s=0.0, line_delay_ns=0))
-    assert ignored_m > 1.5 * known_m
+    known_m, _ = ate_m(vi_map, rolling)
     for start, free in (
         (with_timing(vi_map, line_delay_ns=0), {}),
         (
@@ -134,8 +147,8 @@ def test_a_rolling_shutter_is_as_good_as_a_global_one(seed: int) -> None:
             {"fix_ncamera_time_offset": False},
         ),
     ):
-        estimated_m, camera = ate_m(start, fix_ncamera_line_delay=False, **free)
-        assert estimated_m <= 1.2 * reference_m
+        estimated_m, camera = ate_m(start, rolling, fix_ncamera_line_delay=False, **free)
+        assert estimated_m <= 1.2 * known_m
         assert camera.line_delay_ns == pytest.approx(62_500, rel=0.03)
         assert camera.image_delay_s == pytest.approx(-0.015, abs=1e-3)
 
