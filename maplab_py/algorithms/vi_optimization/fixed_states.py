@@ -35,10 +35,30 @@ def hold_unconstrained(problem: Problem, states: States) -> I64:
     return np.flatnonzero(~touched[NODES_PER_VERTEX * np.arange(num_vertices) + POSITION])
 
 
+def fix_vertices(problem: Problem, vertices: I64) -> None:
+    """Fix pose, velocity and biases of vertices (k,)."""
+    problem.fix((NODES_PER_VERTEX * vertices[:, None] + np.arange(NODES_PER_VERTEX)).reshape(-1))
+
+
 def fix_gauge(
-    problem: Problem, states: States, held: I64, *, has_inertial: bool, has_fixed_landmarks: bool
+    problem: Problem,
+    states: States,
+    held: I64,
+    *,
+    has_inertial: bool,
+    has_fixed_landmarks: bool,
+    fixed: I64 | None = None,
 ) -> str:
-    """Fix the unobservable directions of each cluster and return a description."""
+    """Fix the unobservable directions of each cluster and return a description.
+
+    Args:
+        problem: Where they are fixed.
+        states: Present states.
+        held: Vertices that nothing constrains.
+        has_inertial: Inertial terms are used.
+        has_fixed_landmarks: All landmarks are fixed.
+        fixed: Vertices that are fixed already; they anchor their cluster.
+    """
     num_vertices = len(states.T_G_I)
     labels = gauge.clusters(num_vertices, _links(problem, num_vertices))
     is_held = np.zeros(num_vertices, dtype=np.bool_)
@@ -49,6 +69,8 @@ def fix_gauge(
     has_prior = problem.visual is not None and problem.visual.has_landmark_prior
     if has_fixed_landmarks or has_prior:
         anchored |= set(np.unique(labels[_observing(problem)]).tolist())
+    if fixed is not None:
+        anchored |= set(np.unique(labels[fixed]).tolist())
     inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
     scaled = _labels_with_scale(labels, problem) | _labels_of_rigs(labels, problem)
     counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}

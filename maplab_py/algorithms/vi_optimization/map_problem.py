@@ -34,7 +34,11 @@ from maplab_py.algorithms.vi_optimization.factor_terms import (
     landmark_prior,
     prior_terms,
 )
-from maplab_py.algorithms.vi_optimization.fixed_states import fix_gauge, hold_unconstrained
+from maplab_py.algorithms.vi_optimization.fixed_states import (
+    fix_gauge,
+    fix_vertices,
+    hold_unconstrained,
+)
 from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
 from maplab_py.algorithms.vi_optimization.options import FixedStates, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
@@ -114,9 +118,10 @@ def build(
     options: VIOptimizationOptions,
     *,
     missions: NDArray[np.integer] | None = None,
+    fixed_vertices: I64 | None = None,
     progress: Progress = SILENT,
 ) -> MapProblem:
-    """Build the problem of some missions (rows, None = all).
+    """Build the problem of some missions (rows, None = all); some vertices (rows) may be held fixed.
 
     Raises:
         UserError: Flags contradict each other.
@@ -128,12 +133,18 @@ def build(
     problem = make_problem(states, parts.visual, parts.terms, options, progress)
     held = hold_unconstrained(problem, states)
     _fix_by_options(problem, options, states, parts.rig)
+    fixed = None
+    if fixed_vertices is not None:
+        fixed = parts.selection.rows(fixed_vertices)
+        fixed = fixed[fixed >= 0]
+        fix_vertices(problem, fixed)
     gauge = fix_gauge(
         problem,
         states,
         held,
         has_inertial=options.include_inertial,
         has_fixed_landmarks=options.fix_landmark_positions,
+        fixed=fixed,
     )
     return parts.map_problem(problem, held, gauge)
 

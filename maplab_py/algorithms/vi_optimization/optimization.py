@@ -14,6 +14,7 @@ from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimiza
 from maplab_py.algorithms.vi_optimization.report_building import make_report
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.algorithms.vi_optimization.solution import apply_states
+from maplab_py.array_types import I64
 from maplab_py.estimation.problem.solver import AfterStep, SolverOptions, optimize_states
 from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
@@ -29,10 +30,19 @@ def optimize(
     options: VIOptimizationOptions,
     *,
     missions: NDArray[np.integer] | None = None,
+    fixed_vertices: I64 | None = None,
     progress: Progress = SILENT,
     watch: Watch | None = None,
 ) -> tuple[VIMap, VIOptimizationReport]:
     """Optimise the free states of some missions (rows, None = all).
+
+    Args:
+        vi_map: The map.
+        options: See there.
+        missions: Mission rows.
+        fixed_vertices: Vertices (rows) whose states are held fixed.
+        progress: Shown meanwhile.
+        watch: Called between iterations.
 
     Returns:
         The optimised map and a report of costs, reprojection errors and outliers.
@@ -42,7 +52,9 @@ def optimize(
         MapError: Calibrations that the terms need are missing.
     """
     began = time.perf_counter()
-    map_problem = build(vi_map, options, missions=missions, progress=progress)
+    map_problem = build(
+        vi_map, options, missions=missions, fixed_vertices=fixed_vertices, progress=progress
+    )
     built = time.perf_counter()
     quiet = options.hide_iterations_console_output
     final, summary = optimize_states(

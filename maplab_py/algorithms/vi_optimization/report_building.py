@@ -74,6 +74,7 @@ def make_report(
         seconds_total=0.0,
         note=_note(landmarks, len(selection.landmarks)),
         absolute_poses_rejected=map_problem.factors.absolute_poses_rejected,
+        trust_region_radius=summary.radius,
     )
 
 

@@ -80,6 +80,7 @@ class VIOptimizationReport(Report):
     seconds_total: float
     note: str = ""
     absolute_poses_rejected: int = 0  # outliers that were left out
+    trust_region_radius: float = 0.0  # at the end
 
     @property
     def advice(self) -> str:

@@ -58,6 +58,7 @@ class SolverSummary:
     seconds: float
     singular_at: tuple[int, ...] = ()  # nodes at which a factorisation failed
     recent_decrease: float = 0.0  # of the cost in the last ten accepted steps
+    radius: float = 0.0  # of the trust region at the end
 
 
 AfterStep = Callable[[int, States], bool]
@@ -181,7 +182,7 @@ def optimize_states(
     summary = SolverSummary(
         initial, dict(run.costs), iterations, run.rejected, termination,
         time.perf_counter() - began, tuple(dict.fromkeys(run.singular)),
-        sum(run.recent),
+        sum(run.recent), run.region.radius,
     )  # fmt: skip
     return run.states, summary
 

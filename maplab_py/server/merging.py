@@ -1,0 +1,290 @@
+"""Merge one prepared submap after the other into a map, and optimise what it touches.
+
+A submap is appended to its mission, or begins it. Then the parts of the map that look most like it and
+those nearest to it are searched: a mission of unknown base frame is anchored, loops are closed. Last
+the new vertices and what they touch are optimised, everything else is held fixed. All of this works
+on excerpts of bounded size. A joint optimisation closes the loops of the whole map and optimises it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+
+import numpy as np
+
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.place_index import PlaceIndex
+from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
+from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax
+from maplab_py.algorithms.vi_optimization.local import optimize_around
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.errors import EstimationError
+from maplab_py.progress import SILENT, Progress
+from maplab_py.server.options import IncrementalOptions, MergingOptions
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.excerpts import excerpt
+from maplab_py.vimap.ids import from_hex, to_hex, to_hex_list
+from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.submaps import append_submap
+
+_LOCAL_ITERATIONS = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """The part of a mission that a submap brought."""
+
+    mission: str  # id
+    first_ns: int
+    last_ns: int
+
+    def vertices(self, vi_map: VIMap) -> I64:
+        """Return its vertices (rows); none where the mission is not in the map any more."""
+        row = int(vi_map.mission_index.rows(from_hex(self.mission)[None])[0])
+        v = vi_map.vertices
+        inside = (v.timestamp_ns >= self.first_ns) & (v.timestamp_ns <= self.last_ns)
+        return np.flatnonzero(inside & (v.mission == row)) if row >= 0 else np.zeros(0, np.int64)
+
+
+def stretches_of(submap: VIMap) -> list[Stretch]:
+    """Return the stretch of each mission of a submap."""
+    result = []
+    for row, mission in enumerate(to_hex_list(submap.missions.id)):
+        times_ns = submap.vertices.timestamp_ns[submap.vertices.mission == row]
+        result.append(Stretch(mission, int(times_ns.min()), int(times_ns.max())))
+    return result
+
+
+@dataclasses.dataclass(frozen=True)
+class MergeSteps:
+    """What became of a submap, and the processor time [s] of each step."""
+
+    anchored: tuple[str, ...]  # missions
+    landmarks_merged: int
+    free_vertices: int
+    fixed_vertices: int
+    joint_is_due: bool  # a loop or a mission needs a joint optimisation
+    seconds: dict[str, float]
+    note: str = ""
+
+
+class Merger:
+    """Merges submaps into a map; see the module.
+
+    Attributes:
+        vi_map: The map; None before the first submap.
+        radius: Trust region of the last joint optimisation; 0 = the default.
+    """
+
+    def __init__(
+        self,
+        merging: MergingOptions,
+        incremental: IncrementalOptions,
+        *,
+        loops: LoopClosureOptions | None = None,
+        optimization: VIOptimizationOptions | None = None,
+    ) -> None:
+        """Start without a map."""
+        self.vi_map: VIMap | None = None
+        self.radius = 0.0
+        self._merging, self._incremental = merging, incremental
+        self._loops = loops or LoopClosureOptions()
+        self._optimization = optimization or VIOptimizationOptions(
+            hide_iterations_console_output=True, include_absolute_pose_constraints=True
+        )
+        self._places = PlaceIndex()
+        self._stretches: list[Stretch] = []
+
+    def restore(self, vi_map: VIMap, stretches: list[Stretch]) -> None:
+        """Continue with a map that has been merged from some submaps."""
+        self.vi_map, self._places, self._stretches = vi_map, PlaceIndex(), []
+        for stretch in stretches:
+            rows = stretch.vertices(vi_map)
+            if len(rows):
+                self._remember(stretch, excerpt(vi_map, rows).vi_map)
+
+    def add(self, submap: VIMap, *, progress: Progress = SILENT) -> MergeSteps:
+        """Merge a submap.
+
+        Raises:
+            MapError: It does not fit the map; see `append_submap`. The map is as before.
+            EstimationError: The optimisation failed. The map is as before.
+            Cancelled: The map is as before.
+        """
+        clock = _Clock()
+        whole = self._appended(submap)
+        clock.lap("append")
+        stretches = stretches_of(submap)
+        rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
+        part = excerpt(whole, self._surroundings(whole, rows, submap))
+        edited, anchored, joint_is_due = self._anchored(part.vi_map, progress)
+        clock.lap("anchor")
+        merged, closures_note = 0, ""
+        if self._merging.enable_visual_loop_closure and len(part.vertices) > len(rows):
+            try:
+                edited, report = close_loops(edited, self._loops, progress=progress)
+                merged = report.landmarks_merged
+                joint_is_due |= _has_large_gap(report.merges_refused)
+            except EstimationError as error:
+                closures_note = str(error)
+        whole = part.written_back(edited)
+        clock.lap("close loops")
+        options = dataclasses.replace(self._optimization, num_iterations=_LOCAL_ITERATIONS)
+        whole, local = optimize_around(
+            whole,
+            rows,
+            options,
+            max_free=self._incremental.local_free_vertices,
+            max_fixed=self._incremental.local_fixed_vertices,
+            progress=progress,
+        )
+        clock.lap("optimise")
+        if self._merging.spatially_distribute_missions:
+            whole, _ = distribute_missions(whole, LayoutOptions())
+        self.vi_map = whole
+        for stretch in stretches:
+            self._remember(stretch, submap)
+        return MergeSteps(
+            anchored,
+            merged,
+            local.free_vertices,
+            local.fixed_vertices,
+            joint_is_due,
+            clock.seconds,
+            closures_note,
+        )
+
+    def optimize_jointly(self, *, progress: Progress = SILENT) -> float:
+        """Anchor, close the loops of the whole map and optimise it; return the largest move [m].
+
+        Raises:
+            EstimationError: The optimisation failed. The map is as before.
+            Cancelled: The map is as before.
+        """
+        before = self.vi_map
+        if before is None:
+            return 0.0
+        vi_map, _ = evaluate_quality(before, LandmarkQualityOptions())
+        vi_map, _, _ = self._anchored(vi_map, progress)
+        if self._merging.enable_visual_loop_closure:
+            vi_map = self._with_all_loops(vi_map, progress)
+        options = self._optimization
+        if self.radius > 0.0 and self._merging.preserve_trust_region_radius_across_merging:
+            options = dataclasses.replace(options, initial_trust_region_radius=self.radius)
+        vi_map, report = optimize(vi_map, options, progress=progress)
+        self.vi_map, self.radius = vi_map, report.trust_region_radius
+        return float(np.linalg.norm(vi_map.T_G_I[:, 4:] - before.T_G_I[:, 4:], axis=1).max())
+
+    def _appended(self, submap: VIMap) -> VIMap:
+        base = self.vi_map
+        if base is None:
+            is_known = np.zeros(len(submap.baseframes), dtype=np.bool_)
+            if self._merging.set_first_robot_map_baseframe_to_known:
+                is_known[submap.missions.baseframe[0]] = True
+            return submap.replace(
+                baseframes=submap.baseframes.replace(is_known=is_known | _placed(submap))
+            )
+        if (base.mission_index.rows(submap.missions.id) >= 0).any():
+            return append_submap(base, submap)[0]
+        frames = submap.baseframes.replace(is_known=_placed(submap))
+        return merge_maps(base, submap.replace(baseframes=frames))[0]
+
+    def _surroundings(self, whole: VIMap, rows: I64, submap: VIMap) -> Mask:
+        """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
+        result = np.zeros(len(whole.vertices), dtype=np.bool_)
+        result[rows] = True
+        if not self._merging.enable_visual_loop_closure:
+            return result
+        frequencies = self._places.frequencies(submap)
+        similar = self._places.similar(frequencies, self._incremental.similar_stretches)
+        for number in similar.tolist():
+            result[self._stretches[number].vertices(whole)] = True
+        mission = whole.vertices.mission
+        known = whole.baseframes.is_known[whole.missions.baseframe]
+        touched = np.unique(mission[result])
+        result |= np.isin(mission, touched[~known[touched]])  # unanchored missions as a whole
+        if known[mission[rows]].all():
+            result |= _nearest(whole.T_G_I[:, 4:], rows, known[mission], self._incremental)
+        return result
+
+    def _anchored(self, vi_map: VIMap, progress: Progress) -> tuple[VIMap, tuple[str, ...], bool]:
+        """Anchor what can be; also tell whether one of the missions has several submaps."""
+        known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+        is_wanted = self._merging.enable_visual_loop_closure_based_map_anchoring
+        if not is_wanted or known.all() or not known.any():
+            return vi_map, (), False
+        try:
+            result, report = anchor_missions(vi_map, loop_options=self._loops, progress=progress)
+        except EstimationError:  # no descriptors or too few tracks: it stays unknown
+            return vi_map, (), False
+        ids = [to_hex(words) for words in vi_map.missions.id]
+        names = {id_[:8]: id_ for id_ in ids}
+        anchored = tuple(names[name] for name in report.anchored)
+        known_stretches = [stretch.mission for stretch in self._stretches]
+        return result, anchored, any(known_stretches.count(id_) > 0 for id_ in anchored)
+
+    def _with_all_loops(self, vi_map: VIMap, progress: Progress) -> VIMap:
+        try:
+            closed, report = close_loops(vi_map, self._loops, progress=progress)
+            if not _has_large_gap(report.merges_refused):
+                return closed
+            edges, _ = find_loop_closures(vi_map, self._loops, progress=progress)
+            relaxed, _ = relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
+            return close_loops(relaxed, self._loops, progress=progress)[0]
+        except EstimationError:  # nothing to recognise places by
+            return vi_map
+
+    def _remember(self, stretch: Stretch, submap: VIMap) -> None:
+        if not self._places.is_trained:
+            with contextlib.suppress(EstimationError):  # another submap will have enough tracks
+                self._places.train(submap)
+        self._stretches.append(stretch)
+        self._places.add(self._places.frequencies(submap, stretch.vertices(submap)))
+
+
+def _placed(vi_map: VIMap) -> Mask:
+    """Return which base frames (B,) absolute poses determine."""
+    result = np.zeros(len(vi_map.baseframes), dtype=np.bool_)
+    mission = vi_map.vertices.mission[vi_map.absolute_poses.vertex]
+    result[vi_map.missions.baseframe[np.unique(mission)]] = True
+    return result
+
+
+def _nearest(p_G: F64, rows: I64, wanted: Mask, options: IncrementalOptions) -> Mask:
+    """Return the wanted vertices (V,) that are nearest to some vertices (rows)."""
+    from scipy.spatial import KDTree
+
+    result = np.zeros(len(p_G), dtype=np.bool_)
+    others = np.flatnonzero(wanted & ~np.isin(np.arange(len(p_G)), rows))
+    if len(others) and options.near_vertices:
+        distance, _ = KDTree(p_G[rows]).query(p_G[others])
+        result[others[np.argsort(distance, kind="stable")[: options.near_vertices]]] = True
+    return result
+
+
+def _has_large_gap(refused: dict[str, int]) -> bool:
+    from maplab_py.algorithms.loop_closure.merging import GAP
+
+    return GAP in refused
+
+
+class _Clock:
+    """Processor time of this thread by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.process_time()
+
+    def lap(self, name: str) -> None:
+        now = time.process_time()
+        self.seconds[name] = now - self._last
+        self._last = now

@@ -1,0 +1,139 @@
+"""Flags of the map server, with maplab's names where it has them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class SubmapOptions:
+    """What happens to a submap before it is merged."""
+
+    remove_outliers_in_absolute_pose_constraints: bool = option(
+        True, help="Leave out absolute poses that contradict their neighbours (see optvi)."
+    )
+    stationary_submaps_fix_with_lc_edge: bool = option(
+        False,
+        help="Tie the first and the last vertex of a submap that stands still by a loop closure edge.",
+    )
+    submap_loading_thread_pool_size: int = option(
+        4, help="Submaps that are prepared at the same time, each in a process."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MergingOptions:
+    """How submaps become one map."""
+
+    enable_visual_loop_closure: bool = option(
+        True, help="Close loops within and between missions."
+    )
+    enable_visual_loop_closure_based_map_anchoring: bool = option(
+        True, help="Anchor missions of unknown base frame to known ones by loop closures."
+    )
+    enable_lidar_loop_closure: bool = option(
+        False, help="Close loops of lidar clouds as well (needs the extra lidar)."
+    )
+    set_first_robot_map_baseframe_to_known: bool = option(
+        True, help="The first mission of the map defines the global frame."
+    )
+    spatially_distribute_missions: bool = option(
+        True, help="Set missions that are not anchored yet apart from the others."
+    )
+    preserve_trust_region_radius_across_merging: bool = option(
+        True, help="A joint optimisation starts with the trust region of the one before."
+    )
+    reset_trust_region_radius_if_new_robot: bool = option(
+        True, help="Not where a new robot has come since."
+    )
+    reset_trust_region_radius_every_nth_submap: int = option(
+        0, help="Nor where so many submaps were merged since the last reset; 0 = never."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishingOptions:
+    """Where the map goes."""
+
+    merged_map_folder: str = option(
+        "", help="Folder of the merged map, replaced after every change; required."
+    )
+    resource_folder: str = option(
+        "", help="Folder for the resources of the map; empty = the map's own."
+    )
+    backup_interval_s: int = option(
+        300, help="Keep a copy of the map beside it every so often; 0 = never.", unit="s"
+    )
+    dense_map_resource_type: int = option(
+        21, help="Type of the resources that get_dense_map_in_range looks into (number)."
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions):
+    """All flags of the server that maplab has, too."""
+
+    flag_prefix: ClassVar[str] = "maplab_server_"
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            FlagError: A value is out of range.
+        """
+        for name in ("backup_interval_s", "reset_trust_region_radius_every_nth_submap"):
+            if getattr(self, name) < 0:
+                raise FlagError(f"--maplab_server_{name} must not be negative; 0 = never")
+        if self.submap_loading_thread_pool_size < 1:
+            raise FlagError("--maplab_server_submap_loading_thread_pool_size must be at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class StationaryOptions:
+    """When a submap counts as standing still."""
+
+    flag_prefix: ClassVar[str] = "maplab_stationary_submaps_"
+
+    max_rotation_rad: float = option(
+        0.15, help="Largest angle between the first and any other vertex.", unit="rad"
+    )
+    max_translation_m: float = option(
+        0.10, help="Largest distance between the first and any other vertex.", unit="m"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class IncrementalOptions:
+    """What is optimised after each submap, and when all is."""
+
+    full_optimization_every_nth: int = option(
+        10,
+        help="Close all loops and optimise the whole map jointly after so many submaps, and when the "
+        "server stops; 0 = when it stops only.",
+    )
+    local_free_vertices: int = option(
+        150, help="Vertices besides those of a new submap that are optimised with it."
+    )
+    local_fixed_vertices: int = option(
+        150, help="Vertices that are held fixed and observe landmarks of the optimised ones."
+    )
+    similar_stretches: int = option(
+        5, help="Submaps that look most like a new one and are searched for loop closures."
+    )
+    near_vertices: int = option(
+        100, help="Vertices nearest to a new submap that are searched for loop closures as well."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            FlagError: A value is negative.
+        """
+        for field in dataclasses.fields(self):
+            if getattr(self, field.name) < 0:
+                raise FlagError(f"--{field.name} must not be negative")

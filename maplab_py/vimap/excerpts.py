@@ -1,0 +1,153 @@
+"""Parts of a map that are edited alone, and their results written back into the map."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maplab_py.array_types import I32, I64
+from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, with_p_G
+from maplab_py.vimap.selection import as_mask, keep_rows
+from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap.tables import NO_ROW
+from maplab_py.vimap.vertex_removal import move_landmarks, stores_for
+from maplab_py.vimap.vi_map import VIMap
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Excerpt:
+    """A part of a map.
+
+    Attributes:
+        source: The whole map.
+        vi_map: The part, with the ids of the whole.
+        missions: Its missions as rows of the whole.
+        vertices: Its vertices likewise.
+        landmarks: Its landmarks likewise.
+        keypoints: Its keypoints likewise.
+    """
+
+    source: VIMap
+    vi_map: VIMap
+    missions: I64
+    vertices: I64
+    landmarks: I64
+    keypoints: I64
+
+    def written_back(self, edited: VIMap) -> VIMap:
+        """Return the whole map with the states and landmarks of the edited part.
+
+        Poses, velocities, biases, base frames, and the positions and qualities of landmarks are
+        taken over. Landmarks that were merged in the part are merged in the whole map, with all
+        their observations; keypoints of the part observe what they observe in the edited part.
+
+        Args:
+            edited: The part after edits that keep its missions, vertices and keypoints and add no
+                landmarks.
+
+        Raises:
+            ValueError: The edit has changed what it must keep.
+        """
+        for name in ("missions", "vertices", "keypoints"):
+            if len(getattr(edited, name)) != len(getattr(self.vi_map, name)):
+                raise ValueError(f"the edit has changed the number of {name}")
+        whole = self._with_observations(self._with_states(edited), edited)
+        rows = whole.landmark_index.rows(edited.landmarks.id)
+        quality = whole.landmarks.quality.copy()
+        quality[rows] = edited.landmarks.quality
+        whole = whole.replace(landmarks=whole.landmarks.replace(quality=quality))
+        return with_p_G(whole, rows, edited.p_G)
+
+    def _with_states(self, edited: VIMap) -> VIMap:
+        v, whole = edited.vertices, self.source.vertices
+        columns = {}
+        for name in ("T_M_I", "v_M", "gyro_bias", "accel_bias"):
+            columns[name] = getattr(whole, name).copy()
+            columns[name][self.vertices] = getattr(v, name)
+        rows = self.source.missions.baseframe[self.missions]
+        frames, of = self.source.baseframes, edited.missions.baseframe
+        T_G_M, is_known = frames.T_G_M.copy(), frames.is_known.copy()
+        T_G_M[rows], is_known[rows] = edited.baseframes.T_G_M[of], edited.baseframes.is_known[of]
+        return self.source.replace(
+            vertices=whole.replace(**columns),
+            baseframes=frames.replace(T_G_M=T_G_M, is_known=is_known),
+        )
+
+    def _with_observations(self, whole: VIMap, edited: VIMap) -> VIMap:
+        kept = self.vi_map.landmark_index.rows(edited.landmarks.id)  # rows of the part
+        before, after = self.vi_map.keypoints.landmark, edited.keypoints.landmark
+        after = np.append(kept, NO_ROW)[after]
+        if len(kept) == len(self.landmarks) and np.array_equal(before, after):
+            return whole
+        is_kept = np.zeros(len(self.landmarks) + 1, dtype=np.bool_)
+        is_kept[kept] = True
+        moved = np.flatnonzero((before >= 0) & ~is_kept[before] & (after >= 0))
+        source, target = _most_frequent(before[moved], after[moved])
+        merged = merge_landmarks(whole, self.landmarks[source], self.landmarks[target])
+        rows = merged.landmark_index.rows(self.source.landmarks.id[self.landmarks])
+        landmark = merged.keypoints.landmark.copy()
+        landmark[self.keypoints] = np.append(rows, NO_ROW)[after]
+        merged = merged.replace(keypoints=merged.keypoints.replace(landmark=landmark))
+        absent = rows[~is_kept[:-1]]
+        absent = absent[absent >= 0]
+        return remove_landmarks(merged, absent[np.diff(merged.observation_start)[absent] == 0])
+
+
+def _most_frequent(source: I32, target: I32) -> tuple[I64, I64]:
+    """Return each source once, with the target that it is paired with most often."""
+    pairs, count = np.unique(np.stack([source, target]), axis=1, return_counts=True)
+    order = np.lexsort((pairs[1], -count, pairs[0]))
+    pairs = pairs[:, order].astype(np.int64)
+    first = np.unique(pairs[0], return_index=True)[1]
+    return pairs[0, first], pairs[1, first]
+
+
+def excerpt(vi_map: VIMap, vertices: ArrayLike, *, observed_by: ArrayLike | None = None) -> Excerpt:
+    """Return the part of a map at some vertices.
+
+    It has the missions of these vertices, the edges between two of them, and the landmarks that they
+    observe. A landmark that another vertex stores is stored in its first observer of the part.
+
+    Args:
+        vi_map: The map.
+        vertices: Vertex rows or a mask (V,).
+        observed_by: Vertices (rows or a mask) of which one must observe a landmark of the part; None
+            = any of the part.
+    """
+    is_in = as_mask(vertices, len(vi_map.vertices))
+    observing = is_in if observed_by is None else as_mask(observed_by, len(is_in)) & is_in
+    keypoints = vi_map.observations
+    keypoints = keypoints[observing[vi_map.keypoint_vertex[keypoints]]]
+    landmarks = np.unique(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
+    homeless = landmarks[~is_in[vi_map.landmarks.vertex[landmarks]]]
+    store = stores_for(vi_map, homeless, is_in, same_mission=False)
+    moved = move_landmarks(vi_map, homeless, store)
+    rows = np.flatnonzero(is_in)
+    missions = np.unique(vi_map.vertices.mission[rows]).astype(np.int64)
+    frames = np.flatnonzero(is_in[vi_map.frames.vertex])
+    part = keep_rows(moved, missions=missions, vertices=rows, landmarks=landmarks)
+    if not np.array_equal(part.frames.id, vi_map.frames.id[frames]):  # frames out of order
+        frames = frames[np.lexsort((vi_map.frames.camera_index[frames], vi_map.frames.vertex[frames]))]
+    return Excerpt(
+        vi_map, part, missions, rows, landmarks, ragged_rows(vi_map.keypoint_start, frames)
+    )
+
+
+def cut_by_time(vi_map: VIMap, seconds: float) -> list[VIMap]:
+    """Cut a map of one mission into submaps, as robots send them; neighbours share a vertex.
+
+    A landmark that several submaps observe is in each of them, under the same id.
+
+    Args:
+        vi_map: The map, its vertices in the order of time.
+        seconds: Length of a submap [s]; the last may be up to half as long again.
+    """
+    times_ns = vi_map.vertices.timestamp_ns
+    count = max(1, round(1e-9 * float(times_ns[-1] - times_ns[0]) / seconds))
+    limits = times_ns[0] + (times_ns[-1] - times_ns[0]) * np.arange(1, count) // count
+    inner = np.searchsorted(times_ns, limits)
+    cuts = np.unique(np.concatenate([[0], inner, [len(times_ns) - 1]]))
+    parts = zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)
+    return [excerpt(vi_map, np.arange(first, last + 1)).vi_map for first, last in parts]
