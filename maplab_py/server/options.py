@@ -29,9 +29,7 @@ class SubmapOptions:
 class MergingOptions:
     """How submaps become one map."""
 
-    enable_visual_loop_closure: bool = option(
-        True, help="Close loops within and between missions."
-    )
+    enable_visual_loop_closure: bool = option(True, help="Close loops within and between missions.")
     enable_visual_loop_closure_based_map_anchoring: bool = option(
         True, help="Anchor missions of unknown base frame to known ones by loop closures."
     )
@@ -93,20 +91,6 @@ class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions):
 
 
 @dataclasses.dataclass(frozen=True)
-class StationaryOptions:
-    """When a submap counts as standing still."""
-
-    flag_prefix: ClassVar[str] = "maplab_stationary_submaps_"
-
-    max_rotation_rad: float = option(
-        0.15, help="Largest angle between the first and any other vertex.", unit="rad"
-    )
-    max_translation_m: float = option(
-        0.10, help="Largest distance between the first and any other vertex.", unit="m"
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class IncrementalOptions:
     """What is optimised after each submap, and when all is."""
 
@@ -137,3 +121,23 @@ class IncrementalOptions:
         for field in dataclasses.fields(self):
             if getattr(self, field.name) < 0:
                 raise FlagError(f"--{field.name} must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class ServiceOptions:
+    """Where the server answers requests, and what it keeps."""
+
+    flag_prefix: ClassVar[str] = "serve_"
+
+    address: str = option(
+        "127.0.0.1",
+        help="Address at which requests are answered; at another than loopback they need the token "
+        "that is in server.json of the spool.",
+    )
+    port: int = option(0, help="Its port; 0 = any.")
+    stop_when_idle_s: float = option(
+        0.0, help="Stop after so long without anything to do; 0 = never.", unit="s"
+    )
+    keep_submaps: bool = option(
+        True, help="Keep submaps in the spool's folder merged, so that the map can be built again."
+    )

@@ -47,7 +47,11 @@ class Drawing:
     @cached_property
     def mission_colours(self) -> U8:
         """Colours (M, 3)."""
-        return colours.mission_colours(len(self.vi_map.missions), self.options.color_salt)
+        names = list(self.vi_map.missions.name)
+        every = colours.mission_colours(len(names), self.options.color_salt)
+        if not self.options.color_missions_by_name:
+            return every
+        return every[[names.index(name) if name else row for row, name in enumerate(names)]]
 
     @cached_property
     def shift(self) -> F64:

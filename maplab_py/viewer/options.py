@@ -59,6 +59,9 @@ class VisualizationOptions:
     color_landmarks_by_time_period_seconds: float = option(
         0.0, help="Time after which colours repeat; 0 = over the length of the mission.", unit="s"
     )
+    color_missions_by_name: bool = option(
+        False, help="Missions of one name have one colour, as those of a robot in a server's map."
+    )
     color_salt: int = option(1, help="Another number gives the missions other colours.")
     landmark_gray_level: int = option(150, help="Grey of landmarks that no rule colours.")
     check_landmark_constrained: bool = option(

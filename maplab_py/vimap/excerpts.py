@@ -129,7 +129,9 @@ def excerpt(vi_map: VIMap, vertices: ArrayLike, *, observed_by: ArrayLike | None
     frames = np.flatnonzero(is_in[vi_map.frames.vertex])
     part = keep_rows(moved, missions=missions, vertices=rows, landmarks=landmarks)
     if not np.array_equal(part.frames.id, vi_map.frames.id[frames]):  # frames out of order
-        frames = frames[np.lexsort((vi_map.frames.camera_index[frames], vi_map.frames.vertex[frames]))]
+        frames = frames[
+            np.lexsort((vi_map.frames.camera_index[frames], vi_map.frames.vertex[frames]))
+        ]
     return Excerpt(
         vi_map, part, missions, rows, landmarks, ragged_rows(vi_map.keypoint_start, frames)
     )
@@ -151,3 +153,9 @@ def cut_by_time(vi_map: VIMap, seconds: float) -> list[VIMap]:
     cuts = np.unique(np.concatenate([[0], inner, [len(times_ns) - 1]]))
     parts = zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)
     return [excerpt(vi_map, np.arange(first, last + 1)).vi_map for first, last in parts]
+
+
+def mission_maps(vi_map: VIMap) -> list[VIMap]:
+    """Return a map of each mission with vertices."""
+    masks = (vi_map.vertices.mission == mission for mission in range(len(vi_map.missions)))
+    return [excerpt(vi_map, mask).vi_map for mask in masks if mask.any()]

@@ -47,7 +47,7 @@ def fix_gauge(
     *,
     has_inertial: bool,
     has_fixed_landmarks: bool,
-    fixed: I64 | None = None,
+    fixed_vertices: I64 | None = None,
 ) -> str:
     """Fix the unobservable directions of each cluster and return a description.
 
@@ -57,7 +57,7 @@ def fix_gauge(
         held: Vertices that nothing constrains.
         has_inertial: Inertial terms are used.
         has_fixed_landmarks: All landmarks are fixed.
-        fixed: Vertices that are fixed already; they anchor their cluster.
+        fixed_vertices: Vertices that are fixed already; they anchor their cluster.
     """
     num_vertices = len(states.T_G_I)
     labels = gauge.clusters(num_vertices, _links(problem, num_vertices))
@@ -69,8 +69,8 @@ def fix_gauge(
     has_prior = problem.visual is not None and problem.visual.has_landmark_prior
     if has_fixed_landmarks or has_prior:
         anchored |= set(np.unique(labels[_observing(problem)]).tolist())
-    if fixed is not None:
-        anchored |= set(np.unique(labels[fixed]).tolist())
+    if fixed_vertices is not None:
+        anchored |= set(np.unique(labels[fixed_vertices]).tolist())
     inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
     scaled = _labels_with_scale(labels, problem) | _labels_of_rigs(labels, problem)
     counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}

@@ -144,7 +144,7 @@ def build(
         held,
         has_inertial=options.include_inertial,
         has_fixed_landmarks=options.fix_landmark_positions,
-        fixed=fixed,
+        fixed_vertices=fixed,
     )
     return parts.map_problem(problem, held, gauge)
 

@@ -1,0 +1,99 @@
+"""The published map: replaced as a whole after every change, with copies kept now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import time
+from pathlib import Path
+
+from maplab_py.progress import SILENT, Progress
+from maplab_py.server.options import PublishingOptions
+from maplab_py.storage.native import is_map_folder, save_map
+from maplab_py.storage.resources import copied_to_external, existing_files, in_map_folder
+from maplab_py.vimap import VIMap
+
+_BACKUPS = 5
+
+
+class Publisher:
+    """Writes a map to its folder, and keeps copies.
+
+    Attributes:
+        folder: Folder of the map.
+        published_s: When the map was last published [s, monotonic]; None = not yet.
+    """
+
+    def __init__(self, options: PublishingOptions) -> None:
+        """Prepare; nothing is written yet."""
+        self.folder = Path(options.merged_map_folder).absolute()
+        self.backups = self.folder.parent / f"{self.folder.name}_backups"
+        self.published_s: float | None = None
+        self._options = options
+        self._files: list[tuple[Path, Path]] = []
+        self._backup_s = time.monotonic()
+        self._is_backed_up = True
+
+    def with_resources(self, submap: VIMap, folder: Path) -> VIMap:
+        """Return a submap whose resources are, or will be, where those of the map are.
+
+        Args:
+            submap: The submap.
+            folder: Where its resource files are.
+
+        Raises:
+            MapError: A file is missing.
+            UserError: The resource folder cannot be written.
+        """
+        if not len(submap.resources):
+            return submap
+        if self._options.resource_folder:
+            return copied_to_external(submap, folder, Path(self._options.resource_folder))
+        self._files += existing_files(submap, folder)
+        return in_map_folder(submap)
+
+    def publish(self, vi_map: VIMap, *, progress: Progress = SILENT) -> None:
+        """Replace the published map; raises UserError where the disk refuses."""
+        save_map(vi_map, self.folder, force=True, resource_files=self._files, progress=progress)
+        self._files.clear()
+        self.published_s = time.monotonic()
+        self._is_backed_up = False
+
+    def remove(self) -> None:
+        """Delete the published map: its last mission was deleted."""
+        if is_map_folder(self.folder):
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def back_up(self) -> Path | None:
+        """Keep a copy of the published map if it is time; return its folder.
+
+        The files are linked, as a published file never changes. The oldest copies are deleted.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        interval_s = self._options.backup_interval_s
+        is_due = interval_s and time.monotonic() - self._backup_s >= interval_s
+        if not is_due or self._is_backed_up or not is_map_folder(self.folder):
+            return None
+        self._backup_s, self._is_backed_up = time.monotonic(), True
+        self.backups.mkdir(exist_ok=True)
+        copy = self.backups / ".copying"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(self.folder, copy, copy_function=_link_or_copy, symlinks=True)
+        target = self.backups / time.strftime("%Y%m%d_%H%M%S")
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(target)
+        copy.rename(target)
+        for old in sorted(p for p in self.backups.iterdir() if p.name[0] != ".")[:-_BACKUPS]:
+            shutil.rmtree(old, ignore_errors=True)
+        return target
+
+
+def _link_or_copy(source: str, target: str) -> str:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+    return target
