@@ -54,6 +54,11 @@ class Stretch:
         inside = (v.timestamp_ns >= self.first_ns) & (v.timestamp_ns <= self.last_ns)
         return np.flatnonzero(inside & (v.mission == row)) if row >= 0 else np.zeros(0, np.int64)
 
+    def is_in(self, vi_map: VIMap) -> bool:
+        """Tell whether a map has both ends; neighbours in the map would bring one of them each."""
+        times_ns = vi_map.vertices.timestamp_ns[self.vertices(vi_map)]
+        return self.first_ns in times_ns and self.last_ns in times_ns
+
 
 def stretches_of(submap: VIMap) -> list[Stretch]:
     """Return the stretch of each mission of a submap."""

@@ -45,6 +45,7 @@ def recover(spool: Spool, map_folder: Path) -> Recovered:
     Raises:
         UserError: The journal is damaged, the map cannot be loaded, or it was not made from this spool.
     """
+    spool.clean()
     journal, notes = read_journal(spool.journal), []
     vi_map = load_map(map_folder)[0] if is_map_folder(map_folder) else None
     is_changed = False
@@ -76,7 +77,7 @@ def _without_lost(
     """Take submaps back to `accepted` that the journal knows and the map has not."""
     kept, notes = [], []
     for submap in journal.merged:
-        if vi_map is not None and all(len(s.vertices(vi_map)) for s in submap.stretches):
+        if vi_map is not None and all(s.is_in(vi_map) for s in submap.stretches):
             kept.append(submap)
         elif spool.take_back(submap.number):
             notes.append(f"{submap.title}: is not in the map; it is merged again")

@@ -20,6 +20,14 @@ class RobotLine:
 
 
 @dataclasses.dataclass(frozen=True)
+class EventLine:
+    """One line of the log."""
+
+    time: str
+    event: str
+
+
+@dataclasses.dataclass(frozen=True)
 class ServerStatus(Report):
     """State of a map server and its map."""
 
@@ -38,7 +46,7 @@ class ServerStatus(Report):
     since_joint_optimization: int  # submaps
     published_s_ago: float | None
     robots: tuple[RobotLine, ...]
-    last_events: tuple[str, ...] = dataclasses.field(metadata={"is_prose": True})
+    last_events: tuple[EventLine, ...]
     problem: str = ""
 
 

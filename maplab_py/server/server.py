@@ -149,11 +149,13 @@ class MapServer:
 
     def status(self) -> ServerStatus:
         """Return the present state."""
-        items = list(self._intake.items.values())
+        items = dict(self._intake.items)
+        published = tuple(m for m in self.journal.merged if m.number not in items)
         return status_of(
             self,
-            preparing=sum(item.is_preparing for item in items),
-            pending=[item.entry.robot for item in items if item.merged is None],
+            dataclasses.replace(self.journal, merged=published),
+            preparing=sum(item.is_preparing for item in items.values()),
+            pending=[item.entry.robot for item in items.values()],
             problem=self._problem,
             url=self._url,
         )

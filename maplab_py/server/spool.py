@@ -30,8 +30,9 @@ from maplab_py.storage import checksums
 from maplab_py.storage.native import is_map_folder
 
 _PUSHED = ".pushed.json"
-_QUIET_S = 5.0
-"""A folder that is not a sound map and has changed since may still be being copied."""
+QUIET_S = 5.0
+"""A folder that is no sound map, or has no checksums, is left alone until nothing has changed in it for so
+long [s]: it may still be being copied."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +72,14 @@ class Arrival:
 class Spool:
     """The folders of a spool."""
 
-    def __init__(self, root: Path) -> None:
-        """Use a folder, which need not exist."""
-        self.root = root.absolute()
+    def __init__(self, root: Path, *, quiet_s: float = QUIET_S) -> None:
+        """Use a folder, which need not exist.
+
+        Args:
+            root: The folder.
+            quiet_s: See `QUIET_S`.
+        """
+        self.root, self._quiet_s = root.absolute(), quiet_s
         self.incoming = self.root / "incoming"
         self.partial = self.incoming / ".partial"
         self.accepted = self.root / "accepted"
@@ -106,7 +112,7 @@ class Spool:
         found = []
         for robot in _folders(self.incoming):
             if not robot.is_symlink():
-                found += [_arrival(robot.name, folder) for folder in _folders(robot)]
+                found += [_arrival(robot.name, path, self._quiet_s) for path in _folders(robot)]
         return sorted(found, key=lambda a: (_changed_s(a.folder), a.robot, a.folder.name))
 
     def accept(self, arrival: Arrival, number: int) -> Entry:
@@ -128,18 +134,22 @@ class Spool:
         return self.accepted / _name(entry)
 
     def entries(self) -> list[Entry]:
-        """Return the accepted submaps by number; remains of a crash are deleted."""
+        """Return the accepted submaps by number."""
         entries = []
         for folder in _folders(self.accepted):
             try:
                 entry = Entry(**json.loads((folder / "entry.json").read_text(encoding="utf-8")))
             except (OSError, ValueError, TypeError):
-                entry = None
-            if entry is not None and (folder / "submap").is_dir():
+                continue
+            if (folder / "submap").is_dir():
                 entries.append(entry)
-            elif not (folder / "submap").exists():
-                shutil.rmtree(folder, ignore_errors=True)
         return sorted(entries, key=lambda entry: entry.number)
+
+    def clean(self) -> None:
+        """Delete what crashes have left; only the server, which holds the lock, may call this."""
+        for folder in _folders(self.accepted):
+            if not (folder / "submap").exists():
+                shutil.rmtree(folder, ignore_errors=True)
 
     def highest_number(self) -> int:
         """Return the largest number that was given to a submap, 0 without any."""
@@ -216,7 +226,7 @@ def push(spool: Spool, robot: str, submap: Path, name: str = "") -> Path:
     return target
 
 
-def _arrival(robot: str, folder: Path) -> Arrival:
+def _arrival(robot: str, folder: Path, quiet_s: float) -> Arrival:
     """Judge a folder by its checksums; those of `push` are compared where there are some."""
     if folder.is_symlink():
         return Arrival(robot, folder, False, "is a symbolic link: put the folder itself there")
@@ -235,7 +245,7 @@ def _arrival(robot: str, folder: Path) -> Arrival:
     is_sealed = (folder / checksums.FILE_NAME).is_file() or (folder / _PUSHED).is_file()
     if not reason and is_sealed:
         return Arrival(robot, folder, True)
-    if time.time() - _changed_s(folder) < _QUIET_S:
+    if time.time() - _changed_s(folder) < quiet_s:
         return Arrival(robot, folder, False)
     return Arrival(robot, folder, not reason, reason)
 

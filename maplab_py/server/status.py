@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from maplab_py.progress import Progress
 from maplab_py.server.journal import Journal, read_journal
-from maplab_py.server.reports import RobotLine, ServerStatus
+from maplab_py.server.reports import EventLine, RobotLine, ServerStatus
 from maplab_py.server.spool import Spool
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
@@ -42,21 +42,28 @@ class Events:
 
 
 def status_of(
-    server: MapServer, *, preparing: int, pending: list[str], problem: str, url: str
+    server: MapServer,
+    journal: Journal,
+    *,
+    preparing: int,
+    pending: list[str],
+    problem: str,
+    url: str,
 ) -> ServerStatus:
     """Return the state of a server that runs.
 
     Args:
         server: The server.
+        journal: What is published.
         preparing: Submaps in workers.
-        pending: Robots of all submaps that are not merged.
+        pending: Robots of all submaps that are not published.
         problem: What keeps it from publishing.
         url: Where it answers.
     """
     published_s = server.publisher.published_s
     return _status(
         server.spool,
-        server.journal,
+        journal,
         server.published,
         is_running=True,
         merged_map_folder=str(server.publisher.folder),
@@ -64,7 +71,7 @@ def status_of(
         preparing=preparing,
         pending=pending,
         published_s_ago=None if published_s is None else time.monotonic() - published_s,
-        last_events=tuple(server.events.last),
+        lines=list(server.events.last),
         problem=problem,
     )
 
@@ -89,7 +96,7 @@ def status_without_server(spool: Spool) -> ServerStatus:
         preparing=0,
         pending=[entry.robot for entry in spool.entries()],
         published_s_ago=None,
-        last_events=tuple(lines[-_LAST_EVENTS:]),
+        lines=lines[-_LAST_EVENTS:],
         problem="",
     )
 
@@ -105,7 +112,7 @@ def _status(
     preparing: int,
     pending: list[str],
     published_s_ago: float | None,
-    last_events: tuple[str, ...],
+    lines: list[str],
     problem: str,
 ) -> ServerStatus:
     shown = vi_map or VIMap()
@@ -135,6 +142,11 @@ def _status(
         since_joint_optimization=journal.since_joint,
         published_s_ago=published_s_ago,
         robots=tuple(robots),
-        last_events=last_events,
+        last_events=tuple(_event(line) for line in lines),
         problem=problem,
     )
+
+
+def _event(line: str) -> EventLine:
+    time_, _, event = line.partition("  ")
+    return EventLine(time_, event)

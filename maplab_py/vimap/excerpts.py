@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.array_types import I32, I64
 from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, with_p_G
@@ -36,7 +37,7 @@ class Excerpt:
     landmarks: I64
     keypoints: I64
 
-    def written_back(self, edited: VIMap) -> VIMap:
+    def written_back(self, edited: VIMap, *, vertices: ArrayLike | None = None) -> VIMap:
         """Return the whole map with the states and landmarks of the edited part.
 
         Poses, velocities, biases, base frames, and the positions and qualities of landmarks are
@@ -46,6 +47,7 @@ class Excerpt:
         Args:
             edited: The part after edits that keep its missions, vertices and keypoints and add no
                 landmarks.
+            vertices: Vertices of the part (rows or a mask) whose states are taken over; None = all.
 
         Raises:
             ValueError: The edit has changed what it must keep.
@@ -53,19 +55,20 @@ class Excerpt:
         for name in ("missions", "vertices", "keypoints"):
             if len(getattr(edited, name)) != len(getattr(self.vi_map, name)):
                 raise ValueError(f"the edit has changed the number of {name}")
-        whole = self._with_observations(self._with_states(edited), edited)
+        rows = np.arange(len(self.vertices)) if vertices is None else np.asarray(vertices)
+        whole = self._with_observations(self._with_states(edited, rows), edited)
         rows = whole.landmark_index.rows(edited.landmarks.id)
         quality = whole.landmarks.quality.copy()
         quality[rows] = edited.landmarks.quality
         whole = whole.replace(landmarks=whole.landmarks.replace(quality=quality))
         return with_p_G(whole, rows, edited.p_G)
 
-    def _with_states(self, edited: VIMap) -> VIMap:
+    def _with_states(self, edited: VIMap, changed: NDArray[Any]) -> VIMap:
         v, whole = edited.vertices, self.source.vertices
         columns = {}
         for name in ("T_M_I", "v_M", "gyro_bias", "accel_bias"):
             columns[name] = getattr(whole, name).copy()
-            columns[name][self.vertices] = getattr(v, name)
+            columns[name][self.vertices[changed]] = getattr(v, name)[changed]
         rows = self.source.missions.baseframe[self.missions]
         frames, of = self.source.baseframes, edited.missions.baseframe
         T_G_M, is_known = frames.T_G_M.copy(), frames.is_known.copy()

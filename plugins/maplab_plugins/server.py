@@ -126,7 +126,7 @@ def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -
         wait_s: Wait up to so long [s] until a server has merged all that can be merged.
     """
     from maplab_py.server.client import NotRunning, ask
-    from maplab_py.server.reports import RobotLine, ServerStatus
+    from maplab_py.server.reports import EventLine, RobotLine, ServerStatus
     from maplab_py.server.spool import Spool
     from maplab_py.server.status import status_without_server
 
@@ -139,7 +139,8 @@ def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -
         else:
             robots = tuple(RobotLine(**line) for line in content.pop("robots"))
             content["spool"] = Path(content["spool"])
-            content["last_events"] = tuple(content["last_events"])
+            events = (EventLine(**line) for line in content["last_events"])
+            content["last_events"] = tuple(events)
             status = ServerStatus(**content, robots=robots)
         is_idle = status.is_running and not status.incoming + status.preparing + status.waiting
         if is_idle or time.monotonic() >= deadline:

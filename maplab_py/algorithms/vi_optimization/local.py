@@ -68,7 +68,8 @@ def optimize_around(
     rows = np.flatnonzero(is_fixed[part.vertices])
     result, report = optimize(part.vi_map, options, fixed_vertices=rows, progress=progress)
     sizes = int(np.count_nonzero(is_free)), len(rows)
-    return part.written_back(result), LocalReport(*sizes, report)
+    whole = part.written_back(result, vertices=is_free[part.vertices])
+    return whole, LocalReport(*sizes, report)
 
 
 def _most_shared(vi_map: VIMap, seeds: Mask, wanted: Mask, count: int) -> Mask:

@@ -1,0 +1,190 @@
+"""What a server refuses, each with one line, while the merged map stays valid."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import UserError
+from maplab_py.pipeline.orders import Ending, Order, Outcome
+from maplab_py.sensors import SensorSet
+from maplab_py.server.publishing import Publisher
+from maplab_py.server.spool import push
+from maplab_py.storage.native import save_map
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import with_new_ids
+from tests.server.support import Servers, copying, submaps
+
+
+def refused(servers: Servers, robot: str, submap: VIMap) -> str:
+    """Return why a submap is refused by a server that has ant's first one."""
+    servers.put("ant", 0)
+    servers.run()
+    before = servers.published().vertices.id
+    servers.put(robot, 1, submap, "bad")
+    servers.run()
+    assert np.array_equal(servers.published().vertices.id, before)
+    (reason,) = servers.reasons()
+    assert reason.startswith(f"{robot}/bad: ")
+    servers.put("ant", 1)
+    servers.run()
+    assert len(servers.published().vertices) > len(before)
+    return reason.removeprefix(f"{robot}/bad: ")
+
+
+def test_two_robots_with_one_mission_id(servers: Servers) -> None:
+    reason = refused(servers, "bee", submaps("ant")[1])
+    assert "comes from robot ant already: give it an id of its own" in reason
+
+
+def test_another_calibration(servers: Servers) -> None:
+    submap = submaps("ant")[1]
+    sensors = dict(submap.sensors.sensors)
+    for name, sensor in sensors.items():
+        if hasattr(sensor, "cameras"):
+            camera = sensor.cameras[0]
+            changed = dataclasses.replace(camera, intrinsics=camera.intrinsics + 1.0)
+            sensors[name] = dataclasses.replace(sensor, cameras=(changed, *sensor.cameras[1:]))
+    assert isinstance(submap.sensors, SensorSet)
+    changed_set = dataclasses.replace(submap.sensors, sensors=sensors)
+    assert "has another calibration" in refused(servers, "ant", submap.replace(sensors=changed_set))
+
+
+def test_a_clock_that_jumps(servers: Servers) -> None:
+    submap = submaps("ant")[1]
+    samples, middle = submap.imu_samples, 40
+    times_ns = samples.timestamp_ns.copy()
+    inside = slice(int(submap.sample_start[1]) + 3, int(submap.sample_start[2]) - 3)
+    times_ns[inside] += 5_000_000_000
+    jumped = submap.replace(imu_samples=samples.replace(timestamp_ns=times_ns))
+    assert middle
+    reason = refused(servers, "ant", jumped)
+    assert "clock jumps" in reason or "increase" in reason
+
+
+def test_a_stretch_of_time_that_the_map_has_with_other_vertices(servers: Servers) -> None:
+    servers.put("ant", 0)
+    servers.run()
+    other = with_new_ids(submaps("ant")[0])
+    same_mission = other.replace(missions=other.missions.replace(id=submaps("ant")[0].missions.id))
+    servers.put("ant", 1, same_mission, "again")
+    servers.run()
+    assert servers.reasons() == []  # it adjoins nothing: it waits
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+
+
+def test_a_duplicate(servers: Servers) -> None:
+    reason = refused(servers, "ant", submaps("ant")[0])
+    assert reason == "is a duplicate of ant/submap_0"
+
+
+def test_a_duplicate_that_was_saved_again(servers: Servers) -> None:
+    submap = submaps("ant")[0]
+    landmarks = submap.landmarks.replace(quality=np.zeros(len(submap.landmarks), np.int8) + 2)
+    reason = refused(servers, "ant", submap.replace(landmarks=landmarks))
+    assert reason == "brings no vertex that the map does not have"
+
+
+def test_a_submap_that_is_half_copied_is_left_alone_until_nothing_comes_any_more(
+    servers: Servers,
+) -> None:
+    servers.spool.make()
+    whole = servers.scratch / "whole"
+    save_map(submaps("ant")[0], whole)
+    half = servers.spool.incoming / "ant" / "half"
+    shutil.copytree(whole, half)
+    vertices = next((half / "vi_map").glob("vertices*"))
+    content = vertices.read_bytes()
+    vertices.write_bytes(content[: len(content) // 2])
+    (arrival,) = servers.spool.arrivals()
+    assert not arrival.is_complete
+    assert not arrival.reason
+    vertices.write_bytes(content)
+    assert servers.spool.arrivals()[0].is_complete
+    vertices.write_bytes(content[: len(content) // 2])
+    servers.run()
+    (reason,) = servers.reasons()
+    assert "ant/half: " in reason
+    assert vertices.name in reason
+    assert len(reason.splitlines()) == 1
+
+
+def test_links_and_hidden_folders(servers: Servers) -> None:
+    servers.spool.make()
+    (servers.spool.incoming / "ant").mkdir()
+    whole = servers.scratch / "whole"
+    save_map(submaps("ant")[0], whole)
+    (servers.spool.incoming / "ant" / "link").symlink_to(whole)
+    shutil.copytree(whole, servers.spool.incoming / ".partial" / "x")
+    (arrival,) = servers.spool.arrivals()
+    assert arrival.reason == "is a symbolic link: put the folder itself there"
+
+
+def test_a_full_disk_delays_the_map_and_loses_nothing(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("maplab_py.server.server._SECONDS_BETWEEN_RETRIES", 0.1)
+    publish, failures = Publisher.publish, [1, 2]
+
+    def full(publisher: Publisher, vi_map: VIMap) -> None:
+        if failures:
+            failures.pop()
+            raise UserError("city: cannot be saved (No space left on device)")
+        publish(publisher, vi_map)
+
+    monkeypatch.setattr(Publisher, "publish", full)
+    for number in range(3):
+        servers.put("ant", number)
+    server = servers.run()
+    servers.check_whole("ant")
+    assert server.status().problem == ""
+    log = servers.spool.log.read_text()
+    assert log.count("the map cannot be published: city: cannot be saved (No space") == 1
+
+
+def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
+    killed: list[str] = []
+
+    def dying(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+        if not killed:
+            killed.append(order.title)
+            return Outcome(order.title, Ending.OVER_MEMORY, "was killed")
+        return copying(order, is_cancelled)
+
+    servers.work(dying)
+    servers.put("ant", 0)
+    servers.run()
+    assert killed == ["ant/submap_0"]
+    assert "its worker was killed; it is tried again" in servers.spool.log.read_text()
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+
+
+def test_a_worker_that_dies_every_time_is_given_up(servers: Servers) -> None:
+    servers.work(lambda order, _: Outcome(order.title, Ending.OVER_MEMORY, "was killed"))
+    servers.put("ant", 0)
+    servers.run()
+    assert servers.reasons() == ["ant/submap_0: its worker was killed, 3 times"]
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", ".hidden"])
+def test_names_that_cannot_be_folders(servers: Servers, robot: str) -> None:
+    with pytest.raises(UserError, match="--robot_name"):
+        servers.put(robot or "", 0, submaps("ant")[0]) if robot else push(
+            servers.spool, robot, Path("x")
+        )
+
+
+def test_push_refuses_what_is_no_map_and_what_is_there_already(
+    servers: Servers, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match="is not a map folder"):
+        push(servers.spool, "ant", tmp_path)
+    servers.put("ant", 0)
+    with pytest.raises(UserError, match="is there already"):
+        servers.put("ant", 0)
+    assert not list(servers.spool.partial.iterdir())

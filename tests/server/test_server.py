@@ -1,0 +1,182 @@
+"""The loop of the server: order, publication, deletion, requests."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import UserError
+from maplab_py.server.client import NotRunning, ask, order
+from maplab_py.server.options import IncrementalOptions, ServiceOptions
+from maplab_py.server.server import MapServer
+from maplab_py.server.status import status_without_server
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.ids import to_hex
+from tests.server.support import ROBOTS, Servers, session, submaps
+from tests.support.waiting import wait_until
+
+
+class Running:
+    """A server in a thread."""
+
+    def __init__(self, server: MapServer) -> None:
+        self.server = server
+        self.thread = threading.Thread(target=server.run, daemon=True)
+        self.thread.start()
+        assert wait_until(server.spool.address.is_file)
+        assert wait_until(lambda: _answers(server))
+
+    def end(self) -> None:
+        self.server.stop()
+        self.thread.join(30.0)
+        assert not self.thread.is_alive()
+
+
+def _answers(server: MapServer) -> bool:
+    try:
+        return bool(ask(server.spool, "serve_status"))
+    except NotRunning:
+        return False
+
+
+def test_submaps_of_two_robots_become_one_map(servers: Servers) -> None:
+    for number in range(3):
+        for robot in ROBOTS:
+            servers.put(robot, number)
+    server = servers.run()
+    servers.check_whole(*ROBOTS)
+    vi_map = servers.published()
+    assert check_consistency(vi_map).errors == ()
+    assert sorted(vi_map.missions.name) == list(ROBOTS)
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    assert known.tolist() == [True, False]
+    assert server.status().merged == 6
+    assert not list(servers.spool.accepted.iterdir())
+    assert len(list(servers.spool.merged.iterdir())) == 6
+    assert not servers.spool.address.exists()
+
+
+def test_a_submap_that_adjoins_nothing_waits_for_its_neighbour(servers: Servers) -> None:
+    servers.put("ant", 0)
+    servers.put("ant", 2)
+    server = servers.run()
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+    assert status_without_server(servers.spool).waiting == 1
+    assert server.status().robots[0].submaps_waiting == 1
+    servers.put("ant", 1)
+    servers.run()
+    servers.check_whole("ant")
+
+
+def test_a_mission_may_grow_from_its_end(servers: Servers) -> None:
+    for number in (2, 1, 0):
+        servers.put("ant", number)
+        servers.run()
+    servers.check_whole("ant")
+
+
+def test_the_map_is_optimised_jointly_after_every_nth_and_at_the_end(servers: Servers) -> None:
+    servers.incremental = IncrementalOptions(full_optimization_every_nth=2)
+    for number in range(3):
+        servers.put("ant", number)
+    server = servers.make()
+    report = server.run()
+    assert report.joint_optimizations == 2
+    assert server.journal.since_joint == 0
+    assert server.journal.radius > 0.0
+
+
+def test_the_watcher_sees_every_published_map(servers: Servers) -> None:
+    seen: list[int] = []
+    server = MapServer(
+        servers.spool,
+        servers.options,
+        incremental=servers.incremental,
+        service=servers.service,
+        watch=lambda vi_map: seen.append(len(vi_map.vertices)),
+    )
+    servers.put("ant", 0)
+    server.run()
+    assert seen[-1] == len(submaps("ant")[0].vertices)
+
+
+def test_a_second_server_on_one_spool_is_refused(servers: Servers) -> None:
+    servers.service = ServiceOptions()
+    running = Running(servers.make())
+    with pytest.raises(UserError, match=r"another server \(process \d+\) works on it"):
+        servers.make().run()
+    running.end()
+
+
+def test_it_answers_on_loopback_and_stops_when_it_is_asked_to(servers: Servers) -> None:
+    servers.service = ServiceOptions()
+    running = Running(servers.make())
+    servers.put("ant", 0)
+    assert wait_until(lambda: ask(servers.spool, "serve_status")["merged"] == 1)
+    status = ask(servers.spool, "serve_status")
+    assert status["url"].startswith("http://127.0.0.1:")
+    assert status["robots"][0]["robot"] == "ant"
+    middle = int(submaps("ant")[0].vertices.timestamp_ns[3])
+    found = ask(
+        servers.spool, "map_lookup", robot_name="ant", timestamp_ns=str(middle), p_S="0 0 0"
+    )
+    vi_map = servers.published()
+    row = int(np.flatnonzero(vi_map.vertices.timestamp_ns == middle)[0])
+    np.testing.assert_allclose(found["p_G"], vi_map.T_G_I[row, 4:], atol=1e-9)
+    with pytest.raises(UserError, match="robot_name=cow"):
+        ask(servers.spool, "map_lookup", robot_name="cow", timestamp_ns="0")
+    with pytest.raises(UserError, match="no resources of type"):
+        ask(servers.spool, "get_dense_map_in_range", center_G="0 0 0", radius_m="1")
+    order(servers.spool, "serve_stop")
+    running.thread.join(30.0)
+    assert not running.thread.is_alive()
+    with pytest.raises(NotRunning, match="start one with maplab serve"):
+        ask(servers.spool, "serve_status")
+
+
+def test_a_deleted_mission_stays_deleted_and_its_submaps_are_refused(servers: Servers) -> None:
+    servers.service = ServiceOptions()
+    running = Running(servers.make())
+    servers.put("ant", 0)
+    servers.put("bee", 0)
+    assert wait_until(lambda: ask(servers.spool, "serve_status")["merged"] == 2)
+    mission = to_hex(session("bee").missions.id[0])
+    answer = order(servers.spool, "delete_mission", mission=mission)
+    assert answer["missions"] == [mission]
+    assert len(servers.published().missions) == 1
+    servers.put("bee", 1)
+    assert wait_until(servers.reasons)
+    assert servers.reasons() == [f"bee/submap_1: mission {mission} was deleted"]
+    order(servers.spool, "delete_all_robot_missions", robot_name="ant")
+    assert not servers.map_folder.exists()
+    with pytest.raises(UserError, match="no map yet"):
+        order(servers.spool, "delete_all_robot_missions", robot_name="ant")
+    running.end()
+    servers.service = ServiceOptions(stop_when_idle_s=0.3)
+    assert servers.run().status().vertices == 0
+
+
+def test_the_folder_of_the_map_is_required_and_must_be_of_this_spool(servers: Servers) -> None:
+    with pytest.raises(UserError, match="merged_map_folder is required"):
+        servers.make(merged_map_folder="")
+    servers.put("ant", 0)
+    servers.run()
+    other = Servers(servers.scratch / "other", pytest.MonkeyPatch())
+    other.options = dataclasses.replace(other.options, merged_map_folder=str(servers.map_folder))
+    with pytest.raises(UserError, match="did not come through"):
+        other.run()
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+
+
+def test_backups_are_kept_beside_the_map(servers: Servers, monkeypatch: pytest.MonkeyPatch) -> None:
+    servers.options = dataclasses.replace(servers.options, backup_interval_s=1)
+    servers.service = ServiceOptions(stop_when_idle_s=1.5)
+    servers.put("ant", 0)
+    servers.run()
+    backups = sorted(Path(f"{servers.map_folder}_backups").iterdir())
+    assert len(backups) == 1
+    assert (backups[0] / "vi_map").is_dir()
