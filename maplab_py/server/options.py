@@ -33,9 +33,6 @@ class MergingOptions:
     enable_visual_loop_closure_based_map_anchoring: bool = option(
         True, help="Anchor missions of unknown base frame to known ones by loop closures."
     )
-    enable_lidar_loop_closure: bool = option(
-        False, help="Close loops of lidar clouds as well (needs the extra lidar)."
-    )
     set_first_robot_map_baseframe_to_known: bool = option(
         True, help="The first mission of the map defines the global frame."
     )

@@ -220,7 +220,7 @@ def delete_all_robot_missions(
 
 @command(
     "map_lookup",
-    example="map_lookup --spool=spool --robot_name=ant --timestamp_ns=1000000000",
+    example="map_lookup --spool=spool --robot_name=ant --timestamp_ns=1600000001000000000",
     needs_map=False,
     see_also=("serve",),
 )

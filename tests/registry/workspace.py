@@ -123,6 +123,24 @@ PREPARED["export_colmap_mvs"] = PREPARED["export_for_pmvs_reconstruction"] = _RO
 PREPARED["visualize_mesh"] = PREPARED["create_mesh_from_tsdf_grid"]
 PREPARED["register_point_clouds"] = "load lidar"
 
+PREPARED["push"] = ""
+_PUSHED = "push submap_1 --spool=spool --robot_name=ant"
+PREPARED["serve"] = _PUSHED
+_SERVING = "serve --spool=spool --maplab_server_merged_map_folder=city --serve_stop_when_idle_s=5"
+SERVED = (
+    "delete_all_robot_missions",
+    "delete_mission",
+    "map_lookup",
+    "serve_status",
+    "serve_stop",
+)
+for _name in SERVED:
+    PREPARED[_name] = f"{_PUSHED}; {_SERVING} &; serve_status --spool=spool --wait_s=100"
+PREPARED["get_dense_map_in_range"] = (
+    "push lidar --spool=spool --robot_name=ant; "
+    f"{_SERVING} &; serve_status --spool=spool --wait_s=100"
+)
+
 _SHOWING = ("images", "depth_maps", "disparity_maps", "pointclouds")
 
 
@@ -134,16 +152,20 @@ def lines_before(name: str) -> str:
 
 
 SLOW = (
+    *SERVED,
     "anchor_all_missions",
     "anchor_mission",
     "assign_edge_uncertainties",
     "demo",
+    "get_dense_map_in_range",
     "loopclosure_all_missions",
     "loopclosure_one_mission",
     "optimize_visual",
     "relax",
     "relax_missions_independently",
+    "serve",
     "simulate",
+    "simulate_robots",
     "warmup",
 )
 """Commands whose examples take more than a second or two."""
