@@ -5,6 +5,7 @@ python docs/scripts/draw_server.py
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,9 @@ PANEL_PX, HEAD_PX, MARGIN_PX = 300, 46, 12
 
 def main() -> None:
     """Merge the submaps of four robots; draw the map at a third, at two thirds and at the end."""
-    data = simulate(load_scenario("four_sessions"))
+    scenario = load_scenario("four_sessions")
+    measurement = dataclasses.replace(scenario.measurement, frame_rate_hz=2.0, max_keypoints=120)
+    data = simulate(dataclasses.replace(scenario, measurement=measurement))
     robots = [f"robot_{number + 1}" for number in range(len(data.maps))]
     submaps = timed_submaps(dict(zip(robots, data.maps, strict=True)), SUBMAP_S)
     merger = Merger(MergingOptions(), IncrementalOptions())

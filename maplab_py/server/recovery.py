@@ -100,17 +100,17 @@ def _with_unknown(
         if entry.number in known:
             spool.finish(entry, keep=True)
             continue
-        found = _if_in_map(spool.folder(entry) / "submap", entry, vi_map)
-        if found is not None:
-            journal = journal.with_merged(found, joint_is_due=True)
+        record = _if_in_map(spool.folder(entry) / "submap", entry, vi_map)
+        if record is not None:
+            journal = journal.with_merged(record, joint_is_due=True)
             spool.finish(entry, keep=True)
             notes.append(f"{entry.title}: was merged before the server ended")
     if not journal.robots:  # the journal was deleted
         for folder in sorted(spool.merged.glob("[0-9]*")):
             entry = Entry(**json.loads((folder / "entry.json").read_text(encoding="utf-8")))
-            found = _if_in_map(folder / "submap", entry, vi_map)
-            if found is not None and entry.number not in known:
-                journal = journal.with_merged(found, joint_is_due=True)
+            record = _if_in_map(folder / "submap", entry, vi_map)
+            if record is not None and entry.number not in known:
+                journal = journal.with_merged(record, joint_is_due=True)
     return journal, notes
 
 

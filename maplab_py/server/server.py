@@ -187,15 +187,15 @@ class MapServer:
     # -- the loop -------------------------------------------------------------------------------
 
     def _recover(self) -> None:
-        found = recover(self.spool, self.publisher.folder)
-        self.journal = found.journal
-        self._restore(found.vi_map)
-        self.published = found.vi_map
-        for note in found.notes:
+        recovered = recover(self.spool, self.publisher.folder)
+        self.journal = recovered.journal
+        self._restore(recovered.vi_map)
+        self.published = recovered.vi_map
+        for note in recovered.notes:
             self.events.add(note)
         self._intake.take_up()
         write_journal(self.journal, self.spool.journal)
-        if found.is_changed:
+        if recovered.is_changed:
             self._publish()
         elif self.published is not None and self._watch is not None:
             self._watch(self.published)

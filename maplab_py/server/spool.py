@@ -109,11 +109,11 @@ class Spool:
 
     def arrivals(self) -> list[Arrival]:
         """Return what lies in `incoming`, the oldest first."""
-        found = []
+        arrivals = []
         for robot in _folders(self.incoming):
             if not robot.is_symlink():
-                found += [_arrival(robot.name, path, self._quiet_s) for path in _folders(robot)]
-        return sorted(found, key=lambda a: (_changed_s(a.folder), a.robot, a.folder.name))
+                arrivals += [_arrival(robot.name, path, self._quiet_s) for path in _folders(robot)]
+        return sorted(arrivals, key=lambda a: (_changed_s(a.folder), a.robot, a.folder.name))
 
     def accept(self, arrival: Arrival, number: int) -> Entry:
         """Move a submap from `incoming` to `accepted`.

@@ -275,7 +275,9 @@ def get_dense_map_in_range(
     output_file: Path | None = None,
     overwrite: bool = False,
 ) -> DenseMapReport:
-    """Ask a map server for the dense points around a position; see --maplab_server_dense_map_resource_type.
+    """Ask a map server for the dense points around a position.
+
+    The server looks into resources of the type --maplab_server_dense_map_resource_type.
 
     Args:
         spool: Folder of the spool.

@@ -121,12 +121,12 @@ def test_it_answers_on_loopback_and_stops_when_it_is_asked_to(servers: Servers) 
     assert status["url"].startswith("http://127.0.0.1:")
     assert status["robots"][0]["robot"] == "ant"
     middle = int(submaps("ant")[0].vertices.timestamp_ns[3])
-    found = ask(
+    answer = ask(
         servers.spool, "map_lookup", robot_name="ant", timestamp_ns=str(middle), p_S="0 0 0"
     )
     vi_map = servers.published()
     row = int(np.flatnonzero(vi_map.vertices.timestamp_ns == middle)[0])
-    np.testing.assert_allclose(found["p_G"], vi_map.T_G_I[row, 4:], atol=1e-9)
+    np.testing.assert_allclose(answer["p_G"], vi_map.T_G_I[row, 4:], atol=1e-9)
     with pytest.raises(UserError, match="robot_name=cow"):
         ask(servers.spool, "map_lookup", robot_name="cow", timestamp_ns="0")
     with pytest.raises(UserError, match="no resources of type"):
