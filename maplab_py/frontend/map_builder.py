@@ -133,6 +133,21 @@ class MapBuilder:
             result = stack(result, part)
         return result
 
+    def make_part(self, mission: int, first: int) -> VIMap | None:
+        """Return a mission from a vertex (its row) on, with landmarks; None of fewer than two vertices.
+
+        Ids are not those of the whole map.
+        """
+        part = self._missions[mission].part(first)
+        if len(part) < _MIN_VERTICES:
+            return None
+        vi_map = mission_map(self._device, part, self._images)
+        return init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)[0]
+
+    def count(self, mission: int) -> int:
+        """Return the number of vertices of a mission."""
+        return len(self._missions[mission])
+
     def finish(self, *, progress: Progress = SILENT) -> tuple[VIMap, TrackReport]:
         """Return the map with landmarks: tracks are triangulated, and their quality is evaluated.
 

@@ -87,6 +87,13 @@ class RecordedMission:
         self._samples = []
         self._row_of_time = {t: row for t, row in self._row_of_time.items() if row < kept}
 
+    def part(self, first: int) -> RecordedMission:
+        """Return the vertices from a row on, with the samples between them."""
+        result = RecordedMission()
+        result.states, result.frames = self.states[first:], self.frames[first:]
+        result.image_rows, result.edges = self.image_rows[first:], self.edges[first:]
+        return result
+
     def refine(self, states: BodyStates) -> None:
         """Replace the states of vertices that have one of these times."""
         for index, time_ns in enumerate(states.times_ns.tolist()):

@@ -169,7 +169,10 @@ class Merger:
         )
 
     def optimize_jointly(self, *, progress: Progress = SILENT) -> float:
-        """Anchor, close the loops of the whole map and optimise it; return the largest move [m].
+        """Anchor, close the loops of the whole map and optimise it.
+
+        Returns:
+            The largest move of a vertex that was anchored before [m].
 
         Raises:
             EstimationError: The optimisation failed. The map is as before.
@@ -187,7 +190,9 @@ class Merger:
             options = dataclasses.replace(options, initial_trust_region_radius=self.radius)
         vi_map, report = optimize(vi_map, options, progress=progress)
         self.vi_map, self.radius = vi_map, report.trust_region_radius
-        return float(np.linalg.norm(vi_map.T_G_I[:, 4:] - before.T_G_I[:, 4:], axis=1).max())
+        known = before.baseframes.is_known[before.missions.baseframe][before.vertices.mission]
+        moved_m = np.linalg.norm(vi_map.T_G_I[:, 4:] - before.T_G_I[:, 4:], axis=1)
+        return float(moved_m[known].max(initial=0.0))
 
     def _appended(self, submap: VIMap) -> VIMap:
         base = self.vi_map

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import ClassVar
 
 from maplab_py.errors import FlagError
@@ -138,3 +139,48 @@ class ServiceOptions:
     keep_submaps: bool = option(
         True, help="Keep submaps in the spool's folder merged, so that the map can be built again."
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class SubmapOutput:
+    """Where submaps go while a recording is read."""
+
+    flag_prefix: ClassVar[str] = ""
+
+    submap_spool: Path | None = option(
+        None, help="Spool of a map server that gets the map in parts; empty = none"
+    )
+    submap_interval_s: float = option(20.0, help="Length of a part", unit="s")
+    robot_name: str = option("robot", help="Name of this robot in the spool")
+
+    def __post_init__(self) -> None:
+        """Check the interval.
+
+        Raises:
+            FlagError: It is not positive.
+        """
+        if not self.submap_interval_s > 0.0:
+            raise FlagError(f"--submap_interval_s={self.submap_interval_s:g}: must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayOptions:
+    """How sessions are cut, and how fast they are played."""
+
+    flag_prefix: ClassVar[str] = "robots_"
+
+    submap_s: float = option(10.0, help="Length of a submap.", unit="s")
+    rate: float = option(
+        1.0, help="Speed relative to real time; 0 = push everything as fast as it can be written."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            FlagError: A value is out of range.
+        """
+        if not self.submap_s > 0.0:
+            raise FlagError(f"--robots_submap_s={self.submap_s:g}: must be greater than 0")
+        if not 0.0 <= self.rate < float("inf"):
+            raise FlagError(f"--robots_rate={self.rate:g}: must be 0 or greater")

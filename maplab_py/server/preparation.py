@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.pose_graph_manipulation.stationary import StationaryOptions
+from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import MapError
 from maplab_py.pipeline.execution import execute
 from maplab_py.pipeline.fingerprint import program_version

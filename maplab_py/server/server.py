@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.pose_graph_manipulation.stationary import StationaryOptions
+from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import Cancelled, MaplabError, UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server.intake import Intake, Item

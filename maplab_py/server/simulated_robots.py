@@ -6,10 +6,7 @@ import dataclasses
 import tempfile
 import time
 from pathlib import Path
-from typing import ClassVar
 
-from maplab_py.errors import FlagError
-from maplab_py.options import option
 from maplab_py.progress import Progress
 from maplab_py.server.spool import Spool, push
 from maplab_py.storage.native import save_map
@@ -17,29 +14,6 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import cut_by_time
 
 _LONGEST_SLEEP_S = 0.1
-
-
-@dataclasses.dataclass(frozen=True)
-class PlayOptions:
-    """How sessions are cut, and how fast they are played."""
-
-    flag_prefix: ClassVar[str] = "robots_"
-
-    submap_s: float = option(10.0, help="Length of a submap.", unit="s")
-    rate: float = option(
-        1.0, help="Speed relative to real time; 0 = push everything as fast as it can be written."
-    )
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            FlagError: A value is out of range.
-        """
-        if not self.submap_s > 0.0:
-            raise FlagError(f"--robots_submap_s={self.submap_s:g}: must be greater than 0")
-        if not 0.0 <= self.rate < float("inf"):
-            raise FlagError(f"--robots_rate={self.rate:g}: must be 0 or greater")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

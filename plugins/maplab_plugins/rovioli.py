@@ -17,6 +17,7 @@ from maplab_py.plugin import (
     command,
     key_of_folder,
 )
+from maplab_py.server.options import SubmapOutput
 
 if TYPE_CHECKING:
     from maplab_py.frontend.finishing import FinishedRun
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _DATA = DataSourceOptions()
 _SOURCE = SourceOptions()
 _RUN = RunOptions()
+_SUBMAPS = SubmapOutput()
 _DEFAULT_KEY = "rovioli"
 
 
@@ -52,6 +54,7 @@ def rovioli(
     data: DataSourceOptions = _DATA,
     source: SourceOptions = _SOURCE,
     run: RunOptions = _RUN,
+    submaps: SubmapOutput = _SUBMAPS,
     map_key: str = "",
     rovioli_visualize_map: bool = False,
     map_publish_interval_s: float = 2.0,
@@ -61,8 +64,9 @@ def rovioli(
     The estimator follows keypoints and smooths a window of frames with the IMU samples. It starts by
     itself, at rest or in motion, and starts again, with a new mission, if the estimate diverges. With
     --vio_localization_map_folder it tells where it is in that map. The new map stays in memory and is
-    saved to --save_map_folder. Ctrl-C ends the recording: the map so far is finished, kept in memory,
-    and saved likewise. A second Ctrl-C cancels the command.
+    saved to --save_map_folder; with --submap_spool it goes to a map server in parts. Ctrl-C ends the
+    recording: the map so far is finished, kept in memory, and saved likewise. A second Ctrl-C cancels
+    the command.
 
     Args:
         datasource_folder: EuRoC or TUM-VI folder, ROS bag, or map folder.
@@ -73,6 +77,7 @@ def rovioli(
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping
+    from maplab_py.server.recorded_submaps import SubmapWriter
     from maplab_py.storage.native import check_target
 
     run.check()
@@ -86,12 +91,17 @@ def rovioli(
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
     recording = open_source(datasource_folder, data, source)
-    observer = None
+    observers: list[Observer] = []
     if rovioli_visualize_map:
-        observer = _observer(context, key, map_publish_interval_s)
-    mapping = Mapping(recording, run, observer=observer)
+        observers.append(_observer(context, key, map_publish_interval_s))
+    writer = SubmapWriter(submaps) if submaps.submap_spool is not None else None
+    if writer is not None:
+        observers.append(writer)
+    mapping = Mapping(recording, run, observer=_Several(observers))
     with ending_early() as is_to_end:
         mapping.run(context.progress, is_to_end=is_to_end)
+        if writer is not None:
+            writer.finish(mapping)
         finished = finish(
             mapping, recording.name, map_key=key, progress=context.progress, is_to_end=is_to_end
         )
@@ -106,6 +116,18 @@ def rovioli(
             disk_copy=finished.disk_copy,
         )
     return finished.report
+
+
+class _Several:
+    """Several observers of a run."""
+
+    def __init__(self, observers: list[Observer]) -> None:
+        self._observers = observers
+
+    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Tell all of them."""
+        for observer in self._observers:
+            observer.after_frame(update, mapping)
 
 
 class _Pictures:

@@ -6,12 +6,16 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.pose_graph_manipulation.stationary import StationaryOptions
+from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.cancellation import ending_early, lasting_effect
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
-from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
-from maplab_py.server.simulated_robots import PlayOptions
+from maplab_py.server.options import (
+    IncrementalOptions,
+    MapServerOptions,
+    PlayOptions,
+    ServiceOptions,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import ClassVar
-
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.record_updates import closure_ids
+from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.geometry import se3
-from maplab_py.options import option
 from maplab_py.vimap import LoopClosureEdges, VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
 
 _SIGMA_M, _SIGMA_RAD = 0.01, 0.01
 _SWITCH_VARIANCE = 1e-8
-
-
-@dataclasses.dataclass(frozen=True)
-class StationaryOptions:
-    """When a mission stands still."""
-
-    flag_prefix: ClassVar[str] = "maplab_stationary_submaps_"
-
-    max_rotation_rad: float = option(
-        0.15, help="Largest angle between the first and any other vertex.", unit="rad"
-    )
-    max_translation_m: float = option(
-        0.10, help="Largest distance between the first and any other vertex.", unit="m"
-    )
 
 
 def tie_stationary(vi_map: VIMap, options: StationaryOptions) -> tuple[VIMap, tuple[str, ...]]:

@@ -32,6 +32,8 @@ from maplab_py.vimap.excerpts import cut_by_time
 
 ROBOTS, SUBMAPS_EACH, SUBMAP_S = 4, 10, 4.0
 _LONGEST_S = 3600.0
+_LONGEST_DELAY_S = 15.0
+"""The server is killed up to so long after a random number of submaps was merged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,24 +141,26 @@ class _Run:
     def play(self, kills: int) -> None:
         """Drop, serve, kill, until all submaps are in the map and the server has ended by itself."""
         deadline = time.monotonic() + _LONGEST_S
-        server = self._start(0.0)
-        until_kill_s, last_s = self._rng.uniform(5.0, 40.0), time.monotonic()
+        server = self._start()
+        moments = sorted(self._rng.uniform(0.0, self._total) for _ in range(kills))
+        wait_s, last_s = self._rng.uniform(0.0, _LONGEST_DELAY_S), time.monotonic()
         while len(self.waits_s) < self._total or self.kills < kills:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{len(self.waits_s)} of {self._total} after {_LONGEST_S} s")
             time.sleep(0.1)
             now_s = time.monotonic()
             self._serving_s += now_s - last_s
-            until_kill_s -= now_s - last_s
+            is_reached = self.kills < kills and len(self.waits_s) >= moments[self.kills]
+            wait_s -= (now_s - last_s) * is_reached
             last_s = now_s
             self._drop()
             self._look()
-            if self.kills < kills and until_kill_s <= 0.0:
+            if is_reached and wait_s <= 0.0:
                 server.send_signal(signal.SIGKILL)
                 server.wait()
                 self.kills += 1
-                server = self._start(0.0)
-                until_kill_s, last_s = self._rng.uniform(5.0, 40.0), time.monotonic()
+                server = self._start()
+                wait_s, last_s = self._rng.uniform(0.0, _LONGEST_DELAY_S), time.monotonic()
         server.send_signal(signal.SIGINT)
         if server.wait(_LONGEST_S) != 0:
             raise RuntimeError(f"the server ended with status {server.returncode}")
@@ -173,7 +177,7 @@ class _Run:
             if submap.title not in self.waits_s:
                 self.waits_s[submap.title] = self._serving_s - self._dropped_s[submap.title]
 
-    def _start(self, idle_s: float) -> subprocess.Popen[bytes]:
+    def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [
                 sys.executable,
@@ -183,7 +187,6 @@ class _Run:
                 f"--spool={self.spool.root}",
                 f"--maplab_server_merged_map_folder={self.map_folder}",
                 "--maplab_server_submap_loading_thread_pool_size=2",
-                f"--serve_stop_when_idle_s={idle_s}",
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

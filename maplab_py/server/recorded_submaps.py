@@ -1,0 +1,116 @@
+"""Submaps of a recording while it is made: the odometry's map goes into a spool in parts."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.server.options import SubmapOutput
+from maplab_py.server.spool import Spool, push
+from maplab_py.storage.native import save_map
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import IdArray
+
+
+class SubmapWriter:
+    """Observes a run and pushes the map in parts; neighbouring parts share a vertex.
+
+    The states of a part are those that the odometry has when it is pushed. The vertices of a mission that
+    was given up after a failure of the odometry are not pushed any more.
+
+    Attributes:
+        pushed: How many parts were pushed.
+    """
+
+    def __init__(self, output: SubmapOutput) -> None:
+        """Prepare; the spool is made at the first part."""
+        assert output.submap_spool is not None
+        self.pushed = 0
+        self._spool, self._output = Spool(output.submap_spool), output
+        self._mission, self._first, self._begin_ns = -1, 0, 0
+        self._start_ns = 0
+
+    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Push a part when it is long enough."""
+        builder = mapping.builder
+        if builder is None or update.state is None or not builder.missions:
+            return
+        if builder.missions - 1 != self._mission:
+            self._mission, self._first = builder.missions - 1, 0
+            self._start_ns = self._begin_ns = update.time_ns
+        if update.time_ns - self._begin_ns >= 1e9 * self._output.submap_interval_s:
+            builder.refine(mapping.odometry.window_states())
+            self._push(mapping)
+            self._begin_ns = update.time_ns
+
+    def finish(self, mapping: Mapping) -> None:
+        """Push what is left at the end of a run."""
+        if self._mission >= 0:
+            self._push(mapping)
+
+    def _push(self, mapping: Mapping) -> None:
+        builder = mapping.builder
+        if builder is None or self._first >= builder.count(self._mission):
+            return
+        submap = builder.make_part(self._mission, self._first)
+        if submap is None:
+            return
+        submap = with_ids_of_times(submap, f"{self._output.robot_name} {self._start_ns}")
+        name = f"{self._start_ns}_submap_{self.pushed:03d}"
+        with tempfile.TemporaryDirectory() as folder:
+            save_map(submap, Path(folder) / name)
+            push(self._spool, self._output.robot_name, Path(folder) / name)
+        self.pushed += 1
+        self._first = builder.count(self._mission) - 1
+
+
+def with_ids_of_times(vi_map: VIMap, mission: str) -> VIMap:
+    """Return a map of one mission whose ids follow from its name and the times of vertices and frames.
+
+    So the copies of a vertex in two submaps have one id, and all submaps have the mission's. Landmarks get
+    ids of their own in every submap; those of a shared vertex are united when submaps are joined.
+    """
+    v, frames, edges = vi_map.vertices, vi_map.frames, vi_map.imu_edges
+    of_edges = v.timestamp_ns[edges.from_vertex]
+    present = (frames.id != 0).any(axis=1)[:, None]
+    camera = frames.camera_index.astype(np.int64)
+    vertices = v.replace(
+        id=_ids(f"vertex {mission}", v.timestamp_ns),
+        nframe_id=_ids(f"nframe {mission}", v.timestamp_ns),
+    )
+    frame_ids = _ids(f"frame {mission}", v.timestamp_ns[frames.vertex], camera)
+    first = v.timestamp_ns[:1]
+    landmarks = vi_map.landmarks
+    count = np.arange(len(landmarks), dtype=np.int64)
+    landmark_ids = _ids(f"landmark {mission} {int(first[0])}", count)
+    zero = np.zeros(1, dtype=np.int64)
+    return vi_map.replace(
+        missions=vi_map.missions.replace(id=_ids(f"mission {mission}", zero)),
+        baseframes=vi_map.baseframes.replace(id=_ids(f"baseframe {mission}", zero)),
+        vertices=vertices,
+        frames=frames.replace(id=np.where(present, frame_ids, frames.id)),
+        imu_edges=edges.replace(id=_ids(f"edge {mission}", of_edges)),
+        landmarks=landmarks.replace(id=landmark_ids),
+    )
+
+
+def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> IdArray:
+    """Return ids (N, 2) that follow from a text and some numbers (N,) each."""
+    seed = np.frombuffer(hashlib.blake2b(purpose.encode(), digest_size=16).digest(), dtype="<u8")
+    with np.errstate(over="ignore"):
+        words = np.tile(seed.astype(np.uint64), (len(numbers[0]), 1))
+        for column in numbers:
+            words = _mixed(words + column.astype(np.uint64)[:, None])
+    return np.asarray(words | (words == 0).astype(np.uint64))
+
+
+def _mixed(words: IdArray) -> IdArray:
+    """Return words whose every bit depends on all bits (the finaliser of splitmix64)."""
+    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(words ^ (words >> np.uint64(31)))

@@ -1,0 +1,48 @@
+"""A recording whose map goes into a spool while it is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.console.session.session import Session
+from maplab_py.errors import FlagError
+from maplab_py.server.options import SubmapOutput
+from maplab_py.storage.native import find_maps, load_map, save_map
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.submaps import append_submaps
+from tests.frontend.simulated import REST_FIRST, replayed
+
+
+def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
+    walk, spool = tmp_path / "walk", tmp_path / "spool"
+    save_map(replayed(REST_FIRST, 1)[0], walk)
+    with Session() as session:
+        session.run(
+            "rovioli",
+            datasource_folder=walk,
+            submap_spool=spool,
+            submap_interval_s=3.0,
+            robot_name="ant",
+        )
+        whole = session.vi_map
+    folders = find_maps(spool / "incoming" / "ant")
+    parts = [load_map(folder)[0] for folder in folders]
+    assert len(parts) >= 3
+    assert len({part.missions.id.tobytes() for part in parts}) == 1
+    joined, report = append_submaps(parts)
+    assert report.vertices_shared == len(parts) - 1
+    assert report.landmarks_united > 0
+    assert check_consistency(joined).errors == ()
+    assert np.array_equal(joined.vertices.timestamp_ns, whole.vertices.timestamp_ns)
+    assert len(joined.imu_samples) == len(whole.imu_samples)
+    assert len(joined.keypoints) == len(whole.keypoints)
+    ids = joined.vertices.id
+    assert len(np.unique(ids, axis=0)) == len(ids)
+
+
+def test_the_interval_must_be_positive() -> None:
+    with pytest.raises(FlagError, match="submap_interval_s=0"):
+        SubmapOutput(submap_interval_s=0.0)
