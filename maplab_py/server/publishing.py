@@ -23,6 +23,7 @@ class Publisher:
     Attributes:
         folder: Folder of the map.
         published_s: When the map was last published [s, monotonic]; None = not yet.
+        duration_s: How long that took.
     """
 
     def __init__(self, options: PublishingOptions) -> None:
@@ -30,6 +31,7 @@ class Publisher:
         self.folder = Path(options.merged_map_folder).absolute()
         self.backups = self.folder.parent / f"{self.folder.name}_backups"
         self.published_s: float | None = None
+        self.duration_s = 0.0
         self._options = options
         self._files: list[tuple[Path, Path]] = []
         self._backup_s = time.monotonic()
@@ -55,9 +57,11 @@ class Publisher:
 
     def publish(self, vi_map: VIMap, *, progress: Progress = SILENT) -> None:
         """Replace the published map; raises UserError where the disk refuses."""
+        began = time.monotonic()
         save_map(vi_map, self.folder, force=True, resource_files=self._files, progress=progress)
         self._files.clear()
         self.published_s = time.monotonic()
+        self.duration_s = self.published_s - began
         self._is_backed_up = False
 
     def remove(self) -> None:

@@ -55,8 +55,10 @@ logger = logging.getLogger(__name__)
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_RETRIES = 5.0
-_SECONDS_UNPUBLISHED = 5.0
-"""While submaps are ready to be merged, the map is published this often; else after each."""
+_SECONDS_UNPUBLISHED = (5.0, 20.0)
+_PUBLISHING_SHARE = 0.1
+"""While submaps are ready to be merged, the map is published so often that this takes a tenth of the time,
+within limits; else after each. So the size of the map hardly slows the server down."""
 
 
 class MapServer:
@@ -371,7 +373,8 @@ class MapServer:
         if vi_map is None or vi_map is self.published or time.monotonic() < self._retry_s:
             return False
         last_s = self.publisher.published_s
-        is_time = last_s is None or time.monotonic() - last_s >= _SECONDS_UNPUBLISHED
+        pause_s = np.clip(self.publisher.duration_s / _PUBLISHING_SHARE, *_SECONDS_UNPUBLISHED)
+        is_time = last_s is None or time.monotonic() - last_s >= pause_s
         return (force or is_time) and self._publish()
 
     def _publish(self) -> bool:

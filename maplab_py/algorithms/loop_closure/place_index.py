@@ -16,7 +16,8 @@ from maplab_py.vision.kmeans import kmeans, nearest_centre
 from maplab_py.vision.projection import DescriptorProjection, learn_projection
 
 _WORDS = 1024
-_MIN_FEATURES = 4 * _WORDS
+_FEATURES_PER_WORD = 4
+_MIN_FEATURES = 400
 _TRAINING_FEATURES = 20_000
 
 
@@ -50,19 +51,20 @@ class PlaceIndex:
         landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
         self._projection = learn_projection(raw, landmark)
         step = max(1, len(raw) // _TRAINING_FEATURES)
-        self._centres = kmeans(self._projection.project(raw[::step]), _WORDS)
+        words = min(_WORDS, len(raw) // _FEATURES_PER_WORD)
+        self._centres = kmeans(self._projection.project(raw[::step]), words)
         return True
 
     def frequencies(self, vi_map: VIMap, vertices: I64 | None = None) -> F64:
         """Return the word frequencies (W,) of vertices (rows, None = all); zeros without features."""
         if self._projection is None:
-            return np.zeros(_WORDS)
+            return np.zeros(1)
         size, keypoints = _features(vi_map, vertices)
         if size != self._projection.descriptor_size or not len(keypoints):
-            return np.zeros(_WORDS)
+            return np.zeros(len(self._centres))
         raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoints, :size])
         words = nearest_centre(self._projection.project(raw), self._centres)
-        return np.bincount(words, minlength=_WORDS) / len(words)
+        return np.bincount(words, minlength=len(self._centres)) / len(words)
 
     def add(self, frequencies: F64) -> None:
         """Add a stretch with its word frequencies (W,)."""
@@ -75,7 +77,9 @@ class PlaceIndex:
         """
         if not self._frequencies or not frequencies.any():
             return np.zeros(0, dtype=np.int64)
-        known = np.stack(self._frequencies)
+        known = np.zeros((len(self._frequencies), len(frequencies)))
+        for row, column in enumerate(self._frequencies):
+            known[row, : len(column)] = column  # those from before the training have no words
         weight = np.log((1.0 + len(known)) / (1.0 + np.count_nonzero(known, axis=0))) + 1e-3
         a, b = known * weight, frequencies * weight
         norm = np.linalg.norm(a, axis=1) * np.linalg.norm(b)

@@ -1,8 +1,8 @@
 """Processor time per new submap with the size of the map.
 
 Missions of 15 s (31 vertices, up to 100 keypoints each) walk a third of the way round blocks of a
-town; each overlaps some of the others. Joint optimisations are left out. A step is everything that the
-server's loop does for a submap: append, anchor, close loops, optimise, and publish the whole map.
+town; each overlaps some of the others. Joint optimisations are left out. Measured is what the server's loop
+does for a submap: append, anchor, close loops, optimise; and the publication of the whole map apart.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from maplab_py.simulation.scenario import (
 )
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.storage.native import save_map
+from maplab_py.vimap import VIMap
 from tests.benchmarks.server.prepared import prepared
 
-_AROUND = 5
-"""Submaps on both sides of a size whose times are averaged."""
+_LATEST = 8
+"""Submaps whose times are averaged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +40,11 @@ class GrowthFigures:
     missions: int
     vertices: int
     keypoints: int
+    anchored: int
     steps_s: dict[str, float]
     merge_s: float
-    with_publishing_s: float
-    exponent_merge: float  # against the first row
-    exponent: float
+    publish_s: float  # once; while submaps are ready it takes at most a tenth of the time
+    exponent: float  # of merge_s against the first row
 
 
 def town(missions: int, blocks: tuple[int, int] = (4, 3)) -> SimulatedData:
@@ -82,30 +83,35 @@ def measure_growth(missions: int = 100) -> Iterator[str]:
     data = town(missions)
     merger = Merger(MergingOptions(), IncrementalOptions())
     steps: list[dict[str, float]] = []
-    sizes: list[tuple[int, int]] = []
+    first: tuple[int, float] | None = None
+    counts = {count for count in (10, 20, 40, 70, 100) if count <= missions}
     anchored = 1
+    for number, session in enumerate(data.maps, start=1):
+        step = merger.add(prepared(session))
+        anchored += len(step.anchored)
+        steps.append(step.seconds)
+        if number not in counts:
+            continue
+        vi_map = merger.vi_map
+        assert vi_map is not None
+        latest = steps[-_LATEST:]
+        mean = {name: float(np.mean([s[name] for s in latest])) for name in latest[0]}
+        merge_s = sum(mean.values())
+        first = first or (number, merge_s)
+        ratio = np.log(number / first[0]) or 1.0
+        exponent = float(np.log(merge_s / first[1]) / ratio)
+        sizes = len(vi_map.vertices), len(vi_map.keypoints)
+        steps_s = {name: round(value, 3) for name, value in mean.items()}
+        figures = GrowthFigures(
+            number, *sizes, anchored, steps_s, merge_s, publish_s(vi_map), exponent
+        )
+        yield str(figures)
+        yield f"error {evaluate_map(vi_map, data.truth).ate_m:.3f} m"
+
+
+def publish_s(vi_map: VIMap) -> float:
+    """Return the processor time of a publication."""
     with tempfile.TemporaryDirectory() as folder:
-        for vi_map in data.maps:
-            step = merger.add(prepared(vi_map))
-            anchored += len(step.anchored)
-            begin = time.process_time()
-            assert merger.vi_map is not None
-            save_map(merger.vi_map, Path(folder) / "map", force=True)
-            steps.append({**step.seconds, "publish": time.process_time() - begin})
-            sizes.append((len(merger.vi_map.vertices), len(merger.vi_map.keypoints)))
-    first: tuple[int, float, float] | None = None
-    for count in [c for c in (10, 20, 40, 70, 100, missions) if c <= missions]:
-        around = steps[max(1, count - _AROUND) : count + _AROUND]
-        mean = {name: float(np.mean([s[name] for s in around])) for name in around[0]}
-        whole = sum(mean.values())
-        merge = whole - mean["publish"]
-        first = first or (count, merge, whole)
-        ratio = np.log(count / first[0]) or 1.0
-        exponents = np.log(merge / first[1]) / ratio, np.log(whole / first[2]) / ratio
-        rounded = {name: round(value, 3) for name, value in mean.items()}
-        yield str(GrowthFigures(count, *sizes[count - 1], rounded, merge, whole, *exponents))
-    assert merger.vi_map is not None
-    yield f"{anchored} of {missions} missions anchored, {evaluate_map(merger.vi_map, data.truth).ate_m:.3f} m"
-    merger.optimize_jointly()
-    errors = evaluate_map(merger.vi_map, data.truth)
-    yield f"after a joint optimisation {errors.ate_m:.3f} m, {errors.false_merges} false merges"
+        begin = time.process_time()
+        save_map(vi_map, Path(folder) / "map")
+        return time.process_time() - begin
