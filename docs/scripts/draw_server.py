@@ -32,7 +32,7 @@ F64 = NDArray[np.float64]
 TARGET = Path(__file__).resolve().parents[1] / "images" / "server.svg"
 COLOURS = ("#0b6fb8", "#c8501e", "#2b8a4b", "#8a4fa3")
 SUBMAP_S = 15.0
-PANEL_PX, HEAD_PX, MARGIN_PX = 300, 46, 12
+PANEL_PX, PANEL_HEIGHT_PX, HEAD_PX, MARGIN_PX = 300, 150, 46, 12
 
 
 def main() -> None:
@@ -54,7 +54,7 @@ def main() -> None:
             left = len(panels) * (PANEL_PX + MARGIN_PX)
             panels.append(_panel(merger.vi_map, data.truth, robots, title, left))
     width = len(panels) * (PANEL_PX + MARGIN_PX) - MARGIN_PX
-    height = PANEL_PX + HEAD_PX
+    height = PANEL_HEIGHT_PX + HEAD_PX
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
         'font-family="sans-serif" font-size="13">',
@@ -85,14 +85,14 @@ def _panel(vi_map: VIMap, truth: Truth, robots: list[str], title: str, left: int
     middle = 0.5 * (low + high)
 
     def pixels(points: F64) -> F64:
-        centre = np.array([left + PANEL_PX / 2, HEAD_PX + PANEL_PX / 2])
+        centre = np.array([left + PANEL_PX / 2, HEAD_PX + PANEL_HEIGHT_PX / 2])
         return np.asarray(centre + (points[:, :2] - middle) * np.array([1.0, -1.0]) * scale)
 
     lines = [f'<text x="{left + PANEL_PX / 2}" y="18" text-anchor="middle">{title}</text>']
     lines += [
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="0.7" fill="#c4c4c4"/>'
         for x, y in pixels(landmarks)
-        if left < x < left + PANEL_PX and HEAD_PX < y < HEAD_PX + PANEL_PX
+        if left < x < left + PANEL_PX and HEAD_PX < y < HEAD_PX + PANEL_HEIGHT_PX
     ]
     for number, (robot, colour) in enumerate(zip(robots, COLOURS, strict=True)):
         missions = [row for row, name in enumerate(vi_map.missions.name) if name == robot]
