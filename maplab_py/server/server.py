@@ -224,11 +224,12 @@ class MapServer:
         self._answer_requests()
         if self.journal.since_joint:
             self._optimize_jointly(self._progress)
+        self._retry_s = 0.0
         self._publish_if_needed(force=True)
 
     def _is_busy(self) -> bool:
         """Tell whether a worker has a submap, or one is being copied."""
-        preparing = any(item.is_preparing for item in self._intake.items.values())
+        preparing = any(item.future is not None for item in self._intake.items.values())
         return preparing or bool(self.spool.arrivals())
 
     def _step(self, is_to_end: Callable[[], bool]) -> bool:
@@ -236,6 +237,8 @@ class MapServer:
         problem = self._intake.advance(self.journal)
         if problem:
             self._fail(problem)
+        elif self._merger.vi_map is self.published:
+            self._problem = ""
         self._answer_requests()
         if self._problem and not self._publish_if_needed(force=True):
             return False
@@ -392,6 +395,7 @@ class MapServer:
                     del self._intake.items[number]
         except (OSError, UserError) as error:
             self._fail(f"the map cannot be published: {error}")
+            self._retry_s = time.monotonic() + _SECONDS_BETWEEN_RETRIES
             return False
         self.published, self._problem = vi_map, ""
         if self._watch is not None and vi_map is not None:
@@ -399,11 +403,10 @@ class MapServer:
         return True
 
     def _fail(self, problem: str) -> None:
-        """Say a problem with the disk once, and wait before the next try."""
+        """Say a problem with the disk once."""
         if problem != self._problem:
             self.events.add(problem)
         self._problem = problem
-        self._retry_s = time.monotonic() + _SECONDS_BETWEEN_RETRIES
 
     def _reject(self, item: Item, reason: str) -> None:
         problem = self._intake.reject(item, reason)

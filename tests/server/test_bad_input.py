@@ -14,7 +14,7 @@ from maplab_py.errors import UserError
 from maplab_py.pipeline.orders import Ending, Order, Outcome
 from maplab_py.sensors import SensorSet
 from maplab_py.server.publishing import Publisher
-from maplab_py.server.spool import push
+from maplab_py.server.spool import Arrival, Entry, Spool, push
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_new_ids
@@ -57,12 +57,11 @@ def test_another_calibration(servers: Servers) -> None:
 
 def test_a_clock_that_jumps(servers: Servers) -> None:
     submap = submaps("ant")[1]
-    samples, middle = submap.imu_samples, 40
+    samples = submap.imu_samples
     times_ns = samples.timestamp_ns.copy()
     inside = slice(int(submap.sample_start[1]) + 3, int(submap.sample_start[2]) - 3)
     times_ns[inside] += 5_000_000_000
     jumped = submap.replace(imu_samples=samples.replace(timestamp_ns=times_ns))
-    assert middle
     reason = refused(servers, "ant", jumped)
     assert "clock jumps" in reason or "increase" in reason
 
@@ -147,6 +146,24 @@ def test_a_full_disk_delays_the_map_and_loses_nothing(
     assert log.count("the map cannot be published: city: cannot be saved (No space") == 1
 
 
+def test_a_full_disk_delays_what_comes(servers: Servers, monkeypatch: pytest.MonkeyPatch) -> None:
+    accept, failures = Spool.accept, [1, 2]
+
+    def full(spool: Spool, arrival: Arrival, number: int) -> Entry:
+        if failures:
+            failures.pop()
+            raise UserError("entry.json: cannot be written (No space left on device)")
+        return accept(spool, arrival, number)
+
+    monkeypatch.setattr(Spool, "accept", full)
+    servers.put("ant", 0)
+    server = servers.run()
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+    assert server.status().problem == ""
+    assert servers.reasons() == []
+    assert servers.spool.log.read_text().count("cannot be taken") == 1
+
+
 def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
     killed: list[str] = []
 
@@ -174,9 +191,7 @@ def test_a_worker_that_dies_every_time_is_given_up(servers: Servers) -> None:
 @pytest.mark.parametrize("robot", ["", "a/b", ".hidden"])
 def test_names_that_cannot_be_folders(servers: Servers, robot: str) -> None:
     with pytest.raises(UserError, match="--robot_name"):
-        servers.put(robot or "", 0, submaps("ant")[0]) if robot else push(
-            servers.spool, robot, Path("x")
-        )
+        push(servers.spool, robot, Path("x"))
 
 
 def test_push_refuses_what_is_no_map_and_what_is_there_already(

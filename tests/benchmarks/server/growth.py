@@ -17,7 +17,6 @@ import numpy as np
 
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MergingOptions
-from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import (
     MeasurementOptions,
     Scenario,
@@ -106,7 +105,6 @@ def measure_growth(missions: int = 100) -> Iterator[str]:
             number, *sizes, anchored, steps_s, merge_s, publish_s(vi_map), exponent
         )
         yield str(figures)
-        yield f"error {evaluate_map(vi_map, data.truth).ate_m:.3f} m"
 
 
 def publish_s(vi_map: VIMap) -> float:
