@@ -7,6 +7,13 @@ that holds the lock.
 """
 
 from maplab_py.atomic.files import PendingFile, replaced_file, write_file
-from maplab_py.atomic.folders import recover, replaced_folder
+from maplab_py.atomic.folders import move_folder, recover, replaced_folder
 
-__all__ = ["PendingFile", "recover", "replaced_file", "replaced_folder", "write_file"]
+__all__ = [
+    "PendingFile",
+    "move_folder",
+    "recover",
+    "replaced_file",
+    "replaced_folder",
+    "write_file",
+]

@@ -65,6 +65,19 @@ def replaced_folder(path: Path) -> Iterator[Path]:
             remove_folders(made)
 
 
+def move_folder(folder: Path, target: Path) -> None:
+    """Rename a folder, on one file system, and flush the names to disk.
+
+    Raises:
+        OSError: It cannot be renamed; it is where it was.
+        Cancelled: The running command has been cancelled.
+    """
+    with lasting_effect():
+        os.rename(folder, target)
+        for parent in {folder.parent, target.parent}:
+            flush_folder(parent)
+
+
 def recover(path: Path) -> None:
     """Recover from a save that was killed: move the old folder back, delete temporary folders.
 

@@ -8,6 +8,7 @@ import shutil
 import time
 from pathlib import Path
 
+from maplab_py.atomic import move_folder
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server.options import PublishingOptions
 from maplab_py.storage.native import is_map_folder, save_map
@@ -89,7 +90,7 @@ class Publisher:
         target = self.backups / time.strftime("%Y%m%d_%H%M%S")
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(target)
-        copy.rename(target)
+        move_folder(copy, target)
         for old in sorted(p for p in self.backups.iterdir() if p.name[0] != ".")[:-_BACKUPS]:
             shutil.rmtree(old, ignore_errors=True)
         return target

@@ -17,13 +17,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import time
 import uuid
 from pathlib import Path
 
-from maplab_py.atomic import write_file
+from maplab_py.atomic import move_folder, write_file
 from maplab_py.errors import MapError, UserError
 from maplab_py.pipeline.fingerprint import folder_hash
 from maplab_py.storage import checksums
@@ -126,7 +125,7 @@ class Spool:
         folder = self.folder(entry)
         text = json.dumps(dataclasses.asdict(entry)) + "\n"
         write_file(folder / "entry.json", [text.encode("utf-8", "surrogatepass")])
-        os.rename(arrival.folder, folder / "submap")
+        move_folder(arrival.folder, folder / "submap")
         return entry
 
     def folder(self, entry: Entry) -> Path:
@@ -163,14 +162,14 @@ class Spool:
         line = f"{entry.title}: {reason}\n"
         write_file(folder / "reason.txt", [line.encode("utf-8", "surrogatepass")])
         shutil.rmtree(folder / "prepared", ignore_errors=True)
-        os.rename(folder, self.rejected / folder.name)
+        move_folder(folder, self.rejected / folder.name)
 
     def finish(self, entry: Entry, *, keep: bool) -> None:
         """Move a submap to `merged`, or delete it."""
         folder = self.folder(entry)
         shutil.rmtree(folder / "prepared", ignore_errors=True)
         if keep:
-            os.rename(folder, self.merged / folder.name)
+            move_folder(folder, self.merged / folder.name)
         else:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -179,7 +178,7 @@ class Spool:
         name = f"{number:06d}"
         if not (self.merged / name).is_dir():
             return False
-        os.rename(self.merged / name, self.accepted / name)
+        move_folder(self.merged / name, self.accepted / name)
         return True
 
 
@@ -217,7 +216,7 @@ def push(spool: Spool, robot: str, submap: Path, name: str = "") -> Path:
         if folder_hash(copy) != digest:
             raise UserError(f"{submap}: the copy in {spool.root} differs; push it again")
         write_file(copy / _PUSHED, [json.dumps({"sha256": digest}).encode()])
-        os.rename(copy, target)
+        move_folder(copy, target)
     except (OSError, shutil.Error) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise UserError(f"{target}: cannot be written ({reason})") from error

@@ -268,7 +268,7 @@ def map_lookup(
     example='get_dense_map_in_range --spool=spool --center_G="0 0 1" --radius_m=5',
     needs_map=False,
     writes_files=True,
-    see_also=("serve", "visualize_reprojected_depth_maps"),
+    see_also=("serve",),
 )
 def get_dense_map_in_range(
     context: CommandContext,  # noqa: ARG001
