@@ -18,6 +18,8 @@ LINES = (
     "list",
     "help lc_report",
     "check_map_consistency",
+    "why mon",
+    "history",
 )
 
 
@@ -34,7 +36,7 @@ def console(
     console.close()
 
 
-@pytest.mark.parametrize("console", [80, 160], indirect=True)
+@pytest.mark.parametrize("console", [80, 100, 160], indirect=True)
 def test_screens(console: Console) -> None:
     console.enter("load monday_morning")
     console.wait_for_prompt("maplab <monday_morning>:/$")
@@ -53,6 +55,8 @@ def test_screens(console: Console) -> None:
     is_narrow = console.screen.columns < 100
     assert ("--descending  bool, default false" in text) == is_narrow
     assert "no room for" not in text
+    assert "The map has no other mission." in text
+    assert "--map_folder=" in text.rpartition("history:")[0]
 
 
 @pytest.mark.parametrize("console", [100], indirect=True)
