@@ -41,6 +41,7 @@ def differences(
     from maplab_py.vision.search_kernels import differences_between
 
     distance = np.empty(len(rows_a), dtype=np.int32)
+    rows_a, rows_b = np.ascontiguousarray(rows_a), np.ascontiguousarray(rows_b)
     differences_between(words_a, rows_a, words_b, rows_b, distance)
     return distance
 

@@ -13,6 +13,8 @@ import numpy as np
 from maplab_py.array_types import F32, I64
 from maplab_py.compilation import compiled, prange
 
+_SIGNED_BYTE = np.dtype(np.int8)
+
 
 class Cells(NamedTuple):
     """Cells of a multi-index, and how a query walks them."""
@@ -37,7 +39,7 @@ def _popcount(x):  # type: ignore[no-untyped-def]
 def difference(a, i, b, j):  # type: ignore[no-untyped-def]
     """Return the number of different bits of packed words, the squared distance of signed bytes."""
     # indices, as taking rows out would count references: that costs more than the comparison
-    if a.itemsize == 1:  # known when compiled
+    if a.dtype == _SIGNED_BYTE:  # decided when compiled, unlike a test of a.itemsize
         total = np.int32(0)
         for w in range(a.shape[1]):
             step = np.int32(a[i, w]) - np.int32(b[j, w])
