@@ -121,8 +121,11 @@ class OdometryOptions:
 
     def _check_window(self) -> None:
         window = self.window
+        if window.num_keyframes < 2 and window.num_keyframes != 0:
+            raise FlagError(
+                f"--{window.flag_prefix}num_keyframes={window.num_keyframes}: wants 2 or more, or 0"
+            )
         for name, least in (
-            ("num_keyframes", 2),
             ("num_recent_frames", 1),
             ("max_landmarks", 10),
             ("num_iterations", 1),

@@ -98,9 +98,21 @@ def save_map(
 
 
 def check_target(
-    folder: Path, *, overwrite: bool = False, known: str = "", force: bool = False
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    known: str = "",
+    force: bool = False,
+    flag: str = "overwrite",
 ) -> None:
     """Check that a map may be saved to a folder; see `save_map`.
+
+    Args:
+        folder: The folder.
+        overwrite: See `save_map`.
+        known: See `save_map`.
+        force: See `save_map`.
+        flag: Name of the flag that permits to replace a map, for the message.
 
     Raises:
         UserError: It holds a map that must not be replaced, or something else than a map.
@@ -121,7 +133,7 @@ def check_target(
                 "save to another --map_folder, or give --force to replace it"
             )
         elif not known and not overwrite:
-            raise UserError(f"{folder} holds a map already; use --overwrite to replace it")
+            raise UserError(f"{folder} holds a map already; use --{flag} to replace it")
     except OSError as error:
         raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
 

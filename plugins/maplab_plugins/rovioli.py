@@ -84,7 +84,7 @@ def rovioli(
     output = run.output
     folder = output.save_map_folder
     if folder is not None:
-        check_target(folder, overwrite=output.overwrite_existing_map)
+        check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
     for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
         if file is not None:
             check_writable(file, overwrite=output.overwrite_existing_map)

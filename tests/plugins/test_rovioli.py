@@ -101,7 +101,7 @@ def test_an_existing_target_is_refused_before_any_work(walk: Path, tmp_path: Pat
     vi_map, _ = replayed(REST_FIRST, 2)
     save_map(vi_map, target)
     with Session() as session:
-        with pytest.raises(UserError, match="holds a map already"):
+        with pytest.raises(UserError, match="already; use --overwrite_existing_map"):
             run(session, walk, save_map_folder=target)
         (tmp_path / "other").mkdir()
         (tmp_path / "other" / "notes.txt").write_text("mine")
@@ -195,7 +195,7 @@ def press_at_frame(monkeypatch: pytest.MonkeyPatch, *frames: int) -> None:
             "FREAK is not in the OpenCV",
         ),
         ({"datasource_folder": "images", "rovio_image_mask_path": "m.png"}, "cannot be read"),
-        ({"datasource_folder": "images", "vio_num_keyframes": 0}, "vio_num_keyframes"),
+        ({"datasource_folder": "images", "vio_num_keyframes": 1}, "vio_num_keyframes"),
         ({"datasource_folder": "WALK", "map_key": "a/b"}, "cannot be a map key"),
     ],
 )

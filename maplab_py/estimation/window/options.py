@@ -8,6 +8,8 @@ from typing import ClassVar
 from maplab_py.estimation.window.standstill import StandstillSigmas
 from maplab_py.options import option
 
+_RIG_KEYFRAMES, _MONO_KEYFRAMES = 7, 12
+
 
 @dataclasses.dataclass(frozen=True)
 class WindowOptions:
@@ -15,7 +17,11 @@ class WindowOptions:
 
     flag_prefix: ClassVar[str] = "vio_"
 
-    num_keyframes: int = option(7, help="Keyframes in the window.")
+    num_keyframes: int = option(
+        0,
+        help="Keyframes in the window; 0 = 7 of several cameras, and 12 of a single camera, which sees "
+        "distances by its motion only.",
+    )
     num_recent_frames: int = option(3, help="Frames in the window that follow the last keyframe.")
     landmark_policy: str = option(
         "all",
@@ -88,10 +94,11 @@ class WindowOptions:
         6, help="Frames after which a track enters though it goes on (landmark_policy thesis)."
     )
 
-    @property
-    def keyframes_kept(self) -> int:
-        """Keyframes in the window, by the policy."""
-        return self.thesis_num_keyframes if self.follows_thesis else self.num_keyframes
+    def keyframes_kept(self, cameras: int) -> int:
+        """Return the number of keyframes in the window, by the policy and the number of cameras."""
+        if self.follows_thesis:
+            return self.thesis_num_keyframes
+        return self.num_keyframes or (_RIG_KEYFRAMES if cameras > 1 else _MONO_KEYFRAMES)
 
     @property
     def follows_thesis(self) -> bool:

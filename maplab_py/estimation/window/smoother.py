@@ -47,7 +47,7 @@ _MIN_KNOWN_DEPTHS = 10
 class FixedLagSmoother:
     """Estimates the frames of a window from tracks and inertial samples.
 
-    A window has `num_keyframes` keyframes and the latest frames. The latest become keyframes or are
+    A window has a number of keyframes and the latest frames. The latest become keyframes or are
     dropped, their inertial intervals joined and their observations forgotten. The oldest keyframe is
     marginalised together with the landmarks anchored in it whose tracks have ended. Landmarks still
     tracked lose its observation and are anchored where they were seen next (see decision 40).
@@ -59,6 +59,7 @@ class FixedLagSmoother:
         """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU."""
         models, self._cameras = camera_table(cameras, T_I_C)
         self.options = options
+        self._keyframes_kept = options.keyframes_kept(len(cameras))
         self._kernels = window_kernels(models)
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
         self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
@@ -355,7 +356,7 @@ class FixedLagSmoother:
         leaving = len(self._states) - options.num_recent_frames
         if leaving > 0 and not self._is_keyframe[leaving]:
             self._drop(leaving)
-        elif leaving >= options.keyframes_kept:
+        elif leaving >= self._keyframes_kept:
             self._marginalize_first()
 
     def _drop(self, frame: int) -> None:

@@ -197,7 +197,7 @@ def measure(keypoints: int, seconds: float) -> Measured:
     )
     smoother = FixedLagSmoother(tracks.cameras, tracks.T_I_C, tracks.imu, options)
     smoother.start(tracks.frames[0], tracks.start_state(_SIGMA))
-    num_frames = options.num_keyframes + options.num_recent_frames
+    num_frames = options.keyframes_kept(len(tracks.cameras)) + options.num_recent_frames
     peer = GtsamSmoother(tracks, num_frames, options.huber_sigmas)
     ours_ms, updates = [], list[WindowUpdate]()
     for frame in tracks.frames[1:]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
+from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.sensors import Camera, Imu
 from maplab_py.simulation.scenario import (
     CameraOptions,
@@ -41,6 +42,7 @@ class SimulatedTracks:
     accel_bias: F64  # (F, 3)
     point: NDArray[np.int64]  # (T,) point of the world that each track id observes
     p_G: F64  # (P, 3) points of the world
+    device: RecordedSensors
 
     def start_state(self, sigma: F64, rng: np.random.Generator | None = None) -> StartState:
         """Return the true state of the first frame, with errors of the given deviations."""
@@ -116,6 +118,7 @@ def _tracks(options: Scenario, session: RecordedSession, p_G: F64) -> SimulatedT
         device.sensor_set.imu(device.imu_id), recording.motion.T_G_I, recording.motion.v_G,
         recording.imu.gyro_bias[row], recording.imu.accel_bias[row],
         _points_of_tracks(seen.point, track), p_G,
+        RecordedSensors(device.sensor_set, rig.id, device.imu_id),
     )  # fmt: skip
 
 
