@@ -58,12 +58,19 @@ def cache_folder(name: str) -> Path:
     return folder
 
 
-def check_trusted(folder: Path, variable: str) -> None:
-    """Refuse to load code from a folder that other users own or may write to.
+def check_trusted(
+    folder: Path,
+    variable: str,
+    content: str = "compiled code",
+    danger: str = "code in it would be run",
+) -> None:
+    """Refuse to load code or other content from a place that other users own or may write to.
 
     Args:
-        folder: The folder; it need not exist.
+        folder: The folder, or a file; it need not exist.
         variable: Environment variable that names another folder.
+        content: What is kept there, for the message.
+        danger: What would happen, for the message.
 
     Raises:
         UserError: Other users own the folder or may write to it.
@@ -81,7 +88,7 @@ def check_trusted(folder: Path, variable: str) -> None:
     else:
         return
     raise UserError(
-        f"{folder}: the cache of compiled code {reason}, and code in it would be run: "
+        f"{folder}: the cache of {content} {reason}, and {danger}: "
         f"remove their write permission (chmod go-w), or name another folder by {variable}"
     )
 

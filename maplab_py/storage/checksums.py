@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from maplab_py.errors import MapError
@@ -19,9 +21,9 @@ _MAX_BYTES = 16_000_000
 
 def write(folder: Path) -> str:
     """Write the checksums of a map's files, without resources, and return the fingerprint."""
-    listing = _listing(folder)
-    (folder / FILE_NAME).write_text(listing, encoding="utf-8")
-    return _digits(listing)
+    listed = listing(folder)
+    (folder / FILE_NAME).write_text(listed, encoding="utf-8")
+    return fingerprint_of(listed)
 
 
 def fingerprint(folder: Path) -> str:
@@ -30,11 +32,15 @@ def fingerprint(folder: Path) -> str:
     Raises:
         OSError: A file cannot be read.
     """
-    return _digits(_listing(folder))
+    return fingerprint_of(listing(folder))
 
 
-def verify(folder: Path) -> None:
+def verify(folder: Path, listed: str = "") -> None:
     """Compare all files with the side file, if there is one.
+
+    Args:
+        folder: Map folder.
+        listed: Checksums of the files (`listing`) if they are known already.
 
     Raises:
         MapError: A file is missing or has changed; the message names it.
@@ -42,6 +48,7 @@ def verify(folder: Path) -> None:
     side_file = folder / FILE_NAME
     if not side_file.is_file():
         return
+    known = {name: digest for digest, _, name in (x.partition("  ") for x in listed.splitlines())}
     without = "delete it to load without checksums"
     try:
         text = read_text(side_file, _MAX_BYTES, remedy=without, error=MapError)
@@ -55,24 +62,31 @@ def verify(folder: Path) -> None:
             raise MapError(f"{side_file}: line {number} is damaged; {without}")
         if not path.is_file():
             raise MapError(f"{path}: is missing")
-        if _digest(path) != digest:
+        if (known.get(name) or _digest(path)) != digest:
             raise MapError(
                 f"{path}: is damaged: it does not have its checksum "
                 f"(delete {FILE_NAME} to load it without the check)"
             )
 
 
-def _digits(listing: str) -> str:
-    return hashlib.sha256(listing.encode()).hexdigest()[:_FINGERPRINT_DIGITS]
+def fingerprint_of(listed: str) -> str:
+    """Return the fingerprint of a map's files whose checksums are listed."""
+    return hashlib.sha256(listed.encode()).hexdigest()[:_FINGERPRINT_DIGITS]
 
 
-def _listing(folder: Path) -> str:
-    """Return one line per file of a map: checksum and path, sorted by path."""
-    paths = [folder / METADATA, folder / RESOURCE_INFO, *(folder / VI_MAP_FOLDER).rglob("*")]
+def listing(folder: Path) -> str:
+    """Return one line per file of a map, without resources: checksum and path, sorted by path.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    candidates = [folder / METADATA, folder / RESOURCE_INFO, *(folder / VI_MAP_FOLDER).rglob("*")]
+    paths = [path for path in sorted(candidates) if path.is_file()]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        digests = list(pool.map(_digest, paths))
     return "".join(
-        f"{_digest(path)}  {path.relative_to(folder).as_posix()}\n"
-        for path in sorted(paths)
-        if path.is_file()
+        f"{digest}  {path.relative_to(folder).as_posix()}\n"
+        for digest, path in zip(digests, paths, strict=True)
     )
 
 

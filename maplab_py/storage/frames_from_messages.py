@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import I64, U64
+from maplab_py.array_types import I32, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.report import counted
 from maplab_py.storage import message_numbers
 from maplab_py.storage.descriptor_layout import Blocks, read_blocks, unpack
 from maplab_py.storage.map_files import COPY_AGAIN
-from maplab_py.storage.message_ids import ids_of, unknown_bytes
+from maplab_py.storage.message_ids import ids_of, ids_of_field, unknown_bytes
 from maplab_py.storage.message_numbers import Name
 from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
 from maplab_py.vimap.table import object_column, starts_of_counts
@@ -47,6 +47,16 @@ class FrameContent:
     keypoints: Keypoints
     landmark_ids: U64  # (K, 2), zero = none
     name: Name  # file and id of a frame (row)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ListedObservations:
+    """The observations (O,) that landmarks list themselves."""
+
+    observers: U64  # (O, 2) ids of vertices
+    frame_index: I64
+    keypoint_index: I64
+    owner: I64  # row of the landmark
 
 
 def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> FrameContent:
@@ -91,12 +101,10 @@ def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> Frame
     return _with_keypoints(table, frames, name, max_bytes)
 
 
-def read_landmarks(vertices: list[Any], vertex_name: Name) -> tuple[Landmarks, U64, I64, I64, I64]:
-    """Return landmarks by vertex row, and their own lists of observations.
-
-    Returns:
-        The landmarks, and for each listed observation: vertex id (O, 2), frame index (O,),
-        keypoint index (O,), landmark row (O,).
+def read_landmarks(
+    vertices: list[Any], vertex_name: Name
+) -> tuple[Landmarks, dict[str, U64 | I64]]:
+    """Return landmarks by vertex row, and the columns of `ListedObservations`.
 
     Raises:
         MapError: The three lists of a landmark differ in length, or a number is not one.
@@ -135,15 +143,13 @@ def read_landmarks(vertices: list[Any], vertex_name: Name) -> tuple[Landmarks, U
         feature_type=[lm.feature_type for lm in landmarks],
         unknown=object_column([unknown_bytes(lm) for lm in landmarks]),
     )
-    owner = np.repeat(np.arange(len(counts)), counts)
-    observers = ids_of(
-        (i for lm in landmarks for i in lm.observer_vertex_ids),
-        "observer_vertex_ids",
-        lambda place: name(int(owner[place])),
-    )
-    frame_index = _joined([lm.frame_indices for lm in landmarks])
-    keypoint_index = _joined([lm.keypoint_indices for lm in landmarks])
-    return table, observers, frame_index, keypoint_index, owner
+    observers, _ = ids_of_field(landmarks, "observer_vertex_ids", "observer_vertex_ids", name)
+    return table, {
+        "observers": observers,
+        "frame_index": _joined([lm.frame_indices for lm in landmarks]),
+        "keypoint_index": _joined([lm.keypoint_indices for lm in landmarks]),
+        "owner": np.repeat(np.arange(len(counts)), counts),
+    }
 
 
 def linked_keypoints(
@@ -216,6 +222,15 @@ def _descriptors(
 
 def _descriptor_table(table: Frames, max_bytes: int) -> NDArray[np.uint8]:
     """Return zeros (K, widest) for the descriptors; every row is as wide as the widest."""
+    return np.zeros(check_descriptor_table(table, max_bytes), dtype=np.uint8)
+
+
+def check_descriptor_table(table: Frames, max_bytes: int) -> tuple[int, int]:
+    """Return the shape (K, widest) of the table of descriptors.
+
+    Raises:
+        MapError: It would take more memory than the bound, and less than half of it is descriptors.
+    """
     blocks = [block for frame_blocks in table.descriptor_blocks for block in frame_blocks or ()]
     stored = sum(block.keypoints * block.size for block in blocks)
     widest = max((block.size for block in blocks if block.keypoints), default=0)
@@ -226,12 +241,18 @@ def _descriptor_table(table: Frames, max_bytes: int) -> NDArray[np.uint8]:
             f"{total * widest / 1e6:.0f} MB of memory; raise --proto_max_size_megabytes if the "
             "map is really that large"
         )
-    return np.zeros((total, widest), dtype=np.uint8)
+    return total, widest
 
 
-def _always(name: Name, place: int) -> Name:
-    """Return a function that names the same entity for every entry."""
-    return lambda _: name(place)
+def _landmark_ids(frames: list[Any], counts: I32, name: Name) -> U64:
+    """Return the ids (K, 2) of the landmarks of all keypoints, zero = none."""
+    where = "landmark id of a keypoint"
+    ids, present = ids_of_field(frames, "landmark_ids", where, name)
+    if np.array_equal(present, counts):
+        return ids
+    result = np.zeros((int(counts.sum()), 2), dtype=np.uint64)
+    result[np.repeat(present > 0, counts)] = ids
+    return result
 
 
 def _present(frame: Any) -> int:
@@ -254,7 +275,6 @@ def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int
         columns["position_3d"] = np.zeros((total, 3))
     if (table.present & FrameField.TIME_OFFSET).any():
         columns["time_offset_ns"] = np.zeros((total, 1), dtype=np.int32)
-    ids: list[U64] = []
     begin = 0
     for place, (frame, count) in enumerate(zip(frames, counts.tolist(), strict=True)):
         rows = slice(begin, begin + count)
@@ -263,12 +283,6 @@ def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int
         if blocks := table.descriptor_blocks[place]:
             layout = int(table.descriptor_layout[place])
             unpack(frame.descriptors, layout, blocks, columns["descriptor"][rows])
-        landmark_ids = frame.landmark_ids
-        where = "landmark id of a keypoint"
-        absent = np.zeros((count, 2), dtype=np.uint64)
-        ids.append(
-            ids_of(landmark_ids, where, _always(name, place)) if len(landmark_ids) else absent
-        )
     owner = np.repeat(np.arange(len(frames)), counts)
     for field in ("uv_px", "sigma_px", "scale"):
         values = columns[field].reshape(total, 2 if field == "uv_px" else 1)
@@ -276,7 +290,7 @@ def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int
     return FrameContent(
         frames=table,
         keypoints=Keypoints.filled(total, **columns),
-        landmark_ids=np.concatenate(ids) if ids else np.zeros((0, 2), dtype=np.uint64),
+        landmark_ids=_landmark_ids(frames, counts, name),
         name=name,
     )
 

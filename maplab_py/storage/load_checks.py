@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -40,32 +41,54 @@ _NAMED = 3
 """Ids that a note names."""
 
 
-def check_files(files: Sequence[tuple[FileKind, Path]], messages: Sequence[pb.VIMap]) -> None:
-    """Check that every file holds the kind that it is listed with, with one id per entity.
+@dataclasses.dataclass(frozen=True)
+class FileFacts:
+    """What the check of all files needs to know of one."""
 
-    An empty file is valid only as the single file of its kind.
+    kind: FileKind
+    path: Path
+    is_empty: bool
+    has_roots: bool
+    has_vertices: bool
+
+
+def check_file(kind: FileKind, path: Path, message: pb.VIMap) -> FileFacts:
+    """Check that a file holds the kind that it is listed with, with one id per entity.
 
     Raises:
         MapError: The check fails; names the file and the field.
     """
-    kinds = [kind for kind, _ in files]
-    has_roots = any(any(m.root_vertex_id.words) for message in messages for m in message.missions)
-    has_vertices = any(message.vertices for message in messages)
-    needed = {FileKind.MISSIONS: has_vertices, FileKind.VERTICES: has_roots}
-    for (kind, path), message in zip(files, messages, strict=True):
-        held = {field.name for field, _ in message.ListFields()}
-        foreign = sorted(held - set(_FIELDS[kind]))
-        if foreign:
+    held = {field.name for field, _ in message.ListFields()}
+    foreign = sorted(held - set(_FIELDS[kind]))
+    if foreign:
+        raise MapError(
+            f"{path}: is listed as {kind.name.lower()} (file_type {kind:d}) but holds "
+            f"{', '.join(foreign)}"
+        )
+    for name, ids in _PAIRS:
+        entities, there = len(getattr(message, name)), len(getattr(message, ids))
+        if entities != there:
+            raise MapError(f"{path}: holds {entities} {name} but {there} {ids}")
+    has_roots = any(any(mission.root_vertex_id.words) for mission in message.missions)
+    return FileFacts(kind, path, not held, has_roots, bool(message.vertices))
+
+
+def check_empty_files(files: Sequence[FileFacts]) -> None:
+    """Check that a file is empty only as the single file of a kind that the map does not need.
+
+    Raises:
+        MapError: The check fails; names the file and the field.
+    """
+    kinds = [file.kind for file in files]
+    needed = {
+        FileKind.MISSIONS: any(file.has_vertices for file in files),
+        FileKind.VERTICES: any(file.has_roots for file in files),
+    }
+    for file in files:
+        if file.is_empty and (kinds.count(file.kind) > 1 or needed.get(file.kind, False)):
             raise MapError(
-                f"{path}: is listed as {kind.name.lower()} (file_type {kind:d}) but holds "
-                f"{', '.join(foreign)}"
+                f"{file.path}: is empty: it holds no {_FIELDS[file.kind][0]}; {COPY_AGAIN}"
             )
-        for name, ids in _PAIRS:
-            entities, there = len(getattr(message, name)), len(getattr(message, ids))
-            if entities != there:
-                raise MapError(f"{path}: holds {entities} {name} but {there} {ids}")
-        if not held and (kinds.count(kind) > 1 or needed.get(kind, False)):
-            raise MapError(f"{path}: is empty: it holds no {_FIELDS[kind][0]}; {COPY_AGAIN}")
 
 
 def edge_kinds(content: Content) -> list[str]:
@@ -104,9 +127,7 @@ def check_listed_edges(
     edge_index = IdIndex(content.edge_ids)
     wrong = unlisted = 0
     for field, end in (("outgoing_edges", "from_vertex_id"), ("incoming_edges", "to_vertex_id")):
-        lists = [getattr(vertex, field) for vertex in content.vertices]
-        owner = np.repeat(np.arange(len(lists)), [len(ids) for ids in lists])
-        listed = ids_of((i for ids in lists for i in ids), f"{field} of a vertex")
+        owner, listed = content.listed_edges[field]
         edges = edge_index.rows(listed)
         ends = [getattr(getattr(e, k), end) for e, k in zip(content.edges, kinds, strict=True)]
         vertex = vertex_index.rows(ids_of(ends, f"{end} of an edge"))

@@ -128,6 +128,14 @@ def read_message(path: Path, message: Message, budget: MemoryBudget) -> int:
             memory than is left for it.
     """
     data = read_unpacked(path, budget.max_bytes)
+    parse_message(path, data, message, budget)
+    return len(data)
+
+
+def parse_message(
+    path: Path, data: bytes | bytearray, message: Message, budget: MemoryBudget
+) -> None:
+    """Parse the unpacked bytes of a file; see `read_message` for errors."""
     budget.admit(path, data, message.DESCRIPTOR)
     try:
         message.ParseFromString(memoryview(data))  # type: ignore[arg-type]
@@ -135,7 +143,6 @@ def read_message(path: Path, message: Message, budget: MemoryBudget) -> int:
         raise MapError(
             f"{path}: is damaged: not a message of the map format; {COPY_AGAIN}"
         ) from error
-    return len(data)
 
 
 def read_unpacked(path: Path, max_bytes: int) -> bytes | bytearray:

@@ -20,24 +20,37 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.storage import frames_from_messages, resources_from_messages, tables_from_messages
-from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.checksums import verify
+from maplab_py.storage.file_parts import FileParts
 from maplab_py.storage.load_checks import (
     absent_parts,
-    check_files,
+    check_empty_files,
     check_listed_edges,
     check_records,
     consistency_notes,
     edge_kinds,
 )
-from maplab_py.storage.map_files import SENSORS, VI_MAP_FOLDER, listed_files, read_message
+from maplab_py.storage.map_cache import CachedMap
+from maplab_py.storage.map_files import (
+    SENSORS,
+    VI_MAP_FOLDER,
+    listed_files,
+)
 from maplab_py.storage.message_ids import ids_of
+from maplab_py.storage.message_numbers import Name
 from maplab_py.storage.message_scan import MemoryBudget
 from maplab_py.storage.mission_names import with_names
+from maplab_py.storage.reading_ahead import read_ahead
 from maplab_py.storage.tables_from_messages import Content, required_rows, unique_index
+from maplab_py.storage.vertex_parts import (
+    NO_TIME,
+    JoinedParts,
+    VertexPart,
+)
 from maplab_py.vimap import TransformationKind, VIMap
-from maplab_py.vimap.ids import IdIndex, is_valid
+from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
 from maplab_py.vimap.table import starts_of_counts
+from maplab_py.vimap.tables import Frames
 
 _TRANSFORMATIONS = {
     "odometry": TransformationKind.ODOMETRY,
@@ -59,6 +72,7 @@ class LoadReport(Report):
     keypoints: int
     notes: list[str]
     seconds: float
+    cache: str = ""  # "read" or "written" where the cache of maps was used
 
 
 def load_map(
@@ -67,6 +81,7 @@ def load_map(
     max_size_megabytes: int = 2000,
     repair: bool = False,
     progress: Progress = SILENT,
+    listed: str = "",
 ) -> tuple[VIMap, LoadReport]:
     """Load a map and check that it is consistent.
 
@@ -75,6 +90,7 @@ def load_map(
         max_size_megabytes: Bound of the unpacked size of one file.
         repair: Where the two copies of an observation disagree, keep what both say.
         progress: Shown while reading.
+        listed: Checksums of its files (`checksums.listing`) if they are known already.
 
     Raises:
         MapError: A file is missing or damaged, or entities do not fit together; one line that
@@ -87,7 +103,7 @@ def load_map(
     budget = MemoryBudget(max_size_megabytes * 1_000_000)
     try:
         with _no_collection():
-            vi_map, files, total, notes = _load(folder, budget, repair, progress)
+            vi_map, files, total, notes = _load(folder, budget, repair, progress, listed)
     except MapError as error:
         text = str(error)
         raise error if str(folder) in text else MapError(f"{folder}: {text}") from error
@@ -97,10 +113,47 @@ def load_map(
         raise MapError(
             f"{folder}: does not fit into memory; end other programs or load parts of it"
         ) from error
-    report = LoadReport(
+    report = _report(folder, vi_map, files, total / 1e6, notes, began)
+    return vi_map, report
+
+
+def facts_of(report: LoadReport) -> dict[str, Any]:
+    """Return what the cache has to keep beside the columns, so that a load from there says the same."""
+    return {"files": report.files, "megabytes": report.megabytes, "notes": report.notes}
+
+
+def with_small_files(
+    folder: Path, cached: CachedMap, listed: str, max_size_megabytes: int, began: float
+) -> tuple[VIMap, LoadReport]:
+    """Return a map from the cache with what its small files say: sensors, metadata, names.
+
+    Args:
+        folder: Map folder.
+        cached: Columns from the cache.
+        listed: Checksums of the map's files.
+        max_size_megabytes: Bound of the size of one file.
+        began: When loading began (`time.perf_counter`).
+
+    Raises:
+        MapError: A file is damaged.
+    """
+    max_bytes = max_size_megabytes * 1_000_000
+    verify(folder, listed)
+    metadata, _ = resources_from_messages.read_metadata(folder, max_bytes)
+    sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, max_bytes)
+    vi_map = with_names(cached.vi_map.replace(sensors=sensors, metadata=metadata), folder)
+    facts = cached.facts
+    report = _report(folder, vi_map, facts["files"], facts["megabytes"], facts["notes"], began)
+    return vi_map, dataclasses.replace(report, cache="read")
+
+
+def _report(
+    folder: Path, vi_map: VIMap, files: int, megabytes: float, notes: list[str], began: float
+) -> LoadReport:
+    return LoadReport(
         folder=str(folder),
         files=files,
-        megabytes=total / 1e6,
+        megabytes=megabytes,
         missions=len(vi_map.missions),
         vertices=len(vi_map.vertices),
         landmarks=len(vi_map.landmarks),
@@ -108,31 +161,29 @@ def load_map(
         notes=notes,
         seconds=time.perf_counter() - began,
     )
-    return vi_map, report
 
 
 def _load(
-    folder: Path, budget: MemoryBudget, repair: bool, progress: Progress
+    folder: Path, budget: MemoryBudget, repair: bool, progress: Progress, listed: str
 ) -> tuple[VIMap, int, int, list[str]]:
     """Return the map, the number of its files and their unpacked bytes, and notes."""
     files = listed_files(folder, budget.max_bytes)
-    verify(folder)
-    messages, total = [], 0
-    for index, (_, path) in enumerate(files):
-        progress.step(index, len(files) + 1, "read files")
-        message = pb.VIMap()
-        total += read_message(path, message, budget)
-        messages.append(message)
-    check_files(files, messages)
+    verify(folder, listed)
+    parts = FileParts()
+    with read_ahead([path for _, path in files], budget.max_bytes) as contents:
+        for index, (kind, path) in enumerate(files):
+            progress.step(index, len(files) + 1, "read files")
+            parts.read(kind, path, contents.take(), budget)
+    check_empty_files(parts.facts)
     sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, budget.max_bytes)
-    content = _content(messages, [path for _, path in files])
+    content = parts.content()
     check_records(content, budget.max_bytes)
-    vi_map, notes = _assemble(folder, content, repair, budget)
+    vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
     vi_map = vi_map.replace(sensors=sensors)
     vi_map = with_names(vi_map, folder)
     notes += absent_parts(folder, vi_map) + consistency_notes(vi_map)
     progress.step(1, 1, "read files")
-    return vi_map, len(files), total, notes
+    return vi_map, len(files), parts.unpacked_bytes, notes
 
 
 @contextlib.contextmanager
@@ -147,37 +198,8 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _content(messages: list[pb.VIMap], paths: list[Path]) -> Content:
-    """Concatenate the messages of all files."""
-    pairs = list(zip(paths, messages, strict=True))
-    joined: dict[str, Any] = {}
-    file_of: dict[str, I64] = {}
-    for name, ids in (
-        ("vertices", "vertex_ids"),
-        ("edges", "edge_ids"),
-        ("missions", "mission_ids"),
-        ("baseframes", "baseframe_ids"),
-    ):
-        joined[name] = [entity for m in messages for entity in getattr(m, name)]
-        parts = [ids_of(getattr(m, ids), f"{path}: {ids}") for path, m in pairs]
-        joined[ids] = np.concatenate(parts)
-        file_of[name] = np.repeat(np.arange(len(paths)), [len(part) for part in parts])
-    entries = [entry for m in messages for entry in m.landmark_index]
-    return Content(
-        **joined,
-        legacy_landmark_ids=ids_of(
-            (i for m in messages for i in m.legacy_landmark_ids), "legacy landmark ids"
-        ),
-        index_vertex_ids=ids_of((e.vertex_id for e in entries), "landmark_index: vertex_id"),
-        index_landmark_ids=ids_of((e.landmark_id for e in entries), "landmark_index: landmark_id"),
-        paths=tuple(paths),
-        index_path=next((p for p, m in pairs if m.landmark_index), paths[0].parent),
-        file_of=file_of,
-    )
-
-
 def _assemble(
-    folder: Path, content: Content, repair: bool, budget: MemoryBudget
+    folder: Path, content: Content, parts: list[VertexPart], repair: bool, budget: MemoryBudget
 ) -> tuple[VIMap, list[str]]:
     """Convert the messages to tables; vertex rows are sorted by mission, then time."""
     unique_index(content.edge_ids, "edge", content.file_namer("edges"))
@@ -187,37 +209,31 @@ def _assemble(
     )
     mission = required_rows(
         mission_index,
-        ids_of([v.mission_id for v in content.vertices], "mission", content.namer("vertices")),
+        content.vertex_mission_ids,
         "mission",
         content.namer("vertices"),
     )
     kinds = edge_kinds(content)
     in_file = unique_index(content.vertex_ids, "vertex", content.file_namer("vertices"))
-    times = _vertex_times(content)
+    times = _vertex_times(content, parts)
     order = np.lexsort((times, mission))
-    vertices = [content.vertices[k] for k in order]
-    vertex_table = tables_from_messages.read_vertices(content, order, mission[order], times[order])
+    joined = JoinedParts(parts, order)
+    vertex_table = joined.vertices().replace(mission=mission[order], timestamp_ns=times[order])
     vertex_index = IdIndex(vertex_table.id)
     name = content.namer("vertices", order)
     edges = _edge_tables(content, kinds, vertex_index)
     notes = check_listed_edges(content, kinds, in_file, repair=repair)
     missions = tables_from_messages.read_missions(content, baseframe_index, vertex_index, mission)
-    frames = frames_from_messages.read_frames(vertices, name, budget.max_bytes)
-    landmarks, observers, frame_index, keypoint_index, owner = frames_from_messages.read_landmarks(
-        vertices, name
-    )
+    frames = joined.frames(budget.max_bytes)
+    frames = dataclasses.replace(frames, name=_frame_namer(frames.frames, name))
+    landmarks, listed = joined.landmarks()
     landmark_index = unique_index(
         landmarks.id, "landmark", lambda row: name(int(landmarks.vertex[row]))
     )
-    frame_start = starts_of_counts(np.bincount(frames.frames.vertex, minlength=len(vertices)))
     frames = _with_current_ids(frames, content)
-    listed = _listed_keypoints(frames, frame_start, vertex_index, observers, frame_index)
-    keypoint = np.where(
-        keypoint_index < listed[1], listed[0] + keypoint_index, -1
-    )  # beyond the frame's keypoints: no such observation
-    keypoint[listed[0] < 0] = -1
+    keypoint = _listed_keypoints(frames, len(vertex_table), vertex_index, listed)
     linked, repairs = frames_from_messages.linked_keypoints(
-        frames, landmark_index, (keypoint, owner), repair=repair
+        frames, landmark_index, (keypoint, listed.owner), repair=repair
     )
     notes += repairs + _check_landmark_index(
         content, landmarks, vertex_table.id, landmark_index, repair
@@ -232,9 +248,9 @@ def _assemble(
         keypoints=frames.keypoints.replace(landmark=linked),
         landmarks=landmarks,
         **edges,
-        absolute_poses=tables_from_messages.read_absolute_poses(vertices, name),
+        absolute_poses=joined.absolute_poses(),
         resources=resources_from_messages.read_resources(
-            folder, vertices, content, frame_start, budget
+            folder, joined.resources_of_frames(), content, budget
         ),
     )
     return vi_map, notes + unknown
@@ -265,14 +281,15 @@ def _rows_of(kinds: list[str], kind: str) -> list[int]:
     return [k for k, row_kind in enumerate(kinds) if row_kind == kind]
 
 
-def _vertex_times(content: Content) -> I64:
+def _frame_namer(frames: Frames, vertex_name: Name) -> Name:
+    return lambda row: f"{vertex_name(int(frames.vertex[row]))}: frame {to_hex(frames.id[row])}"
+
+
+def _vertex_times(content: Content, parts: list[VertexPart]) -> I64:
     """Return the time of every vertex (file order): of its first stamped frame, else of IMU edges."""
-    times = np.full(len(content.vertices), np.iinfo(np.int64).min)
-    for row, vertex in enumerate(content.vertices):
-        stamps = [f.timestamp_ns for f in vertex.nframe.frames if any(f.id.words)]
-        if any(stamps):  # a stamp that is missing reads as 0
-            times[row] = min(stamps)
-    unset = np.flatnonzero(times == np.iinfo(np.int64).min)
+    stamps = [part.timestamp_ns() for part in parts]
+    times = np.concatenate(stamps) if stamps else np.zeros(0, dtype=np.int64)
+    unset = np.flatnonzero(times == NO_TIME)
     if len(unset):
         index = IdIndex(content.vertex_ids)
         for edge in content.edges:
@@ -282,9 +299,9 @@ def _vertex_times(content: Content) -> I64:
                     index.rows(ends), (edge.imu.timestamps_ns[0], edge.imu.timestamps_ns[-1]),
                     strict=True,
                 ):  # fmt: skip
-                    if row >= 0 and times[row] == np.iinfo(np.int64).min:
+                    if row >= 0 and times[row] == NO_TIME:
                         times[row] = stamp
-        times[times == np.iinfo(np.int64).min] = 0
+        times[times == NO_TIME] = 0
     return times
 
 
@@ -309,27 +326,21 @@ def _with_current_ids(
 
 def _listed_keypoints(
     frames: frames_from_messages.FrameContent,
-    frame_start: I64,
+    vertices: int,
     vertex_index: IdIndex,
-    observers: NDArray[np.uint64],
-    frame_index: I64,
-) -> tuple[I64, I64]:
-    """Return the first keypoint row of the frame of each listed observation, and its count.
-
-    Rows are -1 for vertices or frames that do not exist.
-    """
-    vertex = vertex_index.rows(observers)
-    exists = vertex >= 0
-    safe = np.where(exists, vertex, 0)
-    if not len(frame_start) > 1:
-        return np.full(len(vertex), -1), np.zeros(len(vertex), dtype=np.int64)
-    exists &= frame_index < frame_start[safe + 1] - frame_start[safe]
-    frame = np.where(exists, frame_start[safe] + frame_index, 0)
+    listed: frames_from_messages.ListedObservations,
+) -> I64:
+    """Return the keypoint row (O,) of each listed observation, -1 where there is none."""
     counts = frames.frames.keypoint_count
+    vertex = vertex_index.rows(listed.observers)
     if not len(counts):
-        return np.full(len(vertex), -1), np.zeros(len(vertex), dtype=np.int64)
-    first = starts_of_counts(counts)[frame]
-    return np.where(exists, first, -1), np.where(exists, counts[frame], 0)
+        return np.full(len(vertex), -1)
+    frame_start = starts_of_counts(np.bincount(frames.frames.vertex, minlength=vertices))
+    safe = np.maximum(vertex, 0)
+    exists = (vertex >= 0) & (listed.frame_index < frame_start[safe + 1] - frame_start[safe])
+    frame = np.where(exists, frame_start[safe] + listed.frame_index, 0)
+    exists &= listed.keypoint_index < counts[frame]  # else beyond the frame's keypoints
+    return np.where(exists, starts_of_counts(counts)[frame] + listed.keypoint_index, -1)
 
 
 def _check_landmark_index(

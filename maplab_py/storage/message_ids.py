@@ -6,7 +6,7 @@ therefore byte-swapped between file and memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from operator import attrgetter
 from typing import Any
@@ -15,12 +15,22 @@ import numpy as np
 from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from maplab_py.array_types import U64
+from maplab_py.array_types import I64, U64
 from maplab_py.errors import MapError
 
 _WORDS = attrgetter("words")
+_WORTH_A_KERNEL = 50_000
+"""Number of ids after which loading the compiled kernel takes less time than their objects."""
+LARGE_MESSAGE = 1 << 20
+"""Bytes of a message from which its ids are read without its parts becoming objects."""
 _PORTION = 4096
 """Number of ids per batch: their Python views take ten times the memory of the ids."""
+
+
+class _Read:
+    """How many ids this process has read; only the way of reading depends on it."""
+
+    ids = 0
 
 
 def ids_of(messages: Iterable[Any], where: str, name: Callable[[int], str] | None = None) -> U64:
@@ -60,3 +70,71 @@ def unknown_bytes(message: Message) -> bytes:
     for field, _ in message.ListFields():
         known.ClearField(field.name)
     return known.SerializeToString(deterministic=True)
+
+
+def ids_of_field(
+    messages: Sequence[Any], field: str, where: str, name: Callable[[int], str]
+) -> tuple[U64, I64]:
+    """Return the ids (N, 2) in a repeated field of messages (M,), and their number (M,) in each.
+
+    Args:
+        messages: Messages of one type.
+        field: Name of the field.
+        where: The field, for the message of an error.
+        name: Gives file and id of a message.
+
+    Raises:
+        MapError: An id has neither two words nor none; names entity and field.
+    """
+    counts = np.fromiter((len(getattr(m, field)) for m in messages), np.int64, len(messages))
+    total = int(counts.sum())
+    _Read.ids += total
+    if total and _Read.ids >= _WORTH_A_KERNEL:
+        ids, is_regular = _ids_in_bytes(messages, field, total)
+        if is_regular:
+            return ids, counts
+    owner = np.repeat(np.arange(len(counts)), counts)
+    all_ids = (i for m in messages for i in getattr(m, field))
+    return ids_of(all_ids, where, lambda place: name(int(owner[place]))), counts
+
+
+def _ids_in_bytes(messages: Sequence[Any], field: str, total: int) -> tuple[U64, bool]:
+    """Return the ids of a field, read from the bytes of the messages, and whether all are regular."""
+    from maplab_py.storage.id_fields_kernel import ids_of_field as read_ids
+
+    number = messages[0].DESCRIPTOR.fields_by_name[field].number
+    parts = [message.SerializePartialToString() for message in messages]
+    start = np.zeros(len(parts) + 1, dtype=np.int64)
+    np.cumsum([len(part) for part in parts], out=start[1:])
+    data = np.frombuffer(b"".join(parts), dtype=np.uint8)
+    ids, is_regular = read_ids(data, start[:-1], start[1:], number, total)
+    return ids.byteswap(), bool(is_regular)
+
+
+def ids_of_parts(data: bytes | bytearray, field: int, inner: Sequence[int]) -> list[U64] | None:
+    """Return the ids (N, 2) in each of some fields of the N parts of a large message.
+
+    Nothing but the ids is allocated; messages of all parts would take a hundred times as much.
+
+    Args:
+        data: Bytes of the message.
+        field: Number of the repeated field whose parts are asked for.
+        inner: Numbers of fields of the parts that hold one id each.
+
+    Returns:
+        Ids by inner field; None where the message is small, or holds something else.
+    """
+    if len(data) < LARGE_MESSAGE:
+        return None
+    from maplab_py.storage.id_fields_kernel import ids_of_field as read_ids
+    from maplab_py.storage.id_fields_kernel import parts_of_field
+
+    content = np.frombuffer(memoryview(data).toreadonly(), dtype=np.uint8)
+    begin, end, is_regular = parts_of_field(content, field)
+    result = []
+    for number in inner if is_regular else ():
+        ids, is_regular = read_ids(content, begin, end, number, len(begin))
+        result.append(ids.byteswap())
+        if not is_regular:
+            return None
+    return result if is_regular else None

@@ -36,11 +36,12 @@ class MemoryBudget:
         """Allow files up to `max_bytes` each, and messages of twice that size together."""
         self.max_bytes = max_bytes
         self._left = 2 * max_bytes
+        self._admitted = 0  # by the latest message
         # messages that only the quick estimate was made for, at most a sixtieth of the budget
         self._quick: list[tuple[int, bytes | bytearray, Any]] = []
 
     def admit(self, path: Path, data: bytes | bytearray, kind: Any) -> None:
-        """Subtract the memory of a message from the budget.
+        """Subtract the memory of a message from the budget; `give_back` returns a part of it.
 
         Raises:
             MapError: The message exceeds the remaining budget; names the file.
@@ -59,6 +60,14 @@ class MemoryBudget:
                 "is really that large"
             )
         self._left -= needed
+        self._admitted = needed
+
+    def give_back(self, kept_bytes: int) -> None:
+        """Replace what the latest message was admitted with by what is kept of it."""
+        if self._quick and self._quick[-1][0] == self._admitted:
+            self._quick.pop()
+        self._left += self._admitted - kept_bytes
+        self._admitted = kept_bytes
 
 
 def quick_estimate(data: bytes | bytearray) -> int:

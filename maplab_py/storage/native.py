@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 
 from maplab_py.atomic import recover
 from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage import checksums, map_loading
+from maplab_py.storage.map_cache import MapCache
 from maplab_py.storage.map_files import is_map_folder
 from maplab_py.storage.map_loading import LoadReport
 from maplab_py.storage.map_saving import SaveReport, check_target, save_map
@@ -17,6 +19,7 @@ from maplab_py.vimap import VIMap
 __all__ = [
     "DiskCopy",
     "LoadReport",
+    "MapCache",
     "SaveReport",
     "check_target",
     "disk_copy",
@@ -56,8 +59,12 @@ def load_map(
     max_size_megabytes: int = 2000,
     repair: bool = False,
     progress: Progress = SILENT,
+    cache: MapCache | None = None,
 ) -> tuple[VIMap, LoadReport]:
     """Load a map; retry if another program replaces it meanwhile. See `map_loading.load_map`.
+
+    With a cache the columns come from there, if the map's files are the same as when they were written,
+    else they are written there. A map that is repaired does not use it.
 
     Raises:
         MapError: A file is missing or damaged, or entities do not fit together; one line that
@@ -66,9 +73,7 @@ def load_map(
     for _ in range(_READINGS):
         before = _identity(folder)
         try:
-            result = map_loading.load_map(
-                folder, max_size_megabytes=max_size_megabytes, repair=repair, progress=progress
-            )
+            result = _loaded(folder, max_size_megabytes, repair, progress, cache)
         except MapError:
             if before is None or before == _identity(folder):
                 raise
@@ -76,6 +81,54 @@ def load_map(
             if before is None or before == _identity(folder):
                 return result
     raise MapError(f"{folder}: another program keeps replacing this map; try again later")
+
+
+def _loaded(
+    folder: Path,
+    max_size_megabytes: int,
+    repair: bool,
+    progress: Progress,
+    cache: MapCache | None,
+) -> tuple[VIMap, LoadReport]:
+    """Load a map from the cache, if there is one that has it, else from its files."""
+    began = time.perf_counter()
+    listed = _listing(folder) if cache is not None and not repair else ""
+    problem = ""
+    if cache is not None and listed:
+        cached, problem = cache.find(listed)
+        if cached is not None:
+            return map_loading.with_small_files(folder, cached, listed, max_size_megabytes, began)
+    vi_map, report = map_loading.load_map(
+        folder,
+        max_size_megabytes=max_size_megabytes,
+        repair=repair,
+        progress=progress,
+        listed=listed,
+    )
+    notes = [problem] if problem else []
+    if cache is not None and listed:
+        refusal = cache.store(listed, vi_map, map_loading.facts_of(report))
+        if refusal:
+            notes.append(refusal)
+        else:
+            # the columns in memory are given back: those in the file take their place
+            cached, _ = cache.find(listed)
+            if cached is not None:
+                vi_map, _ = map_loading.with_small_files(
+                    folder, cached, listed, max_size_megabytes, began
+                )
+            report = dataclasses.replace(report, cache="written")
+    seconds = time.perf_counter() - began
+    return vi_map, dataclasses.replace(report, notes=report.notes + notes, seconds=seconds)
+
+
+def _listing(folder: Path) -> str:
+    """Return the checksums of a map's files; an empty text where they cannot be read."""
+    recover(folder)
+    try:
+        return checksums.listing(folder) if is_map_folder(folder) else ""
+    except OSError:
+        return ""
 
 
 def _identity(folder: Path) -> tuple[int, int, int] | None:

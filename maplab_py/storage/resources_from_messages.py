@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.map_files import METADATA, RESOURCE_INFO, read_message, read_text_message
@@ -42,19 +43,21 @@ def read_metadata(folder: Path, max_bytes: int) -> tuple[MapMetadata, list[str]]
 
 
 def read_resources(
-    folder: Path,
-    vertices: list[Any],
-    content: Content,
-    frame_start: Any,
-    budget: MemoryBudget,
+    folder: Path, of_frames: Resources, content: Content, budget: MemoryBudget
 ) -> Resources:
     """Return all references, with the folder that resource_info gives for each.
+
+    Args:
+        folder: Map folder.
+        of_frames: Those of the frames (`resources_of_frames`).
+        content: Missions.
+        budget: Bound of memory.
 
     Raises:
         MapError: resource_info is damaged, or a mission's lists differ in length.
     """
     parts = [
-        _of_frames(vertices, frame_start),
+        of_frames,
         _of_missions(content),
         _of_sensors(content.missions),
     ]
@@ -81,7 +84,8 @@ def read_resources(
     return Resources.concatenate([table.replace(folder=where), unattached])
 
 
-def _of_frames(vertices: list[Any], frame_start: Any) -> Resources:
+def resources_of_frames(vertices: list[Any], frame_start: I64) -> Resources:
+    """Return the references of the vertices' frames; `frame_start` (V + 1,) has the frames' rows."""
     entries = [
         (int(frame_start[row]) + camera, entry.type, resource)
         for row, vertex in enumerate(vertices)

@@ -47,7 +47,8 @@ class Content:
     """The entities of all files of a map, in file order, with their ids (N, 2)."""
 
     vertex_ids: U64
-    vertices: list[Any]
+    vertex_mission_ids: U64
+    listed_edges: dict[str, tuple[I64, U64]]  # by field of vertices: vertex row and id of each
     edge_ids: U64
     edges: list[Any]
     mission_ids: U64
@@ -164,16 +165,13 @@ def read_missions(
     )
 
 
-def read_vertices(content: Content, order: I64, mission: I64, timestamp_ns: I64) -> Vertices:
-    """Return the vertices, rows in the given order of the file's entities."""
-    vertices = [content.vertices[k] for k in order]
-    name = content.namer("vertices", order)
+def read_vertices(vertices: list[Any], ids: U64, timestamp_ns: I64, name: Name) -> Vertices:
+    """Return the vertices in the given order, still without missions."""
     T_M_I = message_numbers.rows([v.T_M_I for v in vertices], 7, "T_M_I", name)
     message_numbers.check_poses(T_M_I, "T_M_I", name)
     return Vertices.filled(
         len(vertices),
-        id=content.vertex_ids[order],
-        mission=mission,
+        id=ids,
         T_M_I=T_M_I,
         v_M=_vectors([v.v_M for v in vertices], "v_M", name),
         accel_bias=_vectors([v.accel_bias for v in vertices], "accel_bias", name),

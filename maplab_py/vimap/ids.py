@@ -14,6 +14,8 @@ IdArray = NDArray[np.uint64]
 """Ids as an array (..., 2) of uint64: the first 16 hexadecimal digits, then the last 16."""
 
 HEX_DIGITS = 32
+_AT_ONCE = 1 << 20
+"""Ids that are looked up at once: each takes 100 bytes meanwhile."""
 SHORT_ID_DIGITS = 8
 """Digits of an id in tables."""
 
@@ -80,6 +82,13 @@ class IdIndex:
             return np.full(len(ids), -1, dtype=np.int64)
         if not self._is_unique:
             return self._rows_by_words(ids)
+        result = np.empty(len(ids), dtype=np.int64)
+        for first in range(0, len(ids), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            result[part] = self._rows(ids[part])
+        return result
+
+    def _rows(self, ids: IdArray) -> NDArray[np.int64]:
         place = np.searchsorted(self._sorted, _mixed(ids))
         row = self._order[np.minimum(place, len(self._order) - 1)]
         return np.where((self._ids[row] == ids).all(axis=1), row, -1).astype(np.int64)

@@ -96,7 +96,23 @@ class Table:
         return sum(array.nbytes for array in self.columns().values())
 
 
+def stacked_columns(
+    tables: list[dict[str, NDArray[Any]]], rows: NDArray[np.int64] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Stack the columns of tables, and reorder the rows where an order is given.
+
+    Every column is taken out of `tables` before the next is stacked: only one is in memory twice.
+    """
+    result = {}
+    for name in list(tables[0]) if tables else ():
+        column = _stack([table.pop(name) for table in tables])
+        result[name] = column if rows is None else column[rows]
+    return result
+
+
 def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    if len(arrays) == 1:
+        return arrays[0]
     if arrays[0].ndim == 2:
         width = max(array.shape[1] for array in arrays)
         arrays = [

@@ -87,9 +87,12 @@ class CommandContext:
 
     def apply_drafts(self) -> None:
         """Apply the committed values to the maps; called by the session when the command succeeds."""
+        from maplab_py.console.session.undo import UndoOptions, bounded
+
         for key, vi_map in self._drafts.items():
             if key in self.maps:
-                self.maps.update(self.maps.get(key).with_value(vi_map, self.command))
+                entry = self.maps.get(key).with_value(vi_map, self.command)
+                self.maps.update(bounded(entry, UndoOptions.of(self.session.settings)))
         self._drafts.clear()
 
     def mark_saved(self, key: str, folder: Path, disk_copy: DiskCopy) -> None:

@@ -39,6 +39,7 @@ class MapEntry:
     past: tuple[Step, ...] = ()
     future: tuple[Step, ...] = ()
     snapshots: Mapping[str, VIMap] = dataclasses.field(default_factory=dict)
+    dropped_values: int = 0  # former values beyond --undo_max_gb
 
     @property
     def is_saved(self) -> bool:
@@ -68,7 +69,12 @@ class MapEntry:
             UserError: There is nothing to undo.
         """
         if not self.past:
-            raise UserError(f"map '{self.key}' has nothing to undo")
+            dropped = (
+                f" any more: {self.dropped_values} former values were beyond --undo_max_gb"
+                if self.dropped_values
+                else ""
+            )
+            raise UserError(f"map '{self.key}' has nothing to undo{dropped}")
         step = self.past[-1]
         future = (Step(step.command, self.vi_map), *self.future)
         return dataclasses.replace(self, vi_map=step.vi_map, past=self.past[:-1], future=future)

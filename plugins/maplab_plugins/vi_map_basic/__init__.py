@@ -29,6 +29,7 @@ from maplab_plugins.vi_map_basic.memory import (
     rename_map,
     select_map,
 )
+from maplab_plugins.vi_map_basic.memory_report import memory
 from maplab_plugins.vi_map_basic.resources import (
     clean_up_resource_folders,
     list_resource_folders,
@@ -61,6 +62,7 @@ __all__ = [
     "load_merge_map",
     "load_merge_submap",
     "map_stats",
+    "memory",
     "merge_map",
     "mission_coobservability_stats",
     "print_baseframes",

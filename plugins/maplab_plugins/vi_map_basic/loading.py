@@ -17,8 +17,10 @@ from maplab_py.plugin import (
     key_of_folder,
 )
 from maplab_py.report import counted
+from maplab_py.storage.cache_options import CacheOptions
 
 if TYPE_CHECKING:
+    from maplab_py.storage.native import MapCache
     from maplab_py.vimap import VIMap
 
 
@@ -108,7 +110,7 @@ class MergedMapsTable:
 
 
 @dataclasses.dataclass(frozen=True)
-class ReadingOptions(SizeOptions):
+class ReadingOptions(CacheOptions, SizeOptions):
     """How map files are read."""
 
     repair: bool = option(
@@ -160,6 +162,7 @@ def load(
         max_size_megabytes=reading.proto_max_size_megabytes,
         repair=reading.repair,
         progress=context.progress,
+        cache=_cache(reading),
     )
     vi_map = with_folder_names(vi_map, map_folder)
     if assign_new_ids:
@@ -385,6 +388,13 @@ def _target_key(context: CommandContext, folder: Path, target_map_key: str) -> s
     return context.maps.check_new_key(target_map_key or key_of_folder(folder))
 
 
+def _cache(reading: ReadingOptions) -> MapCache | None:
+    """Return the cache of maps if it is asked for."""
+    from maplab_py.storage.native import MapCache
+
+    return MapCache(reading.map_cache_max_gb) if reading.map_cache else None
+
+
 def _load_each(
     context: CommandContext, folders: list[Path], reading: ReadingOptions
 ) -> list[tuple[VIMap, Report]]:
@@ -395,7 +405,9 @@ def _load_each(
     for done, folder in enumerate(folders):
         context.progress.step(done, len(folders), f"load {folder.name}")
         limit, repair = reading.proto_max_size_megabytes, reading.repair
-        vi_map, report = load_map(folder, max_size_megabytes=limit, repair=repair)
+        vi_map, report = load_map(
+            folder, max_size_megabytes=limit, repair=repair, cache=_cache(reading)
+        )
         loaded.append((with_folder_names(vi_map, folder), report))
     return loaded
 

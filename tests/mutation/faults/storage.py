@@ -55,8 +55,8 @@ STORAGE = (
     Fault(
         "checksums_not_verified",
         "maplab_py/storage/map_loading.py",
-        "    verify(folder)\n",
-        "",
+        "    files = listed_files(folder, budget.max_bytes)\n    verify(folder, listed)\n",
+        "    files = listed_files(folder, budget.max_bytes)\n",
         _MAPS,
     ),
     Fault(
@@ -111,8 +111,8 @@ STORAGE = (
     Fault(
         "observation_behind_the_frame",
         "maplab_py/storage/map_loading.py",
-        "        keypoint_index < listed[1],",
-        "        keypoint_index <= listed[1],",
+        "listed.keypoint_index < counts[frame]",
+        "listed.keypoint_index <= counts[frame]",
         _FIELDS,
     ),
     Fault(

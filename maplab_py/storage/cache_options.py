@@ -1,0 +1,36 @@
+"""Options of the cache of loaded maps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class CacheOptions:
+    """Whether the columns of loaded maps are kept for the next load, and how much of them."""
+
+    map_cache: bool = option(
+        False,
+        help="Keep the columns of the map in the user's cache folder, and map them into memory from there "
+        "at the next load as long as the files of the map are the same.",
+    )
+    map_cache_max_gb: float = option(
+        20.0,
+        help="Size of the cache of maps; those that were not loaded for the longest time are deleted.",
+        unit="GB",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the range.
+
+        Raises:
+            FlagError: The size is not a positive number.
+        """
+        if not 0.0 < self.map_cache_max_gb < float("inf"):
+            raise FlagError(
+                f"--map_cache_max_gb={self.map_cache_max_gb:g}: must be a positive number; "
+                "--nomap_cache loads without the cache"
+            )
