@@ -16,6 +16,7 @@ from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
 from maplab_py.estimation.problem.problem import DirectSolver, Problem
 from maplab_py.estimation.problem.solver_choice import SolverCosts, predict_costs
+from maplab_py.estimation.problem.submaps import SubmapProblem
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
@@ -38,11 +39,10 @@ def make_problem(
     """Return the problem with the linear solver of the options; `auto` decides by predicted costs.
 
     Raises:
-        FlagError: The forcing is not between 0 and 1.
+        FlagError: A number is out of range, or flags contradict each other.
         NotEnoughMemory: The solver does not fit.
     """
-    if not 0.0 < options.pcg_forcing < 1.0:
-        raise FlagError(f"--ba_pcg_forcing={options.pcg_forcing:g} is not between 0 and 1")
+    _check(options)
     solver: DirectSolver = partial(SupernodalCholesky, tell=progress.line)
     if options.linear_solver_type == "superlu":
         solver = SuperLU
@@ -55,7 +55,18 @@ def make_problem(
         settings = IterativeOptions(forcing=options.pcg_forcing, budget=budget)
         return IterativeProblem(states, visual, terms, direct, settings, progress.line)
 
+    def in_submaps() -> Problem:
+        with _limited(options):
+            return SubmapProblem(
+                states, visual, terms, options.submaps, OrderingKind(options.ordering), direct,
+                progress.line,
+            )  # fmt: skip
+
     obstacle = _obstacle(visual)
+    if options.submaps and not obstacle:
+        return _with_remedy(in_submaps, remedy=", or take less by a larger --ba_submaps")
+    if options.submaps:
+        progress.line(f"linear solver: direct, since submaps do not support {obstacle}")
     if options.linear_solver_type == "pcg":
         if not obstacle:
             return iterative()
@@ -63,6 +74,19 @@ def make_problem(
     if options.linear_solver_type != "auto" or visual is None or obstacle:
         return _with_remedy(direct, remedy="" if obstacle else _REMEDY)
     return _automatic(visual, options, direct, iterative, progress)
+
+
+def _check(options: SolverFlags) -> None:
+    if not 0.0 < options.pcg_forcing < 1.0:
+        raise FlagError(f"--ba_pcg_forcing={options.pcg_forcing:g} is not between 0 and 1")
+    for name in ("submaps", "submap_rounds"):
+        if getattr(options, name) < 0:
+            raise FlagError(f"--ba_{name}={getattr(options, name)} must not be negative")
+    if options.submaps and options.linear_solver_type in ("pcg", "superlu"):
+        raise FlagError(
+            f"--ba_submaps factorises: drop --ba_linear_solver_type={options.linear_solver_type}, or "
+            "--ba_submaps"
+        )
 
 
 def _automatic(

@@ -223,6 +223,17 @@ class SolverFlags:
         "that overlap), or whichever of them takes less work",
         choices=("auto", "minimum_degree", "nested_dissection"),
     )
+    submaps: int = option(
+        0,
+        help="Cut the problem into so many submaps where few states hold it together, and keep the equations "
+        "of one submap at a time in memory, the others in the temporary folder (TMPDIR); the steps are those "
+        "of the direct solver; 0 = all in memory.",
+    )
+    submap_rounds: int = option(
+        0,
+        help="Largest number of rounds over all submaps with --ba_submaps, each of which is an iteration of "
+        "the joint problem; 0 = --ba_num_iterations.",
+    )
     trust_region_schedule: str = option(
         "step_quality",
         help="Update of the trust region radius: as in Ceres, or the same with a larger increase after "

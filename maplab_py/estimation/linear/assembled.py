@@ -12,15 +12,22 @@ from maplab_py.estimation.linear.block_storage import BlockLayout
 from maplab_py.estimation.linear.protocol import FactorStatistics
 
 
-class AssembledSolver(Protocol):
+class BlockSums(Protocol):
+    """Where the blocks of a matrix are summed."""
+
+    layout: BlockLayout
+    numbers: F64  # the storage; see `block_storage`
+
+    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
+        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
+
+
+class AssembledSolver(BlockSums, Protocol):
     """Factorises and solves A x = b; the blocks of A are summed in the solver's own storage.
 
     A is symmetric, (num_nodes * node_size) square, and its lower blocks (row >= col) are given. The
     constructor takes their rows and columns, number and size of nodes, and an ordering.
     """
-
-    layout: BlockLayout
-    numbers: F64  # the storage; see `block_storage`
 
     @property
     def statistics(self) -> FactorStatistics:
@@ -31,9 +38,6 @@ class AssembledSolver(Protocol):
 
     def clear(self) -> None:
         """Set A to zero; a factor is gone."""
-
-    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
-        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
 
     def add_to_diagonal(self, added: F64) -> None:
         """Add numbers (num_nodes, d) to the diagonal of A."""
@@ -72,7 +76,7 @@ class BlockPlaces:
         short_rows, short_cols = rows.astype(np.int32), cols.astype(np.int32)
         return cls(short_rows, short_cols, solver.places(short_rows, short_cols))
 
-    def add(self, solver: AssembledSolver, values: F64, first: int = 0) -> None:
-        """Add the blocks (k, d, d) from number `first` on to the solver's matrix."""
+    def add(self, solver: BlockSums, values: F64, first: int = 0) -> None:
+        """Add the blocks (k, d, d) from number `first` on to a matrix."""
         part = slice(first, first + len(values))
         solver.add(self.rows[part], self.cols[part], self.places[part], values)

@@ -64,7 +64,8 @@ class BlockStorage:
 
     def project(self, is_restricted: Mask, projector: F64, size: F64) -> None:
         """Turn the matrix A into P A P + s (I - P); see `block_storage.project_panels`."""
-        project_panels(self.plan, is_restricted, projector, size, self.numbers)
+        every = 0, len(self.plan.parent)
+        project_panels(self.plan, is_restricted, projector, size, self.numbers, *every)
 
     def blocks(self, rows: I32, cols: I32) -> F64:
         """Return blocks (B, d, d) of the matrix as it was summed."""
@@ -131,7 +132,8 @@ class SupernodalCholesky(BlockStorage):
             NotPositiveDefinite: A pivot is not positive (or not a number).
         """
         with single_blas_thread():
-            bad = supernodal.factorise(self.plan, self.numbers, self._scratch, self._blas)
+            every = 0, len(self.plan.parent)
+            bad = supernodal.factorise(self.plan, self.numbers, self._scratch, self._blas, *every)
         if bad >= 0:
             raise NotPositiveDefinite(int(self.plan.order[bad]))
         self._is_factorised = True

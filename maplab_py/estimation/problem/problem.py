@@ -24,7 +24,7 @@ from maplab_py.estimation.terms.visual import VisualTerms
 DirectSolver = Callable[..., AssembledSolver]
 """Makes a solver for lower blocks at rows and columns, a number and size of nodes, and an ordering."""
 
-_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
+SMALLEST_DAMPED, LARGEST_DAMPED = 1e-6, 1e32
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ class Problem:
         """Factorise the projected, damped equations; return the projected gradient."""
         self._assemble(linear)
         self._assembled = None
-        added = damping * np.clip(linear.diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
+        added = damping * np.clip(linear.diagonal, SMALLEST_DAMPED, LARGEST_DAMPED)
         self._solver.add_to_diagonal(added)
         # directions that must not move get a pivot of the others' size: one that is small against
         # them would drown in their rounding errors

@@ -48,13 +48,7 @@ def linearize(
         add: Takes blocks (k, 3, 3) of the system from some number on, one per pair of nodes of every
             factor, at `block_places`. The next call overwrites them.
     """
-    residual, jacobian = term.evaluate(states)
-    loss, scale = term.loss
-    rho, weight = loss_and_weight(loss, scale * scale, np.einsum("nm,nm->n", residual, residual))
-    if loss is not Loss.NONE:
-        root = np.sqrt(weight)
-        residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
-    residual, jacobian = np.ascontiguousarray(residual), np.ascontiguousarray(jacobian)
+    residual, jacobian, total = weighted(term, states)
     gradient, diagonal = np.empty((*term.nodes.shape, 3)), np.empty((*term.nodes.shape, 3))
     pairs = blocks_each(term.nodes)
     room = np.empty((min(_FACTORS_AT_ONCE, len(residual)), pairs, 3, 3))
@@ -65,7 +59,19 @@ def linearize(
             residual[part], jacobian[part], term.nodes[part], blocks, gradient[part], diagonal[part]
         )
         add(blocks.reshape(-1, 3, 3), first * pairs)
-    return FactorSystem(gradient, diagonal, 0.5 * float(np.sum(rho))), residual, jacobian
+    return FactorSystem(gradient, diagonal, total), residual, jacobian
+
+
+def weighted(term: FactorTerm, states: States) -> tuple[F64, F64, float]:
+    """Return residuals (N, m) and Jacobians (N, m, 3 n) with the weights of the loss, and the cost."""
+    residual, jacobian = term.evaluate(states)
+    loss, scale = term.loss
+    rho, weight = loss_and_weight(loss, scale * scale, np.einsum("nm,nm->n", residual, residual))
+    if loss is not Loss.NONE:
+        root = np.sqrt(weight)
+        residual, jacobian = residual * root[:, None], jacobian * root[:, None, None]
+    total = 0.5 * float(np.sum(rho))
+    return np.ascontiguousarray(residual), np.ascontiguousarray(jacobian), total
 
 
 def blocks_each(nodes: I64) -> int:

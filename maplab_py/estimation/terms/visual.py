@@ -19,7 +19,7 @@ from maplab_py.estimation.kernels.visual_arguments import (
     VisualSums,
     VisualTarget,
 )
-from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces
+from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces, BlockSums
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
@@ -42,6 +42,7 @@ from maplab_py.estimation.terms.visual_structure import (
 )
 from maplab_py.geometry import se3
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.vimap.table import starts_of_counts
 
 _BLOCKS_AT_ONCE = 65_536
 
@@ -148,6 +149,42 @@ class VisualTerms:
         """Give back the memory of the plan, which is made again when somebody needs it."""
         self.__dict__.pop("plan", None)
 
+    def part(
+        self,
+        landmarks: I64,
+        rows: I64,
+        vertex: I32,
+        num_vertices: int,
+        plan: EliminationPlan | None,
+    ) -> VisualTerms:
+        """Return the terms of some landmarks over the vertices that see them, numbered anew.
+
+        Cameras must not be estimated.
+
+        Args:
+            landmarks: Rows (l,) of the landmarks.
+            rows: Their observations (o,), by landmark.
+            vertex: New number (o,) of the vertex of each.
+            num_vertices: Number of vertices that see them.
+            plan: Plan of these terms if it is known already.
+        """
+        data = self.observations
+        chosen = Observations(
+            starts_of_counts(np.diff(data.start)[landmarks]),
+            vertex,
+            data.camera[rows],
+            data.uv_px[rows],
+            data.inverse_sigma[rows],
+            data.loss_scale[rows],
+        )
+        terms = VisualTerms(
+            self._kernels, chosen, self._cameras, num_vertices, loss=self.loss,
+            move_points=self.moves_points, landmark_prior=self._prior[landmarks],
+        )  # fmt: skip
+        if plan is not None:
+            terms.__dict__["plan"] = plan  # computed before
+        return terms
+
     @cached_property
     def _Y(self) -> F64:
         return np.empty((self.plan.largest_slab, 3, 6))
@@ -227,7 +264,7 @@ class VisualTerms:
         return VisualPlaces(target, border)
 
     def linearize(
-        self, states: States, damping: float, solver: AssembledSolver, places: VisualPlaces
+        self, states: States, damping: float, solver: BlockSums, places: VisualPlaces
     ) -> NodeSystem:
         """Eliminate the landmarks; add what is left to the solver's matrix and the result."""
         cost = np.zeros(self.num_chunks)
