@@ -25,6 +25,9 @@ def split_by_position(
     removed; what is left out of a mission is removed as by keyframing, so that its edges are joined.
     Ids stay, so the same vertex has one id in all cells.
 
+    With an overlap every edge is in some cell with both its vertices, so that `join.join_cells` restores the
+    map: where the overlap is shorter than an edge, the edge's second vertex is added to a cell of the first.
+
     Args:
         vi_map: The map.
         options: Number of cells and overlap.
@@ -41,10 +44,28 @@ def split_by_position(
         )
     cells = []
     rectangles = _rectangles(p_G_I, options.count)
-    for number, rectangle in enumerate(rectangles):
+    distance_m = np.array([_distance_m(p_G_I, rectangle) for rectangle in rectangles])
+    is_inside = distance_m <= options.overlap_m
+    if options.overlap_m > 0.0:
+        _add_second_vertices(vi_map, is_inside, np.argmin(distance_m, axis=0))
+    for number, members in enumerate(is_inside):
         progress.step(number, len(rectangles), f"cell {number}")
-        cells.append(_cell(vi_map, _distance_m(p_G_I, rectangle) <= options.overlap_m))
+        cells.append(_cell(vi_map, members))
     return cells
+
+
+def _add_second_vertices(vi_map: VIMap, is_inside: Mask, home: I64) -> None:
+    """Put the second vertex of edges that lie in no cell into the cell (V,) of the first, in place.
+
+    Args:
+        vi_map: The map.
+        is_inside: Whether a vertex is in a cell (cells, V).
+        home: Cell of each vertex.
+    """
+    for edges in (vi_map.imu_edges, vi_map.transformation_edges, vi_map.loop_closure_edges):
+        first, second = edges.from_vertex, edges.to_vertex
+        is_split = ~(is_inside[:, first] & is_inside[:, second]).any(axis=0)
+        is_inside[home[first[is_split]], second[is_split]] = True
 
 
 def _rectangles(p_G: F64, count: int) -> list[F64]:
@@ -82,6 +103,7 @@ def _cell(vi_map: VIMap, is_inside: Mask) -> VIMap:
     observed = vi_map.keypoints.landmark[keypoints[is_inside[vi_map.keypoint_vertex[keypoints]]]]
     is_seen = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
     is_seen[observed] = True
+    is_seen |= (np.diff(vi_map.observation_start) == 0) & is_inside[vi_map.landmarks.vertex]
     seen = remove_landmarks(vi_map, ~is_seen)
     kept = is_inside[(per_mission > 0)[vi_map.vertices.mission]]
     return remove_vertices(remove_missions(seen, per_mission == 0), ~kept)

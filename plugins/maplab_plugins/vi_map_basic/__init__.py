@@ -1,6 +1,6 @@
 """maplab's vi_map_basic plugin: maps in memory and on disk, their content, undo."""
 
-from maplab_plugins.vi_map_basic.cells import split_map
+from maplab_plugins.vi_map_basic.cells import join_submaps, split_map
 from maplab_plugins.vi_map_basic.history import history, redo, restore, snapshot, undo
 from maplab_plugins.vi_map_basic.information import (
     check_map_consistency,
@@ -52,6 +52,7 @@ __all__ = [
     "get_map_folder",
     "history",
     "join_all_maps",
+    "join_submaps",
     "list_maps",
     "list_maps_on_file_system",
     "list_resource_folders",

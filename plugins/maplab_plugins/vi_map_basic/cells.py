@@ -1,11 +1,15 @@
-"""Splitting a map into cells."""
+"""Splitting a map into cells, and joining them again."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.cells.options import CellOptions
-from maplab_py.plugin import CommandContext, Report, command
+from maplab_py.plugin import CommandContext, Report, UserError, command
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.cells.join import JoinReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +35,7 @@ _CELLS = CellOptions()
 @command(
     "split_map",
     example="split_map --cell_count=2 --cell_overlap_m=2",
-    see_also=("save_all", "delete_map", "generate_summary_map_and_save_to_disk"),
+    see_also=("join_submaps", "save_all", "generate_summary_map_and_save_to_disk"),
 )
 def split_map(context: CommandContext, *, options: CellOptions = _CELLS) -> SplitReport:
     """Split the selected map by position into overlapping cells, each a new map in memory.
@@ -52,3 +56,52 @@ def split_map(context: CommandContext, *, options: CellOptions = _CELLS) -> Spli
         )
     context.maps.select(key)
     return SplitReport(tuple(lines))
+
+
+@command(
+    "join_submaps",
+    example="join_submaps --target_map_key=city --map_keys=city_cell_0,city_cell_1",
+    see_also=("split_map", "compare_maps", "merge_map", "load_merge_all_submaps"),
+    needs_map=False,
+)
+def join_submaps(
+    context: CommandContext, target_map_key: str, *, map_keys: str = "", keep_submaps: bool = False
+) -> JoinReport:
+    """Join cells that were edited apart to one map, which is selected; the cells are removed from memory.
+
+    Vertices, landmarks and edges with one id become one. Where cells differ, the copy of a vertex is taken
+    from the cell where it is farthest from what the cell lacks, with its images and observations. What only
+    one cell has stays: an entity is gone only if all cells that had it have removed it.
+
+    Args:
+        target_map_key: Key of the new map.
+        map_keys: Keys of the cells, separated by commas; empty = all maps in memory that are named after the
+            target, as split_map names them (city_cell_0, city_cell_1, ...).
+        keep_submaps: Keep the cells in memory.
+    """
+    from maplab_py.algorithms.cells.join import join_cells
+
+    keys = [key.strip() for key in map_keys.split(",") if key.strip()]
+    if not map_keys:
+        named = [key for key in context.maps.keys if _is_cell_of(key, target_map_key)]
+        keys = sorted(named, key=lambda key: int(key.rpartition("_")[2]))
+    if len(keys) < 2:
+        raise UserError(
+            f"join_submaps: needs two or more cells, found {', '.join(keys) or 'none'}: "
+            "name them by --map_keys"
+        )
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    if twice:
+        raise UserError(f"join_submaps: --map_keys names '{twice[0]}' twice")
+    entries = [context.maps.get(key) for key in keys]
+    joined, report = join_cells([entry.vi_map for entry in entries], progress=context.progress)
+    if not keep_submaps:
+        for key in keys:
+            context.maps.remove(key)
+    context.maps.add(context.maps.check_new_key(target_map_key), joined)
+    return report
+
+
+def _is_cell_of(key: str, map_key: str) -> bool:
+    number = key.removeprefix(f"{map_key}_cell_")
+    return number != key and number.isdecimal()
