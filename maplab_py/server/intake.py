@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
+import time
 from concurrent.futures import Future
 
 from maplab_py.errors import MaplabError, UserError
@@ -17,7 +20,9 @@ from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 
 _ATTEMPTS = 3
-"""How often a submap is prepared whose worker dies."""
+"""How often a submap is prepared whose worker dies or fails without saying what is wrong with the submap."""
+_DISK_FULL = os.strerror(errno.ENOSPC)
+_SECONDS_BETWEEN_RETRIES = 5.0
 
 
 @dataclasses.dataclass
@@ -31,6 +36,7 @@ class Item:
         submap: The prepared submap, until it is merged.
         waits_for_neighbour: It adjoins nothing of its mission in the map.
         merged: Its record, from the merge on.
+        not_before_s: When its next worker may start [s, monotonic].
     """
 
     entry: Entry
@@ -39,6 +45,13 @@ class Item:
     submap: VIMap | None = None
     waits_for_neighbour: bool = False
     merged: MergedSubmap | None = None
+    not_before_s: float = 0.0
+
+    @property
+    def needs_worker(self) -> bool:
+        """Whether a worker is to be started now."""
+        is_open = self.future is None and self.submap is None and self.merged is None
+        return is_open and time.monotonic() >= self.not_before_s
 
     @property
     def is_preparing(self) -> bool:
@@ -95,7 +108,7 @@ class Intake:
                 problem = self._collect(item, item.future.result())
                 if problem:
                     return problem
-            elif item.future is None and item.submap is None and item.merged is None:
+            elif item.needs_worker:
                 item.attempts += 1
                 item.future = self._preparation.start(item.entry)
         return ""
@@ -130,12 +143,16 @@ class Intake:
         item.future = None
         if outcome.ending is Ending.DONE:
             return self._load(item)
-        if outcome.ending in (Ending.FAILED, Ending.REFUSED):
+        if _DISK_FULL in outcome.error:
+            item.attempts -= 1
+            item.not_before_s = time.monotonic() + _SECONDS_BETWEEN_RETRIES
+            return f"{item.entry.title}: {outcome.error}"
+        if outcome.ending is Ending.REFUSED:
             return self.reject(item, outcome.error)
         if item.attempts < _ATTEMPTS:
-            self._events.add(f"{item.entry.title}: its worker {outcome.error}; it is tried again")
+            self._events.add(f"{item.entry.title}: {outcome.error}; it is tried again")
             return ""
-        return self.reject(item, f"its worker {outcome.error}, {item.attempts} times")
+        return self.reject(item, f"{outcome.error}, {item.attempts} times")
 
     def _load(self, item: Item) -> str:
         folder = self._spool.folder(item.entry)

@@ -228,9 +228,10 @@ class MapServer:
         self._publish_if_needed(force=True)
 
     def _is_busy(self) -> bool:
-        """Tell whether a worker has a submap, or one is being copied."""
-        preparing = any(item.future is not None for item in self._intake.items.values())
-        return preparing or bool(self.spool.arrivals())
+        """Tell whether a submap is being prepared, or copied."""
+        items = self._intake.items.values()
+        unprepared = any(item.submap is None and item.merged is None for item in items)
+        return unprepared or bool(self.spool.arrivals())
 
     def _step(self, is_to_end: Callable[[], bool]) -> bool:
         """Do what comes next; False where there is nothing to do."""

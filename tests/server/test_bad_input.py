@@ -177,7 +177,34 @@ def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
     servers.put("ant", 0)
     servers.run()
     assert killed == ["ant/submap_0"]
-    assert "its worker was killed; it is tried again" in servers.spool.log.read_text()
+    assert "ant/submap_0: was killed; it is tried again" in servers.spool.log.read_text()
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
+
+
+@pytest.mark.parametrize(
+    ("ending", "error"),
+    [
+        (Ending.FAILED, "optvi: ImportError: an error of the program"),
+        (Ending.REFUSED, "prepared: cannot be saved (No space left on device)"),
+    ],
+)
+def test_a_failure_that_is_not_the_submap_s_is_tried_again(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch, ending: Ending, error: str
+) -> None:
+    monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
+    failed: list[str] = []
+
+    def failing(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+        if not failed:
+            failed.append(order.title)
+            return Outcome(order.title, ending, error)
+        return copying(order, is_cancelled)
+
+    servers.work(failing)
+    servers.put("ant", 0)
+    servers.run()
+    assert failed == ["ant/submap_0"]
+    assert servers.reasons() == []
     assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
 
 
@@ -185,7 +212,7 @@ def test_a_worker_that_dies_every_time_is_given_up(servers: Servers) -> None:
     servers.work(lambda order, _: Outcome(order.title, Ending.OVER_MEMORY, "was killed"))
     servers.put("ant", 0)
     servers.run()
-    assert servers.reasons() == ["ant/submap_0: its worker was killed, 3 times"]
+    assert servers.reasons() == ["ant/submap_0: was killed, 3 times"]
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", ".hidden"])
