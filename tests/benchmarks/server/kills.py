@@ -9,6 +9,7 @@ optvi, anchors, lc, optvi.
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import random
 import signal
@@ -161,9 +162,17 @@ class _Run:
                 self.kills += 1
                 server = self._start()
                 wait_s, last_s = self._rng.uniform(0.0, _LONGEST_DELAY_S), time.monotonic()
+        while self._serving_process() != server.pid:  # Ctrl-C would end it before it serves
+            time.sleep(0.1)
         server.send_signal(signal.SIGINT)
         if server.wait(_LONGEST_S) != 0:
             raise RuntimeError(f"the server ended with status {server.returncode}")
+
+    def _serving_process(self) -> int:
+        try:
+            return int(json.loads(self.spool.address.read_text())["process"])
+        except (OSError, ValueError):
+            return 0
 
     def _drop(self) -> None:
         """Push the next submap when few are waiting."""
