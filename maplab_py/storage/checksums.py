@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
 from maplab_py.storage.map_files import METADATA, RESOURCE_INFO, VI_MAP_FOLDER
+from maplab_py.storage.threads import map_in_threads
 
 FILE_NAME = "checksums.sha256"
 _FINGERPRINT_DIGITS = 16
@@ -82,8 +81,7 @@ def listing(folder: Path) -> str:
     """
     candidates = [folder / METADATA, folder / RESOURCE_INFO, *(folder / VI_MAP_FOLDER).rglob("*")]
     paths = [path for path in sorted(candidates) if path.is_file()]
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        digests = list(pool.map(_digest, paths))
+    digests = map_in_threads(_digest, paths)
     return "".join(
         f"{digest}  {path.relative_to(folder).as_posix()}\n"
         for digest, path in zip(digests, paths, strict=True)

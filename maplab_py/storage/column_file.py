@@ -18,7 +18,6 @@ import struct
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.cancellation import check_cancelled
 from maplab_py.storage import object_columns
+from maplab_py.storage.threads import map_in_threads
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.tables import Missions
@@ -224,8 +224,7 @@ def _map_of(columns: Mapping[str, NDArray[Any]]) -> VIMap:
 
 def _checksums(columns: Mapping[str, NDArray[Any]]) -> list[int]:
     """Return the CRC-32 of every column, of those that stay on disk that of samples."""
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return list(pool.map(_checksum, columns, columns.values()))
+    return map_in_threads(_checksum, columns, columns.values())
 
 
 def _checksum(name: str, values: NDArray[Any]) -> int:

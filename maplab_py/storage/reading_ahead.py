@@ -28,6 +28,7 @@ class FilesAhead:
 
         Raises:
             MapError: The file cannot be read; see `map_files.read_unpacked`.
+            MemoryError: The file, or the thread that reads the next one, does not fit into memory.
         """
         content = self._next.result()
         self._next = self._start()
@@ -37,7 +38,10 @@ class FilesAhead:
         path = next(self._left, None)
         if path is None:
             return Future()
-        return self._pool.submit(read_unpacked, path, self._max_bytes)
+        try:
+            return self._pool.submit(read_unpacked, path, self._max_bytes)
+        except RuntimeError as error:  # there is no space for the stack of the thread
+            raise MemoryError(str(error)) from error
 
 
 @contextlib.contextmanager

@@ -122,6 +122,10 @@ PREPARED["create_mesh_from_tsdf_grid"] = f"{_ROOM}; sdr; tsdf"
 PREPARED["export_colmap_mvs"] = PREPARED["export_for_pmvs_reconstruction"] = _ROOM
 PREPARED["visualize_mesh"] = PREPARED["create_mesh_from_tsdf_grid"]
 PREPARED["register_point_clouds"] = "load lidar"
+PREPARED["join_submaps"] = (
+    "load_merge_all_maps --maps_folder=maps --target_map_key=city; split_map --cell_count=2; "
+    "delete_map city --yes"
+)
 
 PREPARED["push"] = ""
 _PUSHED = "push submap_1 --spool=spool --robot_name=ant"

@@ -93,12 +93,14 @@ def join_submaps(
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
         raise UserError(f"join_submaps: --map_keys names '{twice[0]}' twice")
+    if keep_submaps or target_map_key not in keys:
+        context.maps.check_new_key(target_map_key)
     entries = [context.maps.get(key) for key in keys]
     joined, report = join_cells([entry.vi_map for entry in entries], progress=context.progress)
     if not keep_submaps:
         for key in keys:
             context.maps.remove(key)
-    context.maps.add(context.maps.check_new_key(target_map_key), joined)
+    context.maps.add(target_map_key, joined)
     return report
 
 
