@@ -22,6 +22,7 @@ _UNIT_SUFFIXES = {
     "_seconds": "s",
     "_ms": "ms",
     "_mb": "MB",
+    "_gb": "GB",
     "_megabytes": "MB",
     "_percent": "%",
     "_mps": "m/s",

@@ -21,6 +21,7 @@ class Sample(Report):
     seconds_build: float = 0.5
     seconds_per_segment: float = 0.25
     total_s: float = 2.0
+    process_gb: float = 0.5
     none_of_these: dict[str, int] = dataclasses.field(default_factory=dict)
     no_rows: tuple[Row, ...] = ()
     empty_rows: tuple[Row, ...] = (Row(""), Row(""))
@@ -36,6 +37,7 @@ def test_headings_keep_names_of_transformations_and_give_units() -> None:
         "build time [s]",
         "time per segment [s]",
         "total [s]",
+        "process [GB]",
     ]
 
 
