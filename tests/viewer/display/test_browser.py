@@ -89,6 +89,26 @@ def drag_slider(page: Page, start: float, end: float) -> None:
     page.page.mouse.up()
 
 
+@pytest.fixture
+def other_viewer() -> Iterator[Viewer]:
+    """A viewer for one test, which may move its windows."""
+    viewer = Viewer(0)
+    viewer.show(SUBJECT, playback=PlaybackOptions(steps=20))
+    yield viewer
+    viewer.stop()
+
+
+@pytest.fixture
+def other_page(browser: Any, other_viewer: Viewer) -> Iterator[Page]:
+    opened = Page(browser, other_viewer.url)
+    assert opened.wait_until(lambda: other_viewer.pages == 1)
+    other_viewer.look_at_everything()
+    opened.settle(1200)
+    opened.still_picture()
+    yield opened
+    opened.page.close()
+
+
 def test_the_page_shows_the_map_and_asks_nobody_else(page: Page, viewer: Viewer) -> None:
     assert page.wait_until(lambda: not is_blank(page.picture()))
     # lines and points have the colours that they were given
@@ -177,8 +197,9 @@ def test_two_picks_measure_a_distance(page: Page, viewer: Viewer) -> None:
     assert page.wait_until(lambda: page.page.get_by_text(f"{expected:.3f} m").count() >= 1)
 
 
-def test_the_slider_moves_through_the_mission(page: Page, viewer: Viewer) -> None:
+def test_the_slider_moves_through_the_mission(other_page: Page, other_viewer: Viewer) -> None:
     """The path is drawn as far as the slider has come; it has 13 pieces and a camera at its head."""
+    page, viewer = other_page, other_viewer
     for layer in ("loop_closures", "path_ends"):  # they lie on the path
         viewer.set_layer(layer, False)
     middles = 0.5 * (MAP.T_G_I[1:, 4:] + MAP.T_G_I[:-1, 4:])
