@@ -24,6 +24,8 @@ from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
 
+_PARTS = (slice(0, 3), slice(3, 6))
+"""Position and orientation in a covariance."""
 _SIGMAS = 3.0
 """Standard deviations that a measurement may be off beyond the limits."""
 _KNOWN_ORIENTATION_RAD = 1.0
@@ -138,7 +140,3 @@ def _agreeing(
     is_near = off_m <= options.ransac_max_position_error_m + _SIGMAS * sigma_m
     is_turned = off_rad > options.ransac_max_orientation_error_rad + _SIGMAS * sigma_rad
     return np.asarray(is_near & ~(is_turned & (sigma_rad < _KNOWN_ORIENTATION_RAD)))
-
-
-_PARTS = (slice(0, 3), slice(3, 6))
-"""Position and orientation in a covariance."""
