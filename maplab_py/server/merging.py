@@ -288,7 +288,7 @@ def _has_large_gap(refused: dict[str, int]) -> bool:
 
 
 class _Clock:
-    """Processor time of this thread by step."""
+    """Processor time of this process by step."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

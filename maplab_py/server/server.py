@@ -339,6 +339,7 @@ class MapServer:
         self.events.add(
             f"{entry.title}: merged, {steps.landmarks_merged} landmarks joined, "
             f"{steps.free_vertices} vertices optimised in {sum(steps.seconds.values()):.1f} s{anchored}"
+            + (f"; no loops were closed: {steps.note}" if steps.note else "")
         )
 
     def _reset_trust_region(self, is_new_robot: bool) -> None:
