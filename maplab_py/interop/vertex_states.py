@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
+from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vectors, slerp
@@ -108,7 +109,7 @@ def write_asl(vi_map: VIMap, states: VertexStates, path: Path, *, overwrite: boo
     Raises:
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
-    vertices = np.unique(states.vertex)
+    vertices = distinct(states.vertex)
     names = dict(zip(vertices.tolist(), ids.to_hex_list(vi_map.vertices.id[vertices]), strict=True))
     mission_names = ids.to_hex_list(vi_map.missions.id)
     order = [4, 5, 6, 3, 0, 1, 2]
@@ -157,7 +158,7 @@ def _mission_states(vi_map: VIMap, mission: int, at_imu_times: bool) -> VertexSt
         return states
     edges = np.flatnonzero(vi_map.vertices.mission[vi_map.imu_edges.from_vertex] == mission)
     samples = ragged_rows(vi_map.sample_start, edges)
-    times = np.unique(vi_map.imu_samples.timestamp_ns[samples])
+    times = distinct(vi_map.imu_samples.timestamp_ns[samples])
     stamps = states.times_ns
     if len(stamps) < 2:
         return states

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import I64
+from maplab_py.distinct import distinct
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
@@ -76,7 +77,7 @@ def count_merges(seen: Sightings, truth: Truth, point_of_landmark: I64) -> Merge
     known = seen.track >= 0
     pairs = np.unique(np.stack([seen.landmark[known], seen.track[known]], axis=1), axis=0)
     landmark, point_of_track = pairs[:, 0], truth.landmark_point[pairs[:, 1]]
-    merges = len(pairs) - len(np.unique(landmark))
+    merges = len(pairs) - len(distinct(landmark))
     # of one landmark's tracks those of the most frequent point are right together
     groups, size = np.unique(
         np.stack([landmark, point_of_track], axis=1), axis=0, return_counts=True
@@ -84,12 +85,12 @@ def count_merges(seen: Sightings, truth: Truth, point_of_landmark: I64) -> Merge
     most = np.zeros(len(point_of_landmark), dtype=np.int64)
     np.maximum.at(most, groups[:, 0], size)
     false_merges = len(pairs) - int(most.sum())
-    shown = point_of_landmark[np.unique(seen.landmark)]
+    shown = point_of_landmark[distinct(seen.landmark)]
     shown = shown[shown >= 0]
     wrong = (seen.point >= 0) & (seen.point != point_of_landmark[seen.landmark])
     return MergeCounts(
         merges,
         false_merges,
-        len(shown) - len(np.unique(shown)),
+        len(shown) - len(distinct(shown)),
         int(np.count_nonzero(wrong)),
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.report import counted
 from maplab_py.storage import maplab_map_pb2 as pb
@@ -142,7 +143,7 @@ def check_listed_edges(
                 f"its {field} {what}; load with --repair to use the edges"
             )
         wrong += len(bad)
-        unlisted += len(ends) - len(np.unique(edges[is_right]))
+        unlisted += len(ends) - len(distinct(edges[is_right]))
     notes = []
     if wrong:
         notes.append(f"{wrong} listed ends of edges repaired")

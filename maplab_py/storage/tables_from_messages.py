@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import I64, U64
+from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.storage import message_numbers
 from maplab_py.storage.message_ids import ids_of, unknown_bytes
@@ -147,7 +148,7 @@ def read_missions(
     if len(dangling):
         row = int(dangling[0])
         raise MapError(f"{name(row)}: its root vertex {to_hex(root_ids[row])} is not in the map")
-    inhabited = np.unique(np.append(vertex_mission, -1))[1:]
+    inhabited = distinct(np.append(vertex_mission, -1))[1:]
     rootless = inhabited[~is_valid(root_ids[inhabited])]
     if len(rootless):
         raise MapError(f"{name(int(rootless[0]))}: has vertices but no root vertex")

@@ -8,6 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.array_types import F64
+from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer.drawing import Drawing
@@ -58,7 +59,7 @@ def observation_signals(vi_map: VIMap) -> tuple[F64, F64]:
     keypoints = vi_map.observations
     vertex = vi_map.keypoint_vertex[keypoints].astype(np.int64)
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
-    pairs = np.unique(vertex * max(len(vi_map.landmarks), 1) + landmark)
+    pairs = distinct(vertex * max(len(vi_map.landmarks), 1) + landmark)
     observed = np.bincount(pairs // max(len(vi_map.landmarks), 1), minlength=count)
     usable = vi_map.landmarks.quality[landmark] != LandmarkQuality.BAD
     keypoints, vertex, landmark = keypoints[usable], vertex[usable], landmark[usable]

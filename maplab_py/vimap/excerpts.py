@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.array_types import I32, I64
+from maplab_py.distinct import distinct
 from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, with_p_G
 from maplab_py.vimap.selection import as_mask, keep_rows
 from maplab_py.vimap.table import ragged_rows
@@ -123,12 +124,12 @@ def excerpt(vi_map: VIMap, vertices: ArrayLike, *, observed_by: ArrayLike | None
     observing = is_in if observed_by is None else as_mask(observed_by, len(is_in)) & is_in
     keypoints = vi_map.observations
     keypoints = keypoints[observing[vi_map.keypoint_vertex[keypoints]]]
-    landmarks = np.unique(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
+    landmarks = distinct(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
     homeless = landmarks[~is_in[vi_map.landmarks.vertex[landmarks]]]
     store = stores_for(vi_map, homeless, is_in, same_mission=False)
     moved = move_landmarks(vi_map, homeless, store)
     rows = np.flatnonzero(is_in)
-    missions = np.unique(vi_map.vertices.mission[rows]).astype(np.int64)
+    missions = distinct(vi_map.vertices.mission[rows]).astype(np.int64)
     frames = np.flatnonzero(is_in[vi_map.frames.vertex])
     part = keep_rows(moved, missions=missions, vertices=rows, landmarks=landmarks)
     if not np.array_equal(part.frames.id, vi_map.frames.id[frames]):  # frames out of order

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.vimap.ids import SHORT_ID_DIGITS, distinct_prefixes, to_hex_list
 from maplab_py.vimap.tables import MissionSensor
@@ -79,7 +80,7 @@ def observer_counts(vi_map: VIMap) -> I64:
     """Return the number of distinct observing vertices (L,) of each landmark."""
     keypoints = vi_map.observations
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
-    pairs = np.unique(landmark * max(len(vi_map.vertices), 1) + vi_map.keypoint_vertex[keypoints])
+    pairs = distinct(landmark * max(len(vi_map.vertices), 1) + vi_map.keypoint_vertex[keypoints])
     observed = pairs // max(len(vi_map.vertices), 1)
     return np.bincount(observed, minlength=len(vi_map.landmarks))
 

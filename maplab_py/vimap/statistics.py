@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.distinct import distinct
 from maplab_py.report import Report, counted
 from maplab_py.vimap.ids import distinct_prefixes, is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import (
@@ -254,7 +255,7 @@ def _cameras(vi_map: VIMap, row: int) -> tuple[CameraStatistics, ...]:
         chosen = of_mission & (index == camera)
         landmark = vi_map.keypoints.landmark[chosen[vi_map.keypoint_frame]]
         observing = landmark[landmark >= 0]
-        quality = np.bincount(vi_map.landmarks.quality[np.unique(observing)], minlength=3)
+        quality = np.bincount(vi_map.landmarks.quality[distinct(observing)], minlength=3)
         cameras.append(
             CameraStatistics(
                 camera_index=camera,

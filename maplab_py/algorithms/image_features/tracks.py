@@ -12,6 +12,7 @@ from maplab_py.algorithms.image_features.reports import FeatureTrackReport
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.features import most_frequent_kind
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
@@ -71,7 +72,7 @@ def track_features(
     tracked = np.flatnonzero(track >= 0)
     frames = vi_map.frames
     present = frames.present.copy()
-    present[np.unique(vi_map.keypoint_frame[tracked])] |= np.uint16(FrameField.TRACK_ID)
+    present[distinct(vi_map.keypoint_frame[tracked])] |= np.uint16(FrameField.TRACK_ID)
     ids = np.where(track >= 0, track, vi_map.keypoints.track_id)
     result = vi_map.replace(
         frames=frames.replace(present=present), keypoints=vi_map.keypoints.replace(track_id=ids)
@@ -128,7 +129,7 @@ def _match_neighbours(
 def _neighbours(vi_map: VIMap, free: Mask, most: int) -> I64:
     """Return pairs of frames (P, 2) of one camera that follow each other, by the first frame."""
     frames = vi_map.frames
-    rows = np.unique(vi_map.keypoint_frame[free]).astype(np.int64)
+    rows = distinct(vi_map.keypoint_frame[free]).astype(np.int64)
     mission = vi_map.vertices.mission[frames.vertex[rows]].astype(np.int64)
     camera = frames.camera_index[rows].astype(np.int64)
     order = np.lexsort((rows, camera, mission))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.keyframing.reports import KeyframingReport
+from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
@@ -122,7 +123,7 @@ class _Walk:
         seeing = np.flatnonzero(vi_map.keypoints.landmark >= 0)
         vertex = vi_map.keypoint_vertex[seeing].astype(np.int64)
         landmarks = max(len(vi_map.landmarks), 1)
-        pairs = np.unique(vertex * landmarks + vi_map.keypoints.landmark[seeing])
+        pairs = distinct(vertex * landmarks + vi_map.keypoints.landmark[seeing])
         self._landmark = pairs % landmarks
         count = np.bincount(pairs // landmarks, minlength=len(vi_map.vertices))
         self._start = starts_of_counts(count)

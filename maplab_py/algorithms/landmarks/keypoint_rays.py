@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project
@@ -23,7 +24,7 @@ def keypoint_rays(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, F64, Mask]:
     origin, ray = np.zeros((len(keypoints), 3)), np.zeros((len(keypoints), 3))
     rad_per_px, valid = np.ones(len(keypoints)), np.zeros(len(keypoints), dtype=np.bool_)
     uv = vi_map.keypoints.uv_px[keypoints]
-    for row in np.unique(mission):
+    for row in distinct(mission):
         ids = vi_map.missions.sensor_id[row]
         ncamera = to_hex(ids[MissionSensor.NCAMERA])
         T_I_C = vi_map.sensors.T_I_C(to_hex(ids[MissionSensor.IMU]), ncamera)

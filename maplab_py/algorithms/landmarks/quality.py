@@ -12,6 +12,7 @@ from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.reports import LandmarkQualityReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -190,7 +191,7 @@ def _medians(values: F64, start: I64) -> F64:
 def _distinct(vertex: NDArray[np.int32], group: I64, groups: int) -> I64:
     """Count the distinct vertices (groups,) of each group."""
     width = int(vertex.max(initial=0)) + 1
-    pairs = np.unique(group * width + vertex)
+    pairs = distinct(group * width + vertex)
     return np.bincount(pairs // width, minlength=groups)
 
 

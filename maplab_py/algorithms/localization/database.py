@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.array_types import F64, I64, U64
+from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -194,6 +195,6 @@ def _kind(summary: SummaryMap) -> DescriptorKind | None:
 def _grouped(key: I64, value: I64, groups: int) -> tuple[I64, I64]:
     """Return offsets (groups + 1) and distinct values, by key."""
     size = int(value.max(initial=0)) + 1
-    pairs = np.unique(key * size + value)
+    pairs = distinct(key * size + value)
     counts = np.bincount(pairs // size, minlength=groups)
     return starts_of_counts(counts), pairs % size

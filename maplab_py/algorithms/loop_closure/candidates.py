@@ -15,6 +15,7 @@ import numpy as np
 
 from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.array_types import I32, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
@@ -106,7 +107,7 @@ def _matched(vi_map: VIMap, features: MapFeatures, matches: Matches) -> Any:
     shape = len(vi_map.vertices), len(vi_map.landmarks)
     key = features.vertex[matches.query] * shape[1]
     key += features.descriptors.label[matches.database]
-    pair = np.divmod(np.unique(key), max(shape[1], 1))
+    pair = np.divmod(distinct(key), max(shape[1], 1))
     return csr_array((np.ones(len(pair[0]), dtype=np.int32), pair), shape=shape)
 
 

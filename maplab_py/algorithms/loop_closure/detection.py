@@ -21,6 +21,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import closure_ids
 from maplab_py.algorithms.loop_closure.verification import PoseSearch, search_poses
 from maplab_py.array_types import I64
+from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
@@ -110,7 +111,7 @@ def detect(
     progress.step(4, 4, "loop closures")
     return Detection(
         closures=closures,
-        query_vertices=len(np.unique(features.vertex)),
+        query_vertices=len(distinct(features.vertex)),
         database_landmarks=database_landmarks,
         descriptor_matches=len(matches),
         best_votes=int(candidates.votes.max(initial=0)),

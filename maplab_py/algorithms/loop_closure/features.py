@@ -9,6 +9,7 @@ import numpy as np
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.reports import TrainingReport
 from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
 from maplab_py.memory import require_memory
@@ -233,7 +234,7 @@ def train_projection(
     other = np.linalg.norm(shuffled - points, axis=1)
     return projection, TrainingReport(
         descriptors=len(points),
-        tracks=len(np.unique(label)),
+        tracks=len(distinct(label)),
         descriptor_size=projection.descriptor_size,
         dimensions=len(projection.matrix),
         same_distance=float(np.median(same)),

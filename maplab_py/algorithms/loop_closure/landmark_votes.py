@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import observer_counts
 from maplab_py.vision.track_union import unite_tracks
@@ -120,7 +121,7 @@ def count_pairs(votes: Votes, label: I64) -> Pairs:
     key, pair = np.unique(key, return_inverse=True)
     pair = pair.astype(np.int64)
     span = int(votes.query.max(initial=0)) + 1
-    voters = np.unique(pair * span + votes.query[open_])
+    voters = distinct(pair * span + votes.query[open_])
     number = np.bincount(voters // span, minlength=len(key))
     mean = np.bincount(pair, weights=votes.bits[open_], minlength=len(key)) / np.maximum(
         np.bincount(pair, minlength=len(key)), 1

@@ -15,6 +15,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.search_memory import nearest_rows, remembered
 from maplab_py.array_types import I32, I64
+from maplab_py.distinct import distinct
 from maplab_py.vision.descriptors import differences
 from maplab_py.vision.index import MatchRule
 from maplab_py.vision.index_engines import make_index
@@ -35,12 +36,12 @@ def match_features(
     the query's mission would displace those of others among the nearest neighbours.
     """
     database = np.flatnonzero(features.in_database)
-    landmarks = len(np.unique(features.descriptors.label[database]))
+    landmarks = len(distinct(features.descriptors.label[database]))
     if landmarks == 0:
         empty = np.zeros(0, dtype=np.int64)
         return Matches(empty, empty, empty.astype(np.int32)), 0
     d = features.descriptors
-    missions = np.unique(d.session[database])
+    missions = distinct(d.session[database])
     if len(missions) > options.max_missions_per_query + 1:
         return _in_chosen_missions(features, options, rule, database), landmarks
     query, matched = _in_all_missions(features, options, rule, apart, database)
@@ -173,7 +174,7 @@ def _neighbours(options: LoopClosureOptions) -> int:
 def _chosen_missions(features: MapFeatures, query: I64, matched: I64, most: int, size: int) -> I64:
     """Return the missions with most matches of each query vertex, as vertex * size + mission."""
     mission = features.descriptors.session[matched].astype(np.int64)
-    key = np.unique(query * size + mission)  # a keypoint votes once for a mission
+    key = distinct(query * size + mission)  # a keypoint votes once for a mission
     voters = features.vertex[key // size] * size + key % size
     pair, votes = np.unique(voters, return_counts=True)
     pair, votes = pair[votes >= _MIN_VOTES], votes[votes >= _MIN_VOTES]

@@ -21,6 +21,7 @@ from maplab_py.algorithms.loop_closure.consensus import path_lengths
 from maplab_py.algorithms.loop_closure.merging import MergeResult
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdArray, IdIndex
 
@@ -128,7 +129,7 @@ def _with_merges(
 ) -> LoopRecord:
     """Append the pairs, the landmarks before merging, and the keypoints that observed them."""
     lm = before.landmarks
-    touched = np.unique(np.concatenate([merges.first, merges.second]))
+    touched = distinct(np.concatenate([merges.first, merges.second]))
     landmarks = MergedLandmarks(
         id=lm.id[touched],
         vertex=before.vertices.id[lm.vertex[touched]],

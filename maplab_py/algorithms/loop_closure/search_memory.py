@@ -21,7 +21,7 @@ from maplab_py.memory import available_bytes
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.index_engines import make_index
 
-_MIN_BYTES, _SHARE = 64_000_000, 1.0 / 32.0
+_MIN_BYTES, _SHARE = 64_000_000, 1.0 / 16.0
 """Memory of all results: a share of what is available, and no less than so much. A result has 12 bytes per
 query and search, or per match of a map of many missions."""
 

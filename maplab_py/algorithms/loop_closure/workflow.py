@@ -15,6 +15,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
 from maplab_py.array_types import I64
+from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.vimap import LoopClosureEdges, VIMap
@@ -169,7 +170,7 @@ def describe(
         descriptor_matches=detection.descriptor_matches,
         candidates=len(closures),
         accepted=int(np.count_nonzero(accepted)),
-        accepted_vertices=len(np.unique(closures.query_vertex[accepted])),
+        accepted_vertices=len(distinct(closures.query_vertex[accepted])),
         refused=closures.refused_by_reason(),
         missions_joined=missions_joined(vi_map, closures),
         largest_correction_m=float(correction.max(initial=0.0)),

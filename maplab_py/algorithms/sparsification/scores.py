@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64
+from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import observer_counts
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
@@ -52,7 +53,7 @@ def mission_counts(vi_map: VIMap) -> I64:
     rows = vi_map.observations
     landmark = vi_map.keypoints.landmark[rows].astype(np.int64)
     mission = vi_map.vertices.mission[vi_map.keypoint_vertex[rows]]
-    seen = np.unique(landmark * missions + mission)
+    seen = distinct(landmark * missions + mission)
     return np.bincount(seen // missions, minlength=len(vi_map.landmarks))
 
 

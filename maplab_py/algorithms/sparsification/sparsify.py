@@ -17,6 +17,7 @@ from maplab_py.algorithms.sparsification.reports import (
 )
 from maplab_py.algorithms.sparsification.scores import landmark_scores, landmark_weights
 from maplab_py.array_types import I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
@@ -108,7 +109,7 @@ def coverage_problem(
     row[landmarks] = np.arange(len(landmarks))
     observed = row[vi_map.keypoints.landmark[vi_map.observations]]
     vertex = vi_map.keypoint_vertex[vi_map.observations[observed >= 0]].astype(np.int64)
-    pairs = np.unique(vertex * len(landmarks) + observed[observed >= 0])
+    pairs = distinct(vertex * len(landmarks) + observed[observed >= 0])
     vertices, keyframe = np.unique(pairs // len(landmarks), return_inverse=True)
     keyframe = keyframe.reshape(-1)
     landmark = pairs % len(landmarks)

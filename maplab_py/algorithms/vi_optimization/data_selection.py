@@ -11,6 +11,7 @@ from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.vi_optimization.options import DataOptions, RobustnessOptions
 from maplab_py.algorithms.vi_optimization.thinning import LeftOut, thinned
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import Observations
@@ -62,7 +63,7 @@ def select(vi_map: VIMap, options: DataOptions, missions: NDArray[np.integer] | 
     per_frame = np.bincount(frame, minlength=len(vi_map.frames))
     rich = (per_frame >= options.min_landmarks_per_frame) & vi_map.frames.is_valid
     keypoints, left_out = thinned(vi_map, keypoints[rich[frame]], options)
-    landmarks = np.unique(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
+    landmarks = distinct(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
     return Selection(vertices, landmarks, row_of_vertex, keypoints, left_out)
 
 
@@ -74,7 +75,7 @@ def _of_type(vi_map: VIMap, feature_type: int) -> Mask:
     """
     of_type = vi_map.landmarks.feature_type == feature_type
     if not of_type.any():
-        types = np.unique(vi_map.landmarks.feature_type).tolist()
+        types = distinct(vi_map.landmarks.feature_type).tolist()
         names = ", ".join(type_name(other) for other in types)
         raise UserError(
             f"--ba_feature_type={type_name(feature_type)}: the map has no landmarks of that type"
@@ -109,7 +110,7 @@ def check_metric(vi_map: VIMap, selection: Selection, options: DataOptions) -> N
     """
     if not options.include_inertial:
         return
-    for mission in np.unique(vi_map.vertices.mission[selection.vertices]).tolist():
+    for mission in distinct(vi_map.vertices.mission[selection.vertices]).tolist():
         if not is_metric(vi_map, mission):
             raise UserError(
                 f"mission {to_hex(vi_map.missions.id[mission])}: its scale and gravity are arbitrary, so "

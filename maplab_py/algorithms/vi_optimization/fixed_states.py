@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import I64
+from maplab_py.distinct import distinct
 from maplab_py.estimation.problem import gauge
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
@@ -22,12 +23,12 @@ def hold_unconstrained(problem: Problem, states: States) -> I64:
     num_vertices = len(states.T_G_I)
     touched = np.zeros(problem.num_nodes, dtype=np.bool_)
     if problem.visual is not None:
-        seeing = np.unique(_observing(problem))
+        seeing = distinct(_observing(problem))
         touched[NODES_PER_VERTEX * seeing + POSITION] = True
         touched[NODES_PER_VERTEX * seeing + ORIENTATION] = True
         if problem.visual.estimates_cameras:
             data = problem.visual.observations
-            used = np.unique(data.camera[data.inverse_sigma > 0.0])
+            used = distinct(data.camera[data.inverse_sigma > 0.0])
             touched[camera_nodes(states)[used]] = True
     for term in problem.factors:
         touched[term.nodes.reshape(-1)] = True
@@ -68,9 +69,9 @@ def fix_gauge(
         anchored |= _labels_of(labels, problem, PosePrior)
     has_prior = problem.visual is not None and problem.visual.has_landmark_prior
     if has_fixed_landmarks or has_prior:
-        anchored |= set(np.unique(labels[_observing(problem)]).tolist())
+        anchored |= set(distinct(labels[_observing(problem)]).tolist())
     if fixed_vertices is not None:
-        anchored |= set(np.unique(labels[fixed_vertices]).tolist())
+        anchored |= set(distinct(labels[fixed_vertices]).tolist())
     inertial = _labels_of(labels, problem, InertialTerm) if has_inertial else set()
     scaled = _labels_with_scale(labels, problem) | _labels_of_rigs(labels, problem)
     counts = {"position and heading": 0, "pose": 0, "pose and scale": 0, "nothing": 0}

@@ -17,6 +17,7 @@ from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.array_types import I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import excerpt
@@ -59,7 +60,7 @@ def optimize_around(
     is_new = np.zeros(len(vi_map.vertices), dtype=np.bool_)
     is_new[vertices] = True
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe][vi_map.vertices.mission]
-    missions = np.unique(vi_map.vertices.mission[vertices])
+    missions = distinct(vi_map.vertices.mission[vertices])
     usable = is_known | np.isin(vi_map.vertices.mission, missions)
     is_free = is_new | _most_shared(vi_map, is_new, usable & ~is_new, max_free)
     is_fixed = _most_shared(vi_map, is_free, usable & ~is_free, max_fixed)

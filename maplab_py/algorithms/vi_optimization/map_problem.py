@@ -43,6 +43,7 @@ from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
 from maplab_py.algorithms.vi_optimization.options import FixedStates, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
 from maplab_py.array_types import I64
+from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.codegen.kernels import visual_kernels
 from maplab_py.estimation.imu.angular_velocity import angular_velocity_at_vertices
@@ -203,7 +204,7 @@ def _visual(
     """
     if not len(selection.keypoints):
         return None, None, None, states
-    used_missions = np.unique(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
+    used_missions = distinct(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
     rig = rig_cameras(vi_map, used_missions)
     data, sigma_px = observations(vi_map, selection, options, rig.first_of_mission)
     calibrating, line_delays = is_calibrating(options), not options.fix_ncamera_line_delay

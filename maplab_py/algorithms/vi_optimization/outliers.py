@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.options import RobustnessOptions
 from maplab_py.array_types import F64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 
@@ -45,7 +46,7 @@ class OutlierRejection:
     def doubtful_landmarks(self) -> NDArray[np.int64]:
         """Return the landmarks with rejected observations."""
         data = self._visual.observations
-        return np.unique(data.landmark[~self.is_used])
+        return distinct(data.landmark[~self.is_used])
 
     def restart(self) -> None:
         """Activate every observation again."""

@@ -12,6 +12,7 @@ from maplab_py.algorithms.vi_optimization.reports import (
     VIOptimizationReport,
 )
 from maplab_py.array_types import F64, I64
+from maplab_py.distinct import distinct
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverSummary
 from maplab_py.estimation.states import NODE_NAMES, NODES_PER_VERTEX, States
@@ -125,7 +126,7 @@ def _mean_median(errors: F64) -> tuple[list[float], list[float]]:
 
 def _by_mission(vi_map: VIMap, errors: F64, missions: I64) -> list[MissionReprojection]:
     rows = []
-    for mission in np.unique(missions).tolist():
+    for mission in distinct(missions).tolist():
         mission_errors = errors[missions == mission]
         mean, median = _mean_median(mission_errors)
         name = to_hex(vi_map.missions.id[mission])

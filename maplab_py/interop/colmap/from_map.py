@@ -8,6 +8,7 @@ import re
 import numpy as np
 
 from maplab_py.array_types import F64, I64
+from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap.camera_models import colmap_camera
@@ -202,7 +203,7 @@ def _exported_landmarks(vi_map: VIMap, keypoints: I64, quality: str) -> tuple[I6
     observed = landmark >= 0
     observed[observed] = wanted[landmark[observed]]
     point = np.where(observed, landmark + 1, NO_POINT)
-    return np.unique(landmark[observed]), point
+    return distinct(landmark[observed]), point
 
 
 def _errors(

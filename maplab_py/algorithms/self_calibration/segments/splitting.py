@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import I64, Mask
+from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import no_blocks
 from maplab_py.vimap.selection import keep_rows, renumbering
@@ -72,7 +73,7 @@ def _with_tracks_only(vi_map: VIMap, is_kept: Mask) -> VIMap:
     inside = np.flatnonzero((landmark >= 0) & is_kept[vi_map.keypoint_vertex])
     pair = landmark[inside].astype(np.int64) * len(vi_map.vertices) + vi_map.keypoint_vertex[inside]
     observers = np.bincount(
-        np.unique(pair) // max(len(vi_map.vertices), 1), minlength=len(vi_map.landmarks)
+        distinct(pair) // max(len(vi_map.vertices), 1), minlength=len(vi_map.landmarks)
     )
     used = np.flatnonzero(observers >= 2)
     new_row = renumbering(len(vi_map.landmarks), used)
