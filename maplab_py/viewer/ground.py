@@ -14,6 +14,8 @@ from maplab_py.viewer.scene import Extent, Segments
 _SECTION_CELLS = 5
 _STEP_CELLS = (1, 2, 5, 10, 20, 50)
 _MAX_INTERVALS = 7
+_CORNER = 0.3
+"""Coordinates along x and y that are closer than this part of their distance share a label."""
 _BAR_COLOUR = colours.from_hex("#6b7280")[0]
 
 
@@ -88,7 +90,11 @@ def _axis_labels(low: F64, high: F64, origin_G: F64, step: float) -> tuple[list[
         for value in (step * np.arange(first, last + 1.0)).tolist():
             place = low.copy()
             place[axis] = value - origin_G[axis]
-            labels.append(f"{name} {value + 0.0:g}")  # no "-0"
+            label = f"{name} {value + 0.0:g}"  # no "-0"
+            if places and np.linalg.norm(places[0] - place) < _CORNER * step and name == "y":
+                labels[0] += f", {label}"
+                continue
+            labels.append(label)
             places.append(place)
     if high[2] > low[2]:
         labels.append(f"z {high[2] + origin_G[2]:.1f}")

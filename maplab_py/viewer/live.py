@@ -8,10 +8,11 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.end_labels import PATH_ENDS
 from maplab_py.viewer.scene import Layer, Part, Points, Scene, Segments
 from maplab_py.vimap import VIMap
 
-_VERTEX_LAYERS = ("vertices", "path_ends")
+_VERTEX_LAYERS = ("vertices", PATH_ENDS)
 _PATH_LAYERS = ("trajectories",)
 _LANDMARK_LAYERS = ("landmarks", "bad_landmarks")
 

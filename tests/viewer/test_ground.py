@@ -46,6 +46,12 @@ def test_the_bar_is_as_long_as_it_says() -> None:
     assert ground.axes.ends[:, 0].min() >= -ground.cell_m
 
 
+def test_coordinates_at_a_corner_share_a_label() -> None:
+    ground = make_ground(_extent(np.zeros(3), np.array([60.0, 60.0, 3.0])), np.zeros(3))
+    assert ground.labels[0] == "x 0, y 0"
+    assert "y 0" not in ground.labels
+
+
 def test_a_map_without_height_has_no_upright_label() -> None:
     ground = make_ground(_extent(np.zeros(3), np.array([1.0, 0.0, 0.0])), np.zeros(3))
     assert not any(label.startswith("z") for label in ground.labels)

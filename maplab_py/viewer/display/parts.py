@@ -14,6 +14,7 @@ import viser
 from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.viewer.colours import linear_light
 from maplab_py.viewer.drawing import axis_lines
+from maplab_py.viewer.end_labels import with_end_labels
 from maplab_py.viewer.glb import coloured_glb, is_coloured
 from maplab_py.viewer.ground import Ground
 from maplab_py.viewer.scene import (
@@ -63,6 +64,7 @@ class Nodes:
             layers: Names of visible layers.
             missions: Ids of visible missions.
         """
+        scene = with_end_labels(scene, missions)
         wanted = {
             (layer.name, mission_id): part
             for layer in scene.layers
@@ -79,7 +81,7 @@ class Nodes:
                 if before is not None and is_same_part(before.part, part):
                     continue
                 sent += 1
-                if before is None or not _moved_in_place(before, part):
+                if before is None or not _moved_in_place(self._server, key, before, part):
                     if before is not None:
                         self._remove(key)
                     self._nodes[key] = _Node(part, self._add(_node_name(*key), part))
@@ -203,12 +205,13 @@ def _add_axes(server: viser.ViserServer, name: str, part: Axes) -> list[Any]:
 def _add_labels(
     server: viser.ViserServer, name: str, labels: tuple[str, ...], p: F64 | F32
 ) -> list[Any]:
-    """Write labels at the first of some points (N, 3)."""
+    """Write labels at the first of some points (N, 3); an empty one is not written."""
     return [
         server.scene.add_label(
             f"/labels{name}/{row}", label, position=p[row].astype(np.float64), font_screen_scale=0.8
         )
         for row, label in enumerate(labels)
+        if label
     ]
 
 
@@ -227,23 +230,24 @@ def _line_colours(colours: U8) -> U8:
     return np.repeat(linear[:, None], 2, axis=1)
 
 
-def _moved_in_place(node: _Node, part: Part) -> bool:
-    """Give a node new positions and colours where it can keep its shape."""
+def _moved_in_place(server: viser.ViserServer, key: _NodeKey, node: _Node, part: Part) -> bool:
+    """Give a node new positions, colours and labels where it can keep its shape."""
     before = node.part
     if not node.handles or len(before) != len(part):
         return False
-    if (
-        isinstance(before, Points)
-        and isinstance(part, Points)
-        and (before.size_m, before.labels) == (part.size_m, part.labels)
-    ):
+    if isinstance(before, Points) and isinstance(part, Points) and before.size_m == part.size_m:
         order = _shuffled(len(part))
         if not np.array_equal(before.p, part.p):
             node.handles[0].points = part.p[order]
-            for label, p in zip(node.handles[1:], part.p, strict=False):
+            labelled = [row for row, label in enumerate(before.labels) if label]
+            for label, p in zip(node.handles[1:], part.p[labelled], strict=True):
                 label.position = p.astype(np.float64)
         if not np.array_equal(before.colours, part.colours):
             node.handles[0].colors = part.colours[order]
+        if before.labels != part.labels:
+            for label in node.handles[1:]:
+                label.remove()
+            node.handles[1:] = _add_labels(server, _node_name(*key), part.labels, part.p)
     elif (
         isinstance(before, Segments)
         and isinstance(part, Segments)

@@ -112,7 +112,7 @@ def _names(drawing: Drawing, p_other: F64, names: tuple[str, str]) -> Layer:
     middles = [
         0.5 * (np.nanmin(p, axis=0) + np.nanmax(p, axis=0)) for p in (drawing.p_vertices, p_other)
     ]
-    top = np.array([0.0, 0.0, 0.15 * drawing.extent.radius_m])
+    top = np.array([0.0, 0.0, 0.45 * drawing.extent.radius_m])
     size = 0.002 * drawing.unit_m
     dots = make_points(np.array(middles) + top, colours.REFERENCE, np.arange(2), size)
     parts: dict[str, Part] = {WHOLE_MAP: dataclasses.replace(dots, labels=names)}

@@ -9,6 +9,7 @@ import numpy as np
 from maplab_py.array_types import I32
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, axis_lines, make_points, make_segments
+from maplab_py.viewer.end_labels import PATH_ENDS
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, Part
 from maplab_py.vimap import TransformationKind
 
@@ -60,7 +61,7 @@ def path_ends(drawing: Drawing) -> Layer:
             if is_closed:
                 labels = (f"start and end{name}",)
         parts[drawing.mission_ids[mission]] = dataclasses.replace(dots, labels=labels)
-    return Layer("path_ends", "Start and end", parts, 2 * len(has_vertices), Entity.VERTEX)
+    return Layer(PATH_ENDS, "Start and end", parts, 2 * len(has_vertices), Entity.VERTEX)
 
 
 def imu_edges(drawing: Drawing) -> Layer:
