@@ -22,6 +22,9 @@ from maplab_py.viewer.scene import MissionEntry, Scene
 MAX_SWITCHES = 24
 """Beyond this many missions the panel offers a list instead of a switch each."""
 
+MAX_LAYERS = 9
+"""Of more layers, those that are hidden at first are in a folder that is closed at first."""
+
 _ALL = "all missions"
 _HINT = "Click a vertex, a landmark or a loop closure."
 
@@ -74,6 +77,10 @@ class Panel:
         self._signature: tuple[Any, ...] = ()
         self.header = self._gui.add_html("", order=0)
         self._layers = self._gui.add_folder("Layers", order=1)
+        with self._layers:
+            self._more_layers = self._gui.add_folder(
+                "more layers", order=1e9, expand_by_default=False, visible=False
+            )
         self._missions = self._gui.add_folder("Missions", order=2)
         with self._gui.add_folder("Colours", order=3):
             self.colouring: Any = self._gui.add_dropdown("landmarks by", COLOURINGS)
@@ -180,13 +187,18 @@ class Panel:
         for box in self._checkboxes.values():
             box.remove()
         self._checkboxes = {}
-        with self._layers:
-            for layer in scene.layers:
+        has_many = len(scene.layers) > MAX_LAYERS
+        for layer in scene.layers:
+            is_extra = has_many and not layer.is_visible
+            with self._more_layers if is_extra else self._layers:
                 box = self._gui.add_checkbox(
                     text.layer_label(layer), layer.name in layers, hint=text.layer_hint(layer)
                 )
-                self._bind(box, self._layer_action(layer.name))
-                self._checkboxes[layer.name] = box
+            self._bind(box, self._layer_action(layer.name))
+            self._checkboxes[layer.name] = box
+        has_extra = has_many and not all(layer.is_visible for layer in scene.layers)
+        if self._more_layers.visible != has_extra:
+            self._more_layers.visible = has_extra
 
     def _layer_action(self, name: str) -> Callable[[Any], None]:
         return lambda event: self._actions.set_layer(name, event.target.value)

@@ -72,7 +72,7 @@ def start_server(port: int) -> viser.ViserServer:
 def _restricted_serve() -> Any:
     """Return the function that opens the socket, restricted to connections of the viewer's pages.
 
-    The page that it serves carries the script `page.js`.
+    The page that it serves carries the script `page.js` and the style `page.css`.
     """
     serve = websockets.asyncio.server.serve
 
@@ -89,13 +89,23 @@ def _restricted_serve() -> Any:
 @functools.cache
 def page_script() -> str:
     """Return the script that the page runs beside viser's."""
-    code = resources.files("maplab_py.viewer.display").joinpath("page.js").read_text("utf-8")
-    return f"<script>{code}</script>"
+    return f"<script>{_display_file('page.js')}</script>"
+
+
+@functools.cache
+def page_style() -> str:
+    """Return the style that the page has beside viser's."""
+    return f"<style>{_display_file('page.css')}</style>"
+
+
+def _display_file(name: str) -> str:
+    return resources.files("maplab_py.viewer.display").joinpath(name).read_text("utf-8")
 
 
 def with_page_script(process_request: Any) -> Any:
-    """Return a server of files that adds our script to the page; all else is passed on."""
+    """Return a server of files that adds our script and style to the page; all else is passed on."""
     pages: dict[bytes, bytes] = {}
+    head = f"<head>{page_style()}{page_script()}".encode()
 
     def process(connection: Any, request: Any) -> Any:
         response = process_request(connection, request)
@@ -104,7 +114,7 @@ def with_page_script(process_request: Any) -> Any:
         if response.body not in pages:
             is_packed = response.headers.get("Content-Encoding") == "gzip"
             page = gzip.decompress(response.body) if is_packed else response.body
-            page = page.replace(b"<head>", b"<head>" + page_script().encode(), 1)
+            page = page.replace(b"<head>", head, 1)
             pages[response.body] = gzip.compress(page) if is_packed else page
         response.body = pages[response.body]
         del response.headers["Content-Length"]
