@@ -112,7 +112,10 @@ def sent_bytes(viewer: Viewer) -> int:
 
 
 def frame_rate(landmarks: int, seconds: float = 10.0) -> dict[str, float]:
-    """Return the frames a second while the view is turned with the mouse, all landmarks drawn."""
+    """Return the frames a second while the view is turned with the mouse, and their cost.
+
+    All landmarks are drawn while the view rests.
+    """
     options = VisualizationOptions(max_points=landmarks)
     subject = Subject(big_map(2_000, landmarks, 3 * landmarks), "turned", options)
     counter = "() => window.__viserTestpoints.rendererInfo.render.frame"
@@ -125,14 +128,18 @@ def frame_rate(landmarks: int, seconds: float = 10.0) -> dict[str, float]:
         page.page.mouse.move(300.0, 400.0)
         page.page.mouse.down()
         before, began = page.page.evaluate(counter), time.perf_counter()
+        cpu = descendants_cpu_s()
         step = 0
         while time.perf_counter() - began < seconds:
             step += 1
             page.page.mouse.move(300.0 + 4.0 * (step % 60), 400.0)
         frames = page.page.evaluate(counter) - before
-        took = time.perf_counter() - began
+        took, cpu = time.perf_counter() - began, descendants_cpu_s() - cpu
         viewer.stop()
-    return {"landmarks": landmarks, "frames_per_s": frames / took}
+    return {
+        "landmarks": landmarks, "frames_per_s": frames / took, "cpu_ms_per_frame": 1e3 * cpu / frames,
+        "load": os.getloadavg()[0],
+    }  # fmt: skip
 
 
 def picking(subject: Subject) -> float:

@@ -82,6 +82,8 @@ def causes(landmarks: int) -> dict[str, tuple[list[str], float, float, str, floa
         "half the pixel ratio": ([], 1.0, 1.0, "circle", 0.5),
         "while the camera moves": (["grid"], 0.2, 1.0, "circle", 0.5),
         "while it moves, 10,000 points": (["grid"], few, 1.0, "circle", 0.5),
+        "the same without lines": (["grid", "lines"], few, 1.0, "circle", 0.5),
+        "the same without points": (["grid", "points"], few, 1.0, "circle", 0.5),
         "everything again": ([], 1.0, 1.0, "circle", 1.0),
     }
 

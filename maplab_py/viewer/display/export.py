@@ -8,6 +8,7 @@ from typing import Any
 from maplab_py.output_files import write_text
 from maplab_py.viewer.display import text
 from maplab_py.viewer.display.camera import aim_initially
+from maplab_py.viewer.display.server import page_script
 from maplab_py.viewer.scene import Scene
 
 _OVERLAY = """
@@ -58,6 +59,6 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
         legend=text.legend(dict.fromkeys(entries)),
     )
     end = page.rindex("</body>")
-    page = f"{page[:end]}{overlay}{_SCRIPT}{page[end:]}"
+    page = f"{page[:end]}{overlay}{_SCRIPT}{page_script()}{page[end:]}"
     write_text(path, [page], overwrite=True)
     return len(page.encode())

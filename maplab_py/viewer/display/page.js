@@ -1,14 +1,20 @@
 // Keeps the view fluent where drawing is slow: while the camera moves, fewer points are drawn with
-// fewer pixels and without the grid; the full picture is drawn again as soon as it rests.
+// fewer pixels, without the grid, and with thin lines; the full picture is drawn again as soon as it
+// rests. Where a program draws instead of a GPU this begins with the first movement, elsewhere once
+// frames are slow.
 // Points arrive in a shuffled order, so that the first ones of a cloud are spread over all of it.
 (() => {
   const SLOW_MS = 40; // a page that needs longer for a frame draws less
   const FAST_MS = 25;
-  const REST_MS = 500;
+  const REST_MS = 300;
+  const STARTING_MS = 1500;
   const FEWEST_POINTS = 10000;
+  const LARGEST_FACTOR = 2; // on the size of the points that stand for all
   const SMALL_CLOUD = 2000; // drawn as it is
+  const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
   let budget = Infinity; // points that are drawn while the camera moves
   let isReduced = false;
+  let isSoftware = null; // not known yet
   let pixelRatio = 1;
   let meanMs = 0.5 * SLOW_MS;
   let lastPose = "";
@@ -24,39 +30,136 @@
     });
     return found && found.getState();
   };
+  const drawsInSoftware = () => {
+    if (isSoftware === null && store()) {
+      const context = store().gl.getContext();
+      const info = context.getExtension("WEBGL_debug_renderer_info");
+      const name = context.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : context.RENDERER);
+      isSoftware = SOFTWARE.test(name);
+    }
+    return Boolean(isSoftware);
+  };
   const clouds = () => {
     const found = [];
     window.__viserMutable.scene.traverse((node) => {
       const position = node.isPoints && node.geometry.attributes.position;
-      if (position && position.count > SMALL_CLOUD) found.push([node.geometry, position.count]);
+      if (position && position.count > SMALL_CLOUD) found.push([node, position.count]);
     });
     return found;
+  };
+  // draws the first points of a cloud alone, larger, so that they cover nearly what all of them do
+  const drawPart = (cloud, count, part) => {
+    const scale = cloud.material.uniforms && cloud.material.uniforms.scale;
+    const factor = Math.min(LARGEST_FACTOR, Math.sqrt(1 / part));
+    cloud.geometry.setDrawRange(0, part < 1 ? Math.ceil(part * count) : Infinity);
+    cloud.onBeforeRender = part < 1 && scale ? () => (scale.value *= factor) : () => {};
+    cloud.onAfterRender = part < 1 && scale ? () => (scale.value /= factor) : () => {};
   };
   const setGround = (isVisible) => {
     const ground = window.__viserMutable.nodeRefFromName["/ground"];
     if (ground) ground.traverse((node) => (isVisible ? node.layers.enable(0) : node.layers.disable(0)));
   };
 
+  // Wide lines are instances of a small mesh, which software draws one after the other: 2000 of them
+  // take longer than 50,000 points. Lines of one pixel, at half the pixel ratio, look nearly alike.
+  const parent = (class_) => Object.getPrototypeOf(class_);
+  const makeThinLines = (wide) => {
+    const { instanceStart, instanceColorStart, position } = wide.geometry.attributes;
+    const Geometry = parent(parent(wide.geometry.constructor));
+    const Material = parent(wide.material.constructor);
+    const Mesh = parent(wide.constructor);
+    const geometry = new Geometry();
+    const set = (name, source) =>
+      geometry.setAttribute(name, new position.constructor(source.data.array, 3));
+    set("position", instanceStart);
+    if (instanceColorStart) set("color", instanceColorStart);
+    const material = new Material({
+      vertexColors: Boolean(instanceColorStart),
+      uniforms: { plain: { value: wide.material.color } },
+      vertexShader: `
+        uniform vec3 plain;
+        varying vec3 lineColor;
+        void main() {
+          lineColor = plain;
+          #ifdef USE_COLOR
+            lineColor *= color;
+          #endif
+          gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+        }`,
+      fragmentShader: `
+        varying vec3 lineColor;
+        void main() {
+          gl_FragColor = vec4(lineColor, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+    const thin = new Mesh(geometry, material);
+    Object.assign(thin, { isMesh: false, isLine: true, isLineSegments: true, frustumCulled: false });
+    thin.raycast = () => {};
+    thin.isThin = true;
+    thin.source = instanceStart;
+    return thin;
+  };
+  const release = (thin) => {
+    thin.removeFromParent();
+    thin.geometry.dispose();
+    thin.material.dispose();
+  };
+  const thinLines = () => {
+    const wide = [];
+    window.__viserMutable.scene.traverse((node) => {
+      if (node.isLineSegments2) wide.push(node);
+    });
+    wide.forEach((node) => {
+      const source = node.geometry.attributes.instanceStart;
+      let thin = node.children.find((child) => child.isThin);
+      if (thin && thin.source !== source) {
+        release(thin);
+        thin = undefined;
+      }
+      if (!source) return;
+      if (!thin) {
+        thin = makeThinLines(node);
+        node.add(thin);
+        node.geometry.addEventListener("dispose", () => release(thin));
+      }
+      thin.visible = true;
+      node.layers.disable(0);
+    });
+  };
+  const widenLines = () => {
+    window.__viserMutable.scene.traverse((node) => {
+      if (node.isLineSegments2) node.layers.enable(0);
+      if (node.isThin) node.visible = false;
+    });
+  };
+
   const reduce = () => {
     const all = clouds();
     const total = all.reduce((sum, [, count]) => sum + count, 0);
-    if (budget === Infinity) budget = Math.max(FEWEST_POINTS, 0.2 * total);
+    if (budget === Infinity) budget = Math.max(FEWEST_POINTS, (drawsInSoftware() ? 0.1 : 0.2) * total);
     const part = Math.min(1, budget / Math.max(total, 1));
-    all.forEach(([geometry, count]) => geometry.setDrawRange(0, Math.ceil(part * count)));
-    if (isReduced) return;
-    isReduced = true;
+    all.forEach(([cloud, count]) => drawPart(cloud, count, part));
     const state = store();
     if (!state) return;
+    if (isReduced) {
+      // viser changes the ratio of slow pages
+      if (state.gl.getPixelRatio() !== 0.5 * pixelRatio) state.setDpr(0.5 * pixelRatio);
+      return;
+    }
+    isReduced = true;
     pixelRatio = state.gl.getPixelRatio();
     state.setDpr(0.5 * pixelRatio);
     setGround(false);
+    thinLines();
   };
   const restore = () => {
     isReduced = false;
-    clouds().forEach(([geometry]) => geometry.setDrawRange(0, Infinity));
+    clouds().forEach(([cloud, count]) => drawPart(cloud, count, 1));
     const state = store();
     if (state) state.setDpr(pixelRatio);
     setGround(true);
+    widenLines();
     window.__viserMutable.requestRender();
   };
 
@@ -101,12 +204,25 @@
     requestAnimationFrame(watch);
   };
 
-  setInterval(() => {
-    if (isWatching || !hasMoved()) return;
+  const begin = () => {
+    if (isWatching) return;
     isWatching = true;
     lastMove = performance.now();
     lastFrame = -1;
-    if (budget < Infinity) reduce();
+    if (budget < Infinity || drawsInSoftware()) reduce();
     requestAnimationFrame(watch);
+  };
+  let readyAt = Infinity; // the camera is aimed while the first picture is made
+  setInterval(() => {
+    if (isWatching || !hasMoved()) return;
+    if (readyAt === Infinity) readyAt = performance.now() + STARTING_MS;
+    if (performance.now() > readyAt) begin();
   }, 50);
+  // where drawing is slow, the first frame of a movement shall not be a full one
+  const expectMovement = (event) => {
+    const isTurning = event.type === "wheel" || (event.type === "pointermove" && event.buttons);
+    if (isTurning && event.target.tagName === "CANVAS" && drawsInSoftware()) begin();
+  };
+  window.addEventListener("pointermove", expectMovement, { capture: true, passive: true });
+  window.addEventListener("wheel", expectMovement, { capture: true, passive: true });
 })();

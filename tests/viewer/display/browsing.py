@@ -65,10 +65,10 @@ class Page:
         frame_ms: int = 120,
         script: str = "",
     ) -> None:
-        """Open a page that draws at most every `frame_ms` and runs a script of ours first."""
+        """Open a page that draws at most every `frame_ms`, 0 = as it will, and runs a script first."""
         self.page = browser.new_page(viewport={"width": size_px[0], "height": size_px[1]})
         self.page.set_default_timeout(120_000)
-        self.page.add_init_script(_LAZY % frame_ms + script)
+        self.page.add_init_script((_LAZY % frame_ms if frame_ms else "") + script)
         self.requests: list[str] = []
         self.errors: list[str] = []
         self._nudges = 0

@@ -37,6 +37,18 @@ def browser() -> Iterator[Any]:
         yield started
 
 
+def _width_px(page: Page, *, turned: bool = False) -> int:
+    """Return the width of the picture, after a movement of the mouse if it is to be turned."""
+    if turned:
+        page.page.mouse.move(300.0, 400.0)
+        page.page.mouse.move(320.0, 400.0)
+    return int(
+        page.page.evaluate(
+            "Math.max(...[...document.querySelectorAll('canvas')].map(c => c.width))"
+        )
+    )
+
+
 def test_a_view_opens_from_a_file(browser: Any, tmp_path: Path) -> None:
     viewer = Viewer(0)
     viewer.show(SUBJECT)
@@ -57,8 +69,37 @@ def test_a_view_opens_from_a_file(browser: Any, tmp_path: Path) -> None:
     hidden = page.still_picture()
     page.click(page.page.locator("input[data-layer=frusta]"))  # not visible when it was written
     assert page.wait_until(lambda: not np.array_equal(page.picture(), hidden), 60.0)
+
+    whole = _width_px(page)  # of the picture at rest; it has fewer pixels while it is turned
+    page.page.mouse.move(300.0, 400.0)
+    page.page.mouse.down()
+    assert page.wait_until(lambda: _width_px(page, turned=True) < 0.6 * whole, 60.0)
+    page.page.mouse.up()
+    assert page.wait_until(lambda: _width_px(page) == whole, 60.0)
     assert page.errors == []
     page.page.close()
+
+
+_OVERFLOWING = """[...document.querySelectorAll(".mantine-ScrollArea-viewport")]
+  .filter((area) => area.scrollHeight > area.clientHeight).length"""
+
+
+def test_the_panel_of_many_layers_needs_no_scrolling(browser: Any) -> None:
+    viewer = Viewer(0)
+    subject = SUBJECT.replace(other=MAP.replace(), side_by_side=True)
+    scene = viewer.show(subject)
+    assert len(scene.layers) == 13
+    page = Page(browser, viewer.url, (1280, 720))
+    assert page.wait_until(lambda: page.page.get_by_text("more layers").count() == 1)
+    page.settle(2000)
+    assert page.page.evaluate(_OVERFLOWING) == 0
+    assert not page.checkbox("Cameras 14").is_visible()
+    page.click(page.page.get_by_text("more layers"))
+    assert page.wait_until(lambda: page.checkbox("Cameras 14").is_visible())
+    page.click(page.checkbox("Cameras 14"))
+    assert page.wait_until(lambda: "frusta" in viewer.visible_layers)
+    page.page.close()
+    viewer.stop()
 
 
 def test_pictures_are_saved_with_and_without_a_page(browser: Any, tmp_path: Path) -> None:
