@@ -6,11 +6,12 @@ also after a crash, sees either the old or the new content, never a part. A writ
 that holds the lock.
 """
 
-from maplab_py.atomic.files import PendingFile, replaced_file, write_file
+from maplab_py.atomic.files import PendingFile, link_or_copy, replaced_file, write_file
 from maplab_py.atomic.folders import move_folder, recover, replaced_folder
 
 __all__ = [
     "PendingFile",
+    "link_or_copy",
     "move_folder",
     "recover",
     "replaced_file",

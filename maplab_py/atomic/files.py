@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import stat
 import threading
 import time
@@ -117,6 +118,20 @@ def write_file(path: Path, chunks: Iterable[bytes], *, durable: bool = True) -> 
     """Write a file from pieces; see `replaced_file`."""
     with replaced_file(path, durable=durable) as stream:
         stream.writelines(chunks)
+
+
+def link_or_copy(source: str | Path, target: str | Path) -> None:
+    """Give a file a second name; copy it where the file system refuses links.
+
+    For files that are only ever replaced: a write into one would show under both names.
+
+    Raises:
+        OSError: It cannot be copied either.
+    """
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 @contextlib.contextmanager

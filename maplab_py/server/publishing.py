@@ -1,18 +1,21 @@
-"""The published map: replaced as a whole after every change, with copies kept now and then."""
+"""The published map: replaced as a whole after every change, with copies kept now and then.
+
+Only files that have changed are written; the others are linked from the folder that is replaced.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import time
 from pathlib import Path
 
-from maplab_py.atomic import move_folder
+from maplab_py.atomic import link_or_copy, move_folder
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server.options import PublishingOptions
 from maplab_py.storage.native import is_map_folder, save_map
 from maplab_py.storage.resources import copied_to_external, existing_files, in_map_folder
+from maplab_py.storage.written_files import WrittenFiles
 from maplab_py.vimap import VIMap
 
 _BACKUPS = 5
@@ -35,6 +38,7 @@ class Publisher:
         self.duration_s = 0.0
         self._options = options
         self._files: list[tuple[Path, Path]] = []
+        self._written = WrittenFiles()
         self._backup_s = time.monotonic()
         self._is_backed_up = True
 
@@ -59,7 +63,14 @@ class Publisher:
     def publish(self, vi_map: VIMap, *, progress: Progress = SILENT) -> None:
         """Replace the published map; raises UserError where the disk refuses."""
         began = time.monotonic()
-        save_map(vi_map, self.folder, force=True, resource_files=self._files, progress=progress)
+        save_map(
+            vi_map,
+            self.folder,
+            force=True,
+            resource_files=self._files,
+            written=self._written,
+            progress=progress,
+        )
         self._files.clear()
         self.published_s = time.monotonic()
         self.duration_s = self.published_s - began
@@ -86,7 +97,7 @@ class Publisher:
         self.backups.mkdir(exist_ok=True)
         copy = self.backups / ".copying"
         shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(self.folder, copy, copy_function=_link_or_copy, symlinks=True)
+        shutil.copytree(self.folder, copy, copy_function=link_or_copy, symlinks=True)
         target = self.backups / time.strftime("%Y%m%d_%H%M%S")
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(target)
@@ -94,11 +105,3 @@ class Publisher:
         for old in sorted(p for p in self.backups.iterdir() if p.name[0] != ".")[:-_BACKUPS]:
             shutil.rmtree(old, ignore_errors=True)
         return target
-
-
-def _link_or_copy(source: str, target: str) -> str:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-    return target

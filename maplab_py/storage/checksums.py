@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from maplab_py.errors import MapError
@@ -18,11 +19,16 @@ _MAX_BYTES = 16_000_000
 """Largest size of the side file: enough for a hundred thousand files."""
 
 
-def write(folder: Path) -> str:
-    """Write the checksums of a map's files, without resources, and return the fingerprint."""
-    listed = listing(folder)
+def write(folder: Path, known: Mapping[str, str] | None = None) -> str:
+    """Write the checksums of a map's files, without resources, and return them (`listing`).
+
+    Args:
+        folder: Map folder.
+        known: Checksums of files (paths in the folder) that need not be read.
+    """
+    listed = listing(folder, known)
     (folder / FILE_NAME).write_text(listed, encoding="utf-8")
-    return fingerprint_of(listed)
+    return listed
 
 
 def fingerprint(folder: Path) -> str:
@@ -47,7 +53,7 @@ def verify(folder: Path, listed: str = "") -> None:
     side_file = folder / FILE_NAME
     if not side_file.is_file():
         return
-    known = {name: digest for digest, _, name in (x.partition("  ") for x in listed.splitlines())}
+    known = digests_of(listed)
     without = "delete it to load without checksums"
     try:
         text = read_text(side_file, _MAX_BYTES, remedy=without, error=MapError)
@@ -68,24 +74,33 @@ def verify(folder: Path, listed: str = "") -> None:
             )
 
 
+def digests_of(listed: str) -> dict[str, str]:
+    """Return the checksums by path in the folder, as they are listed."""
+    return {name: digest for digest, _, name in (x.partition("  ") for x in listed.splitlines())}
+
+
 def fingerprint_of(listed: str) -> str:
     """Return the fingerprint of a map's files whose checksums are listed."""
     return hashlib.sha256(listed.encode()).hexdigest()[:_FINGERPRINT_DIGITS]
 
 
-def listing(folder: Path) -> str:
+def listing(folder: Path, known: Mapping[str, str] | None = None) -> str:
     """Return one line per file of a map, without resources: checksum and path, sorted by path.
+
+    Args:
+        folder: Map folder.
+        known: See `write`.
 
     Raises:
         OSError: A file cannot be read.
     """
     candidates = [folder / METADATA, folder / RESOURCE_INFO, *(folder / VI_MAP_FOLDER).rglob("*")]
     paths = [path for path in sorted(candidates) if path.is_file()]
-    digests = map_in_threads(_digest, paths)
-    return "".join(
-        f"{digest}  {path.relative_to(folder).as_posix()}\n"
-        for digest, path in zip(digests, paths, strict=True)
-    )
+    digests = {path.relative_to(folder).as_posix(): "" for path in paths} | dict(known or {})
+    unread = [name for name, digest in digests.items() if not digest]
+    read = map_in_threads(_digest, [folder / name for name in unread])
+    digests.update(zip(unread, read, strict=True))
+    return "".join(f"{digest}  {name}\n" for name, digest in digests.items())
 
 
 def _digest(path: Path) -> str:

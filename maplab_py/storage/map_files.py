@@ -21,6 +21,7 @@ from maplab_py.storage.message_scan import MemoryBudget
 VI_MAP_FOLDER = "vi_map"
 METADATA = "metadata"
 VI_MAP_METADATA = "vi_map_metadata"
+MISSIONS = "missions"
 SENSORS = "sensors.yaml"
 RESOURCE_INFO = "resource_info"
 COPY_AGAIN = "copy the map again from where it was recorded or saved"

@@ -13,7 +13,7 @@ from pathlib import Path
 from google.protobuf import text_format
 from google.protobuf.message import Message
 
-from maplab_py.atomic import recover, replaced_folder
+from maplab_py.atomic import link_or_copy, recover, replaced_folder
 from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
@@ -24,13 +24,17 @@ from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.descriptor_layout import LayoutChoice, with_layout
 from maplab_py.storage.map_files import (
     METADATA,
+    MISSIONS,
     RESOURCE_INFO,
     SENSORS,
     VI_MAP_FOLDER,
     VI_MAP_METADATA,
+    FileKind,
     is_map_folder,
 )
 from maplab_py.storage.new_resources import copied_files, with_staged_in_place
+from maplab_py.storage.tables_to_messages import Partition
+from maplab_py.storage.written_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap
 
 RESOURCES = "resources"
@@ -58,6 +62,7 @@ def save_map(
     compress: bool = True,
     descriptor_layout: LayoutChoice = "as_loaded",
     resource_files: Sequence[tuple[Path, Path]] = (),
+    written: WrittenFiles | None = None,
     progress: Progress = SILENT,
 ) -> SaveReport:
     """Save a map atomically: the folder always holds the complete old or the complete new map.
@@ -77,6 +82,8 @@ def save_map(
         descriptor_layout: Layout of the descriptors; "as_loaded" writes every frame in the layout
             that it was loaded with and new frames in that of maplab 2.2.
         resource_files: Files that come into the map's own resource folder, with their paths in it.
+        written: What the folder had after its last save, and where it is noted for the next one:
+            files that would not change are taken over, in a partition of its own.
         progress: Shown while writing.
 
     Raises:
@@ -90,11 +97,15 @@ def save_map(
     check_target(folder, overwrite=overwrite, known=known, force=force)
     with copied_files(resources.to_external), replaced_folder(folder) as temporary:
         check_target(folder, overwrite=overwrite, known=known, force=force)
-        files, fingerprint = _write(resources.vi_map, temporary, compress, progress)
+        taken = TakenOver(written, temporary, compress=compress) if written else None
+        files, listed = _write(resources.vi_map, temporary, compress, taken, progress)
         size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
         _keep(folder, temporary)
         _add_resources((*resource_files, *resources.into_map), temporary)
-    return SaveReport(str(folder), files, size / 1e6, fingerprint, time.perf_counter() - began)
+    if taken is not None:
+        taken.finish(folder, listed)
+    seconds = time.perf_counter() - began
+    return SaveReport(str(folder), files, size / 1e6, checksums.fingerprint_of(listed), seconds)
 
 
 def check_target(
@@ -138,15 +149,22 @@ def check_target(
         raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
 
 
-def _write(vi_map: VIMap, folder: Path, compress: bool, progress: Progress) -> tuple[int, str]:
+def _write(
+    vi_map: VIMap, folder: Path, compress: bool, taken: TakenOver | None, progress: Progress
+) -> tuple[int, str]:
+    """Return the number of files and their checksums."""
     inner = folder / VI_MAP_FOLDER
     inner.mkdir()
     listing = pb.VIMapMetadata()
-    for kind, name, message in tables_to_messages.messages(vi_map):
+    _write_message(inner / MISSIONS, tables_to_messages.missions(vi_map), compress)
+    listing.files.add(file_type=FileKind.MISSIONS, path=MISSIONS)
+    partition = taken.partition if taken else Partition()
+    for content in tables_to_messages.contents(vi_map, partition):
         check_cancelled()
         progress.step(len(listing.files), len(vi_map.vertices) // 50 + 4, "write files")
-        _write_message(inner / name, message, compress)
-        listing.files.add(file_type=kind, path=name)
+        if taken is None or not taken.take_over(content, f"{VI_MAP_FOLDER}/{content.name}"):
+            _write_bytes(inner / content.name, content.data(), compress)
+        listing.files.add(file_type=content.kind, path=content.name)
     _write_text(inner / VI_MAP_METADATA, text_format.MessageToString(listing))
     _write_text(inner / SENSORS, write_sensors(vi_map.sensors))
     _write_message(folder / RESOURCE_INFO, tables_to_messages.resource_info(vi_map), compress)
@@ -161,11 +179,14 @@ def _write(vi_map: VIMap, folder: Path, compress: bool, progress: Progress) -> t
     names = mission_names.text_of_names(vi_map)
     if names:
         _write_text(folder / mission_names.FILE_NAME, names)
-    return len(listing.files), checksums.write(folder)
+    return len(listing.files), checksums.write(folder, taken.checksums if taken else None)
 
 
 def _write_message(path: Path, message: Message, compress: bool) -> None:
-    data = message.SerializeToString(deterministic=True)
+    _write_bytes(path, message.SerializeToString(deterministic=True), compress)
+
+
+def _write_bytes(path: Path, data: bytes, compress: bool) -> None:
     path.write_bytes(gzip.compress(data, _GZIP_LEVEL, mtime=0) if compress else data)
 
 
@@ -193,7 +214,7 @@ def _bring(entry: os.DirEntry[str], target: Path) -> None:
         for inner in os.scandir(entry.path):
             _bring(inner, target / inner.name)
     else:
-        _link_or_copy(entry.path, str(target))
+        link_or_copy(entry.path, target)
 
 
 def _add_resources(files: Sequence[tuple[Path, Path]], new: Path) -> None:
@@ -205,12 +226,4 @@ def _add_resources(files: Sequence[tuple[Path, Path]], new: Path) -> None:
         if source.is_symlink():
             target.symlink_to(os.readlink(source))
         else:
-            _link_or_copy(str(source), str(target))
-
-
-def _link_or_copy(source: str, target: str) -> str:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-    return target
+            link_or_copy(source, target)

@@ -110,7 +110,7 @@ def test_a_failed_save_leaves_nothing_behind(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("maplab_py.storage.map_saving._link_or_copy", full)
+        patch.setattr("maplab_py.storage.map_saving.link_or_copy", full)
         with pytest.raises(UserError, match="No space left on device"):
             save_map(vi_map, target)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["temporary"]

@@ -103,8 +103,8 @@ STORAGE = (
     ),
     Fault(
         "switch_variance_not_written",
-        "maplab_py/storage/tables_to_messages.py",
-        "        loop.switch_variable_variance = float(loops.switch_variable_variance[row])\n",
+        "maplab_py/storage/edges_to_messages.py",
+        '        loop.switch_variable_variance = float(columns["loop.switch_variable_variance"][row])\n',
         "",
         _FIELDS,
     ),

@@ -1,0 +1,184 @@
+"""Files that do not change are taken over by the next save of the same folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import functools
+import gzip
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import UserError
+from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.file_contents import FileContent
+from maplab_py.storage.landmark_index import index_to_bytes
+from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.tables_to_messages import Partition, contents
+from maplab_py.storage.written_files import WrittenFiles
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.comparison import is_same
+from maplab_py.vimap.edits import remove_missions
+from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.table import Table
+from tests.vimap.builders import walk_map
+
+
+@functools.cache
+def three_missions() -> VIMap:
+    """Return a map as it is loaded."""
+    vi_map = walk_map(seed=0, first_ns=10**9)
+    for number in (1, 2):
+        other = walk_map(seed=number, first_ns=10**9 * (1 + 100 * number))
+        vi_map, _ = merge_maps(vi_map, other)
+    with tempfile.TemporaryDirectory() as folder:
+        save_map(vi_map, Path(folder) / "map")
+        return load_map(Path(folder) / "map")[0]
+
+
+def moved(vi_map: VIMap, row: int) -> VIMap:
+    """Return the map with one vertex elsewhere."""
+    T_M_I = vi_map.vertices.T_M_I.copy()
+    T_M_I[row, 4] += 0.25
+    return vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I))
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_ino for path in (folder / "vi_map").iterdir()}
+
+
+def changed(before: dict[str, int], after: dict[str, int]) -> set[str]:
+    """Return the files that were written."""
+    return {name for name, inode in after.items() if before.get(name) != inode}
+
+
+def holds(folder: Path, vi_map: VIMap) -> bool:
+    """Tell whether a folder is a sound map with the tables of a map."""
+    loaded = load_map(folder)[0]
+    return all(is_same(getattr(loaded, name), getattr(vi_map, name)) for name in TABLES)
+
+
+TABLES = [f.name for f in dataclasses.fields(VIMap) if isinstance(getattr(VIMap(), f.name), Table)]
+ALWAYS = {"missions", "sensors.yaml", "vi_map_metadata"}
+
+
+def test_only_what_has_changed_is_written(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    first = inodes(target)
+    assert {"vertices0", "vertices1", "vertices2"} < set(first)
+    edited = moved(vi_map, int(vi_map.vertex_start[1]))
+    save_map(edited, target, force=True, written=written)
+    assert changed(first, inodes(target)) == ALWAYS | {"vertices1"}
+    assert holds(target, edited)
+    assert written.reused == len(first) - len(ALWAYS) - 1
+
+
+def test_what_is_taken_over_equals_what_would_be_written(tmp_path: Path) -> None:
+    vi_map, written = three_missions(), WrittenFiles()
+    edited = moved(vi_map, 0)
+    save_map(vi_map, tmp_path / "a", written=written)
+    taken = save_map(edited, tmp_path / "a", force=True, written=written)
+    fresh = save_map(edited, tmp_path / "b", written=WrittenFiles())
+    assert written.reused
+    assert taken.fingerprint == fresh.fingerprint
+
+
+def test_a_mission_that_grows_leaves_the_files_of_others(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    without = remove_missions(vi_map, np.arange(3) == 1)
+    save_map(without, target, written=written)
+    before = inodes(target)
+    save_map(vi_map, target, force=True, written=written)
+    after = inodes(target)
+    assert after["vertices0"] == before["vertices0"]
+    assert after["vertices2"] == before["vertices1"]  # under another name
+
+
+def test_readers_of_an_older_state_keep_theirs(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    older = tmp_path / "older"
+    (older / "vi_map").mkdir(parents=True)
+    for path in target.rglob("*"):
+        if path.is_file():
+            os.link(path, older / path.relative_to(target))
+    for row in range(0, len(vi_map.vertices), 3):
+        save_map(moved(vi_map, row), target, force=True, written=written)
+    assert holds(older, vi_map)
+
+
+def test_where_links_are_refused_files_are_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    edited = moved(vi_map, 0)
+    save_map(vi_map, target, written=written)
+    for value in (edited, vi_map, edited):
+        save_map(value, target, force=True, written=written)
+        assert written.reused
+        assert holds(target, value)
+
+
+def test_a_file_that_another_program_changed_is_written_again(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    first = inodes(target)
+    (target / "vi_map" / "vertices1").write_bytes(b"damaged")
+    (target / "vi_map" / "edges0").unlink()
+    save_map(vi_map, target, force=True, written=written)
+    assert changed(first, inodes(target)) >= {"vertices1"}
+    assert holds(target, vi_map)
+
+
+def test_a_failed_save_forgets_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    edited = moved(vi_map, 0)
+
+    def full(*_: object, **__: object) -> bytes:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gzip, "compress", full)
+        with pytest.raises(UserError, match="No space left"):
+            save_map(edited, target, force=True, written=written)
+    assert holds(target, vi_map)
+    save_map(edited, target, force=True, written=written)
+    assert written.reused
+    assert holds(target, edited)
+
+
+def test_the_partition_of_saves_is_that_of_maplab() -> None:
+    vi_map = three_missions()
+    names = [content.name for content in contents(vi_map, Partition())]
+    assert names == ["vertices0", "edges0", "landmark_index"]
+    assert [len(rows) for rows in Partition(vertices=7).vertex_rows(vi_map)][:-1] == [7] * (
+        (len(vi_map.vertices) - 1) // 7
+    )
+
+
+def test_the_landmark_index_has_the_bytes_of_its_messages() -> None:
+    rng = np.random.default_rng(0)
+    ids = rng.integers(0, 2**64, (400, 2, 2), dtype=np.uint64) >> rng.integers(
+        0, 64, (400, 2, 2), dtype=np.uint64
+    )
+    ids[0] = 0
+    ids[1] = 2**64 - 1
+    message = pb.VIMap()
+    for vertex, landmark in ids.byteswap().tolist():
+        entry = message.landmark_index.add()
+        entry.vertex_id.words.extend(vertex)
+        entry.landmark_id.words.extend(landmark)
+    columns = {"vertex_id": ids[:, 0], "landmark_id": ids[:, 1]}
+    content = FileContent(3, "landmark_index", columns, index_to_bytes)
+    assert content.data() == message.SerializeToString(deterministic=True)
+    assert index_to_bytes({name: values[:0] for name, values in columns.items()}) == b""
