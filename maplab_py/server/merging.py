@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
+from maplab_py.server.open_alignments import OpenAlignments
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import excerpt
@@ -108,10 +110,12 @@ class Merger:
         )
         self._places = PlaceIndex()
         self._stretches: list[Stretch] = []
+        self._open_alignments = OpenAlignments()
 
     def restore(self, vi_map: VIMap, stretches: list[Stretch]) -> None:
         """Continue with a map that has been merged from some submaps."""
         self.vi_map, self._places, self._stretches = vi_map, PlaceIndex(), []
+        self._open_alignments = OpenAlignments()
         for stretch in stretches:
             rows = stretch.vertices(vi_map)
             if len(rows):
@@ -130,8 +134,11 @@ class Merger:
         clock.lap("append")
         stretches = stretches_of(submap)
         rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
-        part = excerpt(whole, self._surroundings(whole, rows, submap))
-        edited, anchored, joint_is_due = self._anchored(part.vi_map, progress)
+        similar, known_stretches = self._similar(submap), [*self._stretches, *stretches]
+        part = excerpt(whole, self._surroundings(whole, rows, similar))
+        searched = [*similar, *range(len(self._stretches), len(known_stretches))]
+        pairs = self._open_alignments.copy()
+        edited, anchored, joint_is_due = self._anchored(part.vi_map, progress, pairs, searched)
         clock.lap("anchor")
         merged, closures_note = 0, ""
         if self._merging.enable_visual_loop_closure and len(part.vertices) > len(rows):
@@ -143,6 +150,10 @@ class Merger:
                 closures_note = str(error)
         whole = part.written_back(edited)
         clock.lap("close loops")
+        waiting = pairs.take(anchored, self._incremental.similar_stretches)
+        whole, others = self._anchored_through(whole, waiting, known_stretches, progress)
+        joint_is_due |= bool(others)
+        clock.lap("anchor others")
         options = dataclasses.replace(self._optimization, num_iterations=_LOCAL_ITERATIONS)
         whole, local = optimize_around(
             whole,
@@ -155,11 +166,11 @@ class Merger:
         clock.lap("optimise")
         if self._merging.spatially_distribute_missions:
             whole, _ = distribute_missions(whole, LayoutOptions())
-        self.vi_map = whole
+        self.vi_map, self._open_alignments = whole, pairs
         for stretch in stretches:
             self._remember(stretch, submap)
         return MergeSteps(
-            anchored,
+            (*anchored, *others),
             merged,
             local.free_vertices,
             local.fixed_vertices,
@@ -208,15 +219,21 @@ class Merger:
         frames = submap.baseframes.replace(is_known=_placed(submap))
         return merge_maps(base, submap.replace(baseframes=frames))[0]
 
-    def _surroundings(self, whole: VIMap, rows: I64, submap: VIMap) -> Mask:
+    def _similar(self, submap: VIMap) -> list[int]:
+        """Return the numbers of the submaps that look most like one."""
+        if not self._merging.enable_visual_loop_closure:
+            return []
+        frequencies = self._places.frequencies(submap)
+        found = self._places.similar(frequencies, self._incremental.similar_stretches)
+        return found.tolist()  # type: ignore[no-any-return]
+
+    def _surroundings(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
         """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
         result = np.zeros(len(whole.vertices), dtype=np.bool_)
         result[rows] = True
         if not self._merging.enable_visual_loop_closure:
             return result
-        frequencies = self._places.frequencies(submap)
-        similar = self._places.similar(frequencies, self._incremental.similar_stretches)
-        for number in similar.tolist():
+        for number in similar:
             result[self._stretches[number].vertices(whole)] = True
         mission = whole.vertices.mission
         known = whole.baseframes.is_known[whole.missions.baseframe]
@@ -226,8 +243,21 @@ class Merger:
             result |= _nearest(whole.T_G_I[:, 4:], rows, known[mission], self._incremental)
         return result
 
-    def _anchored(self, vi_map: VIMap, progress: Progress) -> tuple[VIMap, tuple[str, ...], bool]:
-        """Anchor what can be; also tell whether one of the missions has several submaps."""
+    def _anchored(
+        self,
+        vi_map: VIMap,
+        progress: Progress,
+        pairs: OpenAlignments | None = None,
+        searched: Sequence[int] = (),
+    ) -> tuple[VIMap, tuple[str, ...], bool]:
+        """Anchor what can be; also tell whether one of the missions has several submaps.
+
+        Args:
+            vi_map: The part of the map in which submaps (numbers `searched`) are compared.
+            progress: May cancel.
+            pairs: Gets the pairs of missions that are aligned and not anchored.
+            searched: Their submaps.
+        """
         known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
         is_wanted = self._merging.enable_visual_loop_closure_based_map_anchoring
         if not is_wanted or known.all() or not known.any():
@@ -236,11 +266,38 @@ class Merger:
             result, report = anchor_missions(vi_map, loop_options=self._loops, progress=progress)
         except EstimationError:  # no descriptors or too few tracks: it stays unknown
             return vi_map, (), False
-        ids = [to_hex(words) for words in vi_map.missions.id]
-        names = {id_[:8]: id_ for id_ in ids}
+        names = {id_[:8]: id_ for id_ in map(to_hex, vi_map.missions.id)}
+        if pairs is not None:
+            pairs.note(report, names, searched)
         anchored = tuple(names[name] for name in report.anchored)
         known_stretches = [stretch.mission for stretch in self._stretches]
         return result, anchored, any(known_stretches.count(id_) > 0 for id_ in anchored)
+
+    def _anchored_through(
+        self,
+        whole: VIMap,
+        waiting: Mapping[str, set[int]],
+        stretches: Sequence[Stretch],
+        progress: Progress,
+    ) -> tuple[VIMap, tuple[str, ...]]:
+        """Anchor missions that were aligned before with missions that have just been anchored.
+
+        Args:
+            whole: The map.
+            waiting: The missions, with the numbers of the submaps that showed the alignments.
+            stretches: All submaps by number.
+            progress: May cancel.
+        """
+        if not waiting:
+            return whole, ()
+        searched = sorted(set().union(*waiting.values()))
+        rows = [stretches[number].vertices(whole) for number in searched]
+        missions = whole.mission_index.rows(np.stack([from_hex(id_) for id_ in waiting]))
+        inside = np.isin(whole.vertices.mission, missions)
+        inside[np.concatenate(rows)] = True
+        part = excerpt(whole, inside)
+        edited, anchored, _ = self._anchored(part.vi_map, progress)
+        return (part.written_back(edited) if anchored else whole), anchored
 
     def _with_all_loops(self, vi_map: VIMap, progress: Progress) -> VIMap:
         try:

@@ -28,6 +28,8 @@ class Publisher:
         folder: Folder of the map.
         published_s: When the map was last published [s, monotonic]; None = not yet.
         duration_s: How long that took.
+        files: Number of files of the map.
+        files_taken_over: How many of them were not written again.
     """
 
     def __init__(self, options: PublishingOptions) -> None:
@@ -36,6 +38,7 @@ class Publisher:
         self.backups = self.folder.parent / f"{self.folder.name}_backups"
         self.published_s: float | None = None
         self.duration_s = 0.0
+        self.files = self.files_taken_over = 0
         self._options = options
         self._files: list[tuple[Path, Path]] = []
         self._written = WrittenFiles()
@@ -63,7 +66,7 @@ class Publisher:
     def publish(self, vi_map: VIMap, *, progress: Progress = SILENT) -> None:
         """Replace the published map; raises UserError where the disk refuses."""
         began = time.monotonic()
-        save_map(
+        report = save_map(
             vi_map,
             self.folder,
             force=True,
@@ -71,6 +74,7 @@ class Publisher:
             written=self._written,
             progress=progress,
         )
+        self.files, self.files_taken_over = report.files, self._written.reused
         self._files.clear()
         self.published_s = time.monotonic()
         self.duration_s = self.published_s - began

@@ -1,8 +1,9 @@
 """Processor time per new submap with the size of the map.
 
-Missions of 15 s (31 vertices, up to 100 keypoints each) walk a third of the way round blocks of a
-town; each overlaps some of the others. Joint optimisations are left out. Measured is what the server's loop
-does for a submap: append, anchor, close loops, optimise; and the publication of the whole map apart.
+Missions of 15 s (31 vertices, up to 100 keypoints each) walk a third of the way round blocks of a town, every
+second block the other way round, so that neighbours look in the same direction in the street between
+them. Joint optimisations are left out. Measured is what the server's loop does for a submap: append,
+anchor, close loops, optimise, and publish the map.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.server.merging import Merger
-from maplab_py.server.options import IncrementalOptions, MergingOptions
+from maplab_py.server.options import IncrementalOptions, MergingOptions, PublishingOptions
+from maplab_py.server.publishing import Publisher
 from maplab_py.simulation.scenario import (
     MeasurementOptions,
     Scenario,
@@ -42,8 +44,12 @@ class GrowthFigures:
     anchored: int
     steps_s: dict[str, float]
     merge_s: float
-    publish_s: float  # once; while submaps are ready it takes at most a tenth of the time
-    exponent: float  # of merge_s against the first row
+    publish_s: float  # after each submap; while submaps are ready the server does it less often
+    files: int
+    files_written: float  # of a publication
+    exponent_merge: float  # of merge_s against the first row
+    exponent: float  # of both
+    whole_s: float  # a publication that writes every file, once
 
 
 def town(missions: int, blocks: tuple[int, int] = (4, 3)) -> SimulatedData:
@@ -60,6 +66,7 @@ def town(missions: int, blocks: tuple[int, int] = (4, 3)) -> SimulatedData:
                 first_block=at,
                 last_block=at,
                 start_turn=(0.23 * (number % 4) + 0.07 * (number // 48)) % 1.0,
+                reverse=(at[0] + at[1]) % 2 == 1,
             )
         )
     scenario = Scenario(
@@ -82,33 +89,53 @@ def measure_growth(missions: int = 100) -> Iterator[str]:
     data = town(missions)
     merger = Merger(MergingOptions(), IncrementalOptions())
     steps: list[dict[str, float]] = []
-    first: tuple[int, float] | None = None
+    first: GrowthFigures | None = None
     counts = {count for count in (10, 20, 40, 70, 100) if count <= missions}
-    anchored = 1
-    for number, session in enumerate(data.maps, start=1):
-        step = merger.add(prepared(session))
-        anchored += len(step.anchored)
-        steps.append(step.seconds)
-        if number not in counts:
-            continue
-        vi_map = merger.vi_map
-        assert vi_map is not None
-        latest = steps[-_LATEST:]
-        mean = {name: float(np.mean([s[name] for s in latest])) for name in latest[0]}
-        merge_s = sum(mean.values())
-        first = first or (number, merge_s)
-        ratio = np.log(number / first[0]) or 1.0
-        exponent = float(np.log(merge_s / first[1]) / ratio)
-        sizes = len(vi_map.vertices), len(vi_map.keypoints)
-        steps_s = {name: round(value, 3) for name, value in mean.items()}
-        figures = GrowthFigures(
-            number, *sizes, anchored, steps_s, merge_s, publish_s(vi_map), exponent
-        )
-        yield str(figures)
+    with tempfile.TemporaryDirectory() as folder:
+        publisher = Publisher(PublishingOptions(merged_map_folder=f"{folder}/town"))
+        for number, session in enumerate(data.maps, start=1):
+            step = merger.add(prepared(session))
+            vi_map = merger.vi_map
+            assert vi_map is not None
+            begin = time.process_time()
+            publisher.publish(vi_map)
+            publish_s = time.process_time() - begin
+            written = publisher.files - publisher.files_taken_over
+            steps.append({**step.seconds, "publish": publish_s, "written": written})
+            if number in counts:
+                figures = _figures(vi_map, publisher.files, steps[-_LATEST:], first)
+                first = first or figures
+                yield str(figures)
 
 
-def publish_s(vi_map: VIMap) -> float:
-    """Return the processor time of a publication."""
+def _figures(
+    vi_map: VIMap, files: int, latest: list[dict[str, float]], first: GrowthFigures | None
+) -> GrowthFigures:
+    mean = {name: float(np.mean([s[name] for s in latest])) for name in latest[0]}
+    publish_s, written = mean.pop("publish"), mean.pop("written")
+    merge_s, missions = sum(mean.values()), len(vi_map.missions)
+    ratio = np.log(missions / first.missions) if first else 1.0
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    return GrowthFigures(
+        missions,
+        len(vi_map.vertices),
+        len(vi_map.keypoints),
+        int(known.sum()),
+        {name: round(value, 3) for name, value in mean.items()},
+        merge_s,
+        publish_s,
+        files,
+        written,
+        float(np.log(merge_s / first.merge_s) / ratio) if first else 0.0,
+        float(np.log((merge_s + publish_s) / (first.merge_s + first.publish_s)) / ratio)
+        if first
+        else 0.0,
+        whole_publication_s(vi_map),
+    )
+
+
+def whole_publication_s(vi_map: VIMap) -> float:
+    """Return the processor time of a publication that writes every file."""
     with tempfile.TemporaryDirectory() as folder:
         begin = time.process_time()
         save_map(vi_map, Path(folder) / "map")
