@@ -24,12 +24,11 @@ from maplab_py.geometry.alignment import umeyama
 from maplab_py.pipeline.plan import MAP_TEMPLATE, RESULT_TEMPLATE, Stage
 from maplab_py.report import Report
 from maplab_py.sensors.yaml_text import parse_yaml
-from maplab_py.simulation.merge_evaluation import shown_points, sightings
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
 from tests.benchmarks.city.sessions import read_truth
-from tests.benchmarks.places.aliased import FAR_M, wrong_closures, wrong_merges
+from tests.benchmarks.places.aliased import merges_of_strangers, wrong_closures, wrong_merges
 from tests.benchmarks.solution import effort
 
 FLAGS_FILE = Path(__file__).parents[3] / "flags" / "city.yaml"
@@ -94,27 +93,6 @@ def against_truth(vi_map: VIMap, truth: Truth) -> dict[str, Any]:
         "wrong_merges": merges_of_strangers(vi_map, truth),
         "merges_of_mixed_tracks": wrong_tracks,
     }
-
-
-def merges_of_strangers(vi_map: VIMap, truth: Truth) -> int:
-    """Count the tracks of merged landmarks none of whose observations shows a point near the landmark's.
-
-    A simulated tracker sometimes goes over from one point to another one. Such a track shows both, and
-    is merged rightly with either, while `wrong_merges` compares the point that it showed most often
-    before keyframing.
-    """
-    seen = sightings(vi_map, truth)
-    real = (seen.track >= 0) & (seen.point >= 0)
-    landmark, track, point = seen.landmark[real], seen.track[real], seen.point[real]
-    main = shown_points(seen, len(vi_map.landmarks))[landmark]
-    gap_m = np.linalg.norm(truth.point_G[point] - truth.point_G[main], axis=1)
-    pair = landmark * len(truth.landmark_id) + track
-    pairs, row = np.unique(pair, return_inverse=True)
-    nearest_m = np.full(len(pairs), np.inf)
-    np.minimum.at(nearest_m, row, gap_m)
-    tracks = np.bincount(pairs // len(truth.landmark_id), minlength=len(vi_map.landmarks))
-    is_merged = tracks[pairs // len(truth.landmark_id)] > 1
-    return int(np.count_nonzero(is_merged & (nearest_m > FAR_M)))
 
 
 def peak_mb() -> float:

@@ -22,7 +22,7 @@ from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
-from maplab_py.simulation.merge_evaluation import sightings
+from maplab_py.simulation.merge_evaluation import shown_points, sightings
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth
@@ -112,3 +112,24 @@ def wrong_merges(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
     apart = truth.point_G[point] - truth.point_G[main[np.searchsorted(owner, landmark)]]
     merges = len(pairs) - len(owner)
     return merges, int(np.count_nonzero(np.linalg.norm(apart, axis=1) > FAR_M))
+
+
+def merges_of_strangers(vi_map: VIMap, truth: Truth) -> int:
+    """Count the tracks of merged landmarks none of whose observations shows a point near the landmark's.
+
+    A simulated tracker sometimes goes over from one point to another one. Such a track shows both, and
+    is merged rightly with either, while `wrong_merges` compares the point that it showed most often
+    before keyframing.
+    """
+    seen = sightings(vi_map, truth)
+    real = (seen.track >= 0) & (seen.point >= 0)
+    landmark, track, point = seen.landmark[real], seen.track[real], seen.point[real]
+    main = shown_points(seen, len(vi_map.landmarks))[landmark]
+    gap_m = np.linalg.norm(truth.point_G[point] - truth.point_G[main], axis=1)
+    pair = landmark * len(truth.landmark_id) + track
+    pairs, row = np.unique(pair, return_inverse=True)
+    nearest_m = np.full(len(pairs), np.inf)
+    np.minimum.at(nearest_m, row, gap_m)
+    tracks = np.bincount(pairs // len(truth.landmark_id), minlength=len(vi_map.landmarks))
+    is_merged = tracks[pairs // len(truth.landmark_id)] > 1
+    return int(np.count_nonzero(is_merged & (nearest_m > FAR_M)))

@@ -23,7 +23,12 @@ from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import VIMap
 from tests.algorithms.loop_closure.against_truth import joined
-from tests.benchmarks.places.aliased import farthest_m, wrong_closures, wrong_merges
+from tests.benchmarks.places.aliased import (
+    farthest_m,
+    merges_of_strangers,
+    wrong_closures,
+    wrong_merges,
+)
 
 WRONG_M = 2.0
 """An anchored mission farther from its place is wrong; the rooms are 14 m apart."""
@@ -47,7 +52,8 @@ class AlikeFigures:
     accepted: int  # closures of lc after relax
     accepted_wrong: int
     merges: int
-    wrong_merges: int  # of points more than 0.5 m apart
+    wrong_merges: int  # tracks of points more than 0.5 m apart
+    of_strangers: int  # of these, with no observation of a point near the landmark's
     wrong_after_optvi: int  # of these, still merged after optvi
 
 
@@ -75,7 +81,7 @@ def measure(seed: int) -> Iterator[AlikeFigures]:
         known = seed % len(sessions)
         anchored, report = anchor_missions(with_known(joined(data), known))
         away_m = farthest_m(anchored, data.truth, known)
-        merging = _merged(anchored, data.truth) if report.anchored else (0, 0, 0, 0, 0)
+        merging = _merged(anchored, data.truth) if report.anchored else (0, 0, 0, 0, 0, 0)
         yield AlikeFigures(
             visits,
             seed,
@@ -88,8 +94,8 @@ def measure(seed: int) -> Iterator[AlikeFigures]:
         )
 
 
-def _merged(anchored: VIMap, truth: Truth) -> tuple[int, int, int, int, int]:
-    """Relax and close loops; return the last five figures."""
+def _merged(anchored: VIMap, truth: Truth) -> tuple[int, int, int, int, int, int]:
+    """Relax and close loops; return the last six figures."""
     relaxed, _, _ = relax_over_loops(anchored, RelaxationOptions(), LoopClosureOptions())
     closed, _ = close_loops(relaxed)
     merges, merged_wrong = wrong_merges(closed, truth)
@@ -97,4 +103,5 @@ def _merged(anchored: VIMap, truth: Truth) -> tuple[int, int, int, int, int]:
     if merged_wrong:
         optimised, _ = optimize(closed, VIOptimizationOptions())
         remaining = wrong_merges(optimised, truth)[1]
-    return (*wrong_closures(closed, truth), merges, merged_wrong, remaining)
+    strangers = merges_of_strangers(closed, truth)
+    return (*wrong_closures(closed, truth), merges, merged_wrong, strangers, remaining)
