@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure.closure_record import read_record
@@ -20,9 +22,10 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
-from maplab_py.simulation.merge_evaluation import shown_points, sightings
+from maplab_py.simulation.merge_evaluation import Sightings, sightings
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth
@@ -115,21 +118,45 @@ def wrong_merges(vi_map: VIMap, truth: Truth) -> tuple[int, int]:
 
 
 def merges_of_strangers(vi_map: VIMap, truth: Truth) -> int:
-    """Count the tracks of merged landmarks none of whose observations shows a point near the landmark's.
+    """Count the tracks that were merged although they show other points than the rest of their landmark.
 
     A simulated tracker sometimes goes over from one point to another one. Such a track shows both, and
-    is merged rightly with either, while `wrong_merges` compares the point that it showed most often
-    before keyframing.
+    is merged rightly with tracks of either, while `wrong_merges` compares the point that it showed most
+    often before keyframing.
     """
-    seen = sightings(vi_map, truth)
+    return strangers(sightings(vi_map, truth), truth.point_G)
+
+
+def strangers(seen: Sightings, point_G: F64) -> int:
+    """Count the tracks outside the largest group of each landmark.
+
+    Two tracks of a landmark belong to one group if they show the same point or points nearer than
+    FAR_M, or if other tracks of the landmark join them in this way.
+
+    Args:
+        seen: Observations of the map.
+        point_G: World points (P, 3).
+    """
     real = (seen.track >= 0) & (seen.point >= 0)
     landmark, track, point = seen.landmark[real], seen.track[real], seen.point[real]
-    main = shown_points(seen, len(vi_map.landmarks))[landmark]
-    gap_m = np.linalg.norm(truth.point_G[point] - truth.point_G[main], axis=1)
-    pair = landmark * len(truth.landmark_id) + track
-    pairs, row = np.unique(pair, return_inverse=True)
-    nearest_m = np.full(len(pairs), np.inf)
-    np.minimum.at(nearest_m, row, gap_m)
-    tracks = np.bincount(pairs // len(truth.landmark_id), minlength=len(vi_map.landmarks))
-    is_merged = tracks[pairs // len(truth.landmark_id)] > 1
-    return int(np.count_nonzero(is_merged & (nearest_m > FAR_M)))
+    tracks, of_track = np.unique(np.stack([landmark, track], axis=1), axis=0, return_inverse=True)
+    shown, of_point = np.unique(np.stack([landmark, point], axis=1), axis=0, return_inverse=True)
+    a, b = _near(shown, point_G)
+    ends = np.append(of_track, len(tracks) + a), len(tracks) + np.append(of_point, b)
+    nodes = len(tracks) + len(shown)
+    joined_by = coo_array((np.ones(len(ends[0])), ends), shape=(nodes, nodes))
+    group = connected_components(joined_by, directed=False)[1][: len(tracks)]
+    groups, size = np.unique(np.stack([tracks[:, 0], group], axis=1), axis=0, return_counts=True)
+    begins = np.flatnonzero(np.diff(groups[:, 0], prepend=-1))
+    return int(len(tracks) - np.maximum.reduceat(size, begins).sum()) if len(size) else 0
+
+
+def _near(shown: I64, point_G: F64) -> tuple[I64, I64]:
+    """Return the pairs of rows of (landmark, point) (N, 2), sorted, of near points of one landmark."""
+    begins = np.flatnonzero(np.diff(shown[:, 0], prepend=-1))
+    count = np.diff(np.append(begins, len(shown)))
+    after = np.repeat(begins + count, count) - np.arange(len(shown)) - 1  # rows of the landmark
+    a = np.repeat(np.arange(len(shown)), after)
+    b = a + 1 + np.arange(len(a)) - np.repeat(np.cumsum(after) - after, after)
+    near = np.linalg.norm(point_G[shown[a, 1]] - point_G[shown[b, 1]], axis=1) <= FAR_M
+    return a[near], b[near]

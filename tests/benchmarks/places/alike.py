@@ -53,7 +53,7 @@ class AlikeFigures:
     accepted_wrong: int
     merges: int
     wrong_merges: int  # tracks of points more than 0.5 m apart
-    of_strangers: int  # of these, with no observation of a point near the landmark's
+    of_strangers: int  # tracks that show other points than the rest of their landmark
     wrong_after_optvi: int  # of these, still merged after optvi
 
 
