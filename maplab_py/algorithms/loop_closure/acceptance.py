@@ -9,9 +9,9 @@ import numpy as np
 
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus
+from maplab_py.algorithms.loop_closure.differences import DIFFERENCES, consensus_of_record
 from maplab_py.algorithms.loop_closure.gate_values import (
-    RIVAL_SHARE,
+    RATIO_MARGIN,
     GateValues,
     Relations,
     geometric_gates,
@@ -19,7 +19,6 @@ from maplab_py.algorithms.loop_closure.gate_values import (
 )
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap
 
 _PREFIX = "--lc_"
@@ -58,14 +57,40 @@ def acceptance(
         return None
     changes = {gate.flag.removeprefix(_PREFIX): _passing_value(gate, row) for gate in failed}
     moved = _moved(options, changes)
-    verdict, support = _decision(vi_map, closures, row, moved)
-    if verdict is Verdict.NO_SUPPORT:
-        changes["min_support"] = support
+    decision = _decision(vi_map, closures, row, moved)
+    larger = [value for value in DIFFERENCES if value > moved.max_neighbour_difference]
+    while further := _further_change(decision, larger):
+        changes |= further
         moved = _moved(options, changes)
-        verdict, _ = _decision(vi_map, closures, row, moved)
+        decision = _decision(vi_map, closures, row, moved)
     return Acceptance(
-        tuple(f"{_PREFIX}{name}={getattr(moved, name):g}" for name in changes), verdict
+        tuple(f"{_PREFIX}{name}={getattr(moved, name):g}" for name in changes), decision.verdict
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Decision:
+    """What would be decided on a closure, and the values that the gates among closures compare."""
+
+    verdict: Verdict
+    support: int
+    rival_share: float = 0.0  # inliers of another place / of the best
+
+
+def _further_change(decision: _Decision, larger: list[float]) -> dict[str, float]:
+    """Return the option that the gate moves that fails next; empty when none fails or none moves it.
+
+    Args:
+        decision: The gate that fails.
+        larger: Differences between neighbours that have not been tried; the next one is removed.
+    """
+    if decision.verdict is Verdict.AMBIGUOUS and decision.rival_share > 0.0:
+        return {"ambiguous_inlier_ratio": round(decision.rival_share + RATIO_MARGIN, _DIGITS)}
+    if decision.verdict is Verdict.CONTRADICTED and larger:
+        return {"max_neighbour_difference": larger.pop(0)}
+    if decision.verdict is Verdict.NO_SUPPORT:
+        return {"min_support": decision.support}
+    return {}
 
 
 def _passing_value(gate: GateValues, row: int) -> float:
@@ -83,30 +108,26 @@ def _moved(options: LoopClosureOptions, changes: dict[str, float]) -> LoopClosur
 
 def _decision(
     vi_map: VIMap, closures: ClosureRecord, row: int, options: LoopClosureOptions
-) -> tuple[Verdict, int]:
-    """Return the verdict on a closure that passes the gates on its pose, and its support."""
+) -> _Decision:
+    """Return what is decided on a closure that passes the gates on its pose."""
     c, relations = closures, Relations.of(vi_map, closures, options)
     failed = np.any([gate.failed for gate in geometric_gates(vi_map, c, options)], axis=0)
     is_far = relations.same & (c.correction_m > relations.drift_m)
-    if relations.related[row] and not failed[row]:
-        shares = rival_shares(vi_map, c, np.asarray(~failed), is_far, options)
-        if shares[row] >= RIVAL_SHARE:
-            return Verdict.AMBIGUOUS, int(c.support[row])
-    out = [VERDICTS.index(v) for v in (Verdict.AMBIGUOUS, Verdict.REMOVED)]
-    left = np.flatnonzero(~failed & ~np.isin(c.verdict, out))
+    shares = rival_shares(vi_map, c, np.asarray(~failed), is_far, options)
+    is_alike = relations.related & (shares >= options.ambiguous_inlier_ratio)
+    support = int(c.support[row])
+    if is_alike[row] and not failed[row]:
+        return _Decision(Verdict.AMBIGUOUS, support, float(shares[row]))
+    was_alike = c.verdict == VERDICTS.index(Verdict.AMBIGUOUS)
+    out = (was_alike & (is_alike | ~relations.related)) | (
+        c.verdict == VERDICTS.index(Verdict.REMOVED)
+    )
+    left = np.flatnonzero(~failed & ~out)
     place = np.flatnonzero(left == row)
     if not len(place):
-        return VERDICTS[c.verdict[row]], int(c.support[row])
-    query, target = (vi_map.vertex_index.rows(ids[left]) for ids in (c.query, c.place))
-    T_M_I = se3.compose(vi_map.vertices.T_M_I[target], se3.inverse(c.T_A_B[left]))
-    support, supported, contradicted = check_consensus(
-        vi_map,
-        query.astype(np.int64),
-        target.astype(np.int64),
-        T_M_I,
-        c.inliers[left].astype(np.int64),
-        ConsensusRule(min_support=options.min_support),
-    )
+        return _Decision(VERDICTS[c.verdict[row]], support)
+    supports, supported, contradicted = consensus_of_record(vi_map, c.take(left), options)
     number = int(place[0])
     verdict = Verdict.ACCEPTED if supported[number] else Verdict.NO_SUPPORT
-    return (Verdict.CONTRADICTED if contradicted[number] else verdict), int(support[number])
+    verdict = Verdict.CONTRADICTED if contradicted[number] else verdict
+    return _Decision(verdict, int(supports[number]))

@@ -22,7 +22,7 @@ class AmbiguityRule:
     drift_offset_m: float
     drift_ratio: float  # fraction of the arc length between the places
     max_turn_rad: float = 0.3
-    inlier_share: float = 0.5  # inliers of the second place relative to the best
+    inlier_share: float = 0.5  # inliers of the second place relative to the best; above 1 = never
     min_inliers: int = 20  # of a distant place of the query's mission
 
 
@@ -61,5 +61,6 @@ def ambiguous_queries(
     drift = rule.drift_offset_m + rule.drift_ratio * np.abs(place_way_m[order] - place_way_m[best])
     is_other = (apart > drift) | (turn > rule.max_turn_rad)
     rivals = is_other & (inliers[order] >= rule.inlier_share * inliers[best])
-    same_mission = rows[is_far_same_mission[rows] & (inliers[rows] >= rule.min_inliers)]
+    is_strong = (inliers[rows] >= rule.min_inliers) & (rule.inlier_share <= 1.0)
+    same_mission = rows[is_far_same_mission[rows] & is_strong]
     return np.union1d(query_vertex[order[rivals]], query_vertex[same_mission])

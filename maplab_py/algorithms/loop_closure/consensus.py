@@ -32,6 +32,7 @@ class ConsensusRule:
     yaw_drift_rad_per_m: float = 4e-4  # over the same way
     min_support: int = 2
     lone_inliers: int = 50  # required inliers of a closure without neighbours
+    max_difference: float = 1.0  # factor on the tolerances
 
 
 def path_lengths(vi_map: VIMap) -> F64:
@@ -99,8 +100,9 @@ def _votes(
             both_ways = between + np.minimum(between_places, between + _REACH_M)
             largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways
             largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
-            agrees = np.linalg.norm(p - T_B_I[i, 4:], axis=1) < largest_m
-            agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < largest_rad
+            apart_m = np.linalg.norm(p - T_B_I[i, 4:], axis=1)
+            agrees = apart_m < rule.max_difference * largest_m
+            agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.max_difference * largest_rad
             other = query[i] != query[j]
             support[i] += near & agrees & other
             for_[i] += np.where(near & agrees, inliers[j], 0)

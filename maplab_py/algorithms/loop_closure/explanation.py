@@ -197,6 +197,9 @@ def explain_pair(
     if lines:
         most = max(lines, key=lambda line: line.failed)
         summary += f" Most fail: {most.gate}" + (f" ({most.flag})." if most.flag else ".")
+    passing = len(closures) - accepted - len(_refused_rows(closures, gates))
+    if passing:
+        summary += f" {counted(passing, 'refused closure')} would pass with these flags."
     return PairExplanation(
         (names[0], names[1]), len(closures), accepted, tuple(lines), _near_misses(closures, gates),
         summary,
@@ -291,7 +294,7 @@ def _summary_of_closure(
 def _near_misses(closures: ClosureRecord, gates: list[GateValues]) -> tuple[NearMiss, ...]:
     total = shortfalls(gates)
     failed = np.sum([gate.failed for gate in gates], axis=0)
-    refused = np.flatnonzero(closures.verdict != VERDICTS.index(Verdict.ACCEPTED))
+    refused = _refused_rows(closures, gates)
     order: I64 = refused[np.lexsort((total[refused], failed[refused]))][:_NEAREST]
     ids = to_hex_list(closures.id)
     return tuple(
@@ -303,6 +306,13 @@ def _near_misses(closures: ClosureRecord, gates: list[GateValues]) -> tuple[Near
         )
         for row in order.tolist()
     )
+
+
+def _refused_rows(closures: ClosureRecord, gates: list[GateValues]) -> I64:
+    """Return the refused closures that also fail a gate with the present flags."""
+    failed = np.any([gate.failed for gate in gates], axis=0)
+    refused = closures.verdict != VERDICTS.index(Verdict.ACCEPTED)
+    return np.asarray(np.flatnonzero(refused & failed), dtype=np.int64)
 
 
 def _pair_gate(gate: GateValues) -> PairGate:

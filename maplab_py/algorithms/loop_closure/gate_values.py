@@ -17,6 +17,7 @@ from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.consensus import path_lengths
+from maplab_py.algorithms.loop_closure.differences import differences
 from maplab_py.algorithms.loop_closure.expected_views import is_refuted
 from maplab_py.algorithms.loop_closure.mission_alignment import (
     AgreementRule,
@@ -35,8 +36,8 @@ YES_NO = "yes or no"
 """Unit of gates whose value is 1 = yes or 0 = no."""
 
 _DRIFT_OFFSET_M = 0.5
-RIVAL_SHARE = 0.5
-"""Share of inliers from which on another place makes a query ambiguous."""
+RATIO_MARGIN = 1e-3
+"""Added to a ratio that must stay below its flag."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -201,8 +202,10 @@ def _gates_among_closures(
     is_contested = is_alike & ~relations.related
     return [
         _gate(
-            "inliers of another place / of the best", rivals, np.nextafter(RIVAL_SHARE, 0.0),
-            Verdict.AMBIGUOUS, applies=is_alike & relations.related,
+            "inliers of another place / of the best", rivals,
+            np.nextafter(o.ambiguous_inlier_ratio, 0.0), Verdict.AMBIGUOUS,
+            "--lc_ambiguous_inlier_ratio", applies=is_alike & relations.related,
+            flag_value=rivals + RATIO_MARGIN,
         ),
         _gate(
             "stretches only another alignment explains / only the best", contest.rival_share,
@@ -223,9 +226,9 @@ def _gates_among_closures(
             applies=c.verdict == VERDICTS.index(Verdict.NO_SUPPORT),
         ),
         _gate(
-            "contradicted by closures nearby",
-            c.verdict == VERDICTS.index(Verdict.CONTRADICTED), 0.0, Verdict.CONTRADICTED,
-            unit=YES_NO,
+            "difference from closures nearby / tolerance", differences(vi_map, c, o),
+            o.max_neighbour_difference, Verdict.CONTRADICTED, "--lc_max_neighbour_difference",
+            applies=c.verdict == VERDICTS.index(Verdict.CONTRADICTED),
         ),
         _gate(
             "removed by hand", c.verdict == VERDICTS.index(Verdict.REMOVED), 0.0,

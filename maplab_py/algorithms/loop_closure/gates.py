@@ -107,7 +107,9 @@ def judge(
     judgement.refuse(
         is_far_same_mission | _beyond(options, judgement, limited), Verdict.IMPLAUSIBLE
     )
-    rule = AmbiguityRule(_DRIFT_OFFSET_M, options.max_drift_ratio)
+    rule = AmbiguityRule(
+        _DRIFT_OFFSET_M, options.max_drift_ratio, inlier_share=options.ambiguous_inlier_ratio
+    )
     ambiguous = np.isin(
         query,
         ambiguous_queries(
@@ -195,7 +197,9 @@ def _check_neighbours(
     left = np.flatnonzero(judgement.passing)
     if len(left) == 0:
         return
-    rule = ConsensusRule(min_support=options.min_support)
+    rule = ConsensusRule(
+        min_support=options.min_support, max_difference=options.max_neighbour_difference
+    )
     support, supported, contradicted = check_consensus(
         vi_map,
         query[left],

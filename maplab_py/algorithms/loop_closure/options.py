@@ -72,8 +72,8 @@ class LoopClosureOptions(FeatureTypeOptions):
     num_neighbors: int = option(-1, help="Landmarks to retrieve per keypoint; -1 = 3")
     max_missions_per_query: int = option(
         8,
-        help="In maps of more missions each image is compared with so many of the others, those that most "
-        "of its nearest landmarks belong to",
+        help="Largest number of other missions that an image is compared with; in larger maps those that "
+        "most of its nearest landmarks belong to",
     )
     num_words_for_nn_search: int = option(
         16, help="Cells of the multi-index that are searched per keypoint"
@@ -136,6 +136,16 @@ class LoopClosureOptions(FeatureTypeOptions):
     )
     min_support: int = option(
         2, help="Number of nearby query vertices whose closures must agree in yaw and position"
+    )
+    ambiguous_inlier_ratio: float = option(
+        0.5,
+        help="A query is ambiguous where another place of the mission has this share of the inliers of the "
+        "best place; above 1 = never",
+    )
+    max_neighbour_difference: float = option(
+        1.0,
+        help="Largest difference between the poses that nearby closures give, relative to 0.15 m and 1.4 "
+        "deg plus drift; closures with a larger difference contradict each other",
     )
     max_ambiguous_ratio: float = option(
         0.1,
