@@ -38,6 +38,11 @@ class Report:
         """Return the report as people shall read it; None lets the console lay out the fields."""
         return None
 
+    @property
+    def is_verbatim(self) -> bool:
+        """Whether the lines of `as_text` stay whole on a narrow terminal, so that they can be copied."""
+        return False
+
     def display(self) -> Any:
         """Return the dataclass that the console lays out: the report, or one with less detail."""
         return self

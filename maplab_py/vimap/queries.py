@@ -55,7 +55,7 @@ def find_mission(vi_map: VIMap, id_prefix: str) -> int:
     if not rows:
         raise UserError(f"no mission begins with '{id_prefix}': the map has {', '.join(known)}")
     candidates = ", ".join(known[row] for row in rows)
-    raise UserError(f"'{id_prefix}' is ambiguous: it begins missions {candidates}")
+    raise UserError(f"'{id_prefix}' is ambiguous: missions begin with it: {candidates}")
 
 
 def mission_mask(vi_map: VIMap, missions: NDArray[Any] | None) -> Mask:

@@ -84,11 +84,13 @@ class MissionLine:
     mission: str
     id: str
     length_m: float | None
-    duration_s: float | None = dataclasses.field(metadata={"title": "time", "unit": "s"})
+    duration_s: float | None = dataclasses.field(metadata={"title": "duration", "unit": "s"})
     vertices: int
-    good: int
-    bad: int
-    unknown: int | str  # empty: there are none in the map
+    good: int = dataclasses.field(metadata={"title": "good landmarks"})
+    bad: int = dataclasses.field(metadata={"title": "bad landmarks"})
+    unknown: int | str = dataclasses.field(  # empty: there are none in the map
+        metadata={"title": "unknown landmarks"}
+    )
     closures: int | None
     known: str
 
@@ -156,6 +158,39 @@ class CoobservabilityReport(Report):
     missions: tuple[str, ...]
     clusters: tuple[tuple[str, ...], ...]
     shared_landmarks: tuple[tuple[int, ...], ...]  # [i][j]: landmarks that missions i and j observe
+
+    def display(self) -> CoobservabilityTable:
+        """Return one row per mission."""
+        cluster = {name: number for number, names in enumerate(self.clusters) for name in names}
+        lines = []
+        for row, mission in enumerate(self.missions):
+            counts = self.shared_landmarks[row]
+            others = sorted(
+                (other for other in range(len(counts)) if other != row and counts[other]),
+                key=lambda other: (-counts[other], other),
+            )
+            shared = ", ".join(f"{self.missions[other]}: {counts[other]}" for other in others)
+            lines.append(
+                CoobservabilityLine(mission, cluster[mission] + 1, counts[row], shared or "none")
+            )
+        return CoobservabilityTable(tuple(lines))
+
+
+@dataclasses.dataclass(frozen=True)
+class CoobservabilityLine:
+    """The landmarks of one mission as they are shown."""
+
+    mission: str
+    group: int
+    landmarks: int
+    shared: str = dataclasses.field(metadata={"title": "shared with"})
+
+
+@dataclasses.dataclass(frozen=True)
+class CoobservabilityTable:
+    """What is shown of the landmarks that missions share."""
+
+    missions: tuple[CoobservabilityLine, ...] = dataclasses.field(metadata={"title": ""})
 
 
 def map_statistics(vi_map: VIMap) -> MapStatistics:

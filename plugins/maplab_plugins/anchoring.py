@@ -67,7 +67,7 @@ def anchor_mission(
 
     Args:
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
-        to: Known mission; of the alignments with it the one near --T_G_M is used.
+        to: Known mission; the alignment with it that is nearest to --T_G_M is used.
         T_G_M: Pose of the mission's frame in the global frame: x y z [m] and yaw [deg], "1 2 0 90".
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions

@@ -77,7 +77,7 @@ def evaluate_trajectory(
     see_also=("import_colmap", "evaluate_trajectory"),
 )
 def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport:
-    """Tell how the selected map and another one differ; rows belong together by their ids.
+    """Show how the selected map and another one differ; rows are matched by their ids.
 
     Poses and landmarks are compared in G. An observation is a keypoint with its landmark.
 

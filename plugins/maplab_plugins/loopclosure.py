@@ -58,6 +58,53 @@ class RelaxMissionsReport(Report):
             return ""
         return "no mission was relaxed: " + "; ".join(failures)
 
+    def display(self) -> RelaxedMissionTable:
+        """Return one row per mission."""
+        return RelaxedMissionTable(
+            tuple(
+                RelaxedMissionLine(
+                    name,
+                    report.loop_closures.accepted,
+                    report.relaxation.num_loop_closures,
+                    report.relaxation.num_switched_off,
+                    report.relaxation.cost_before,
+                    report.relaxation.cost_after,
+                    report.relaxation.mean_correction_m,
+                    report.relaxation.max_correction_m,
+                    report.merging.landmarks_merged if report.merging else None,
+                )
+                for name, report in self.missions.items()
+            ),
+            tuple(
+                f"{name}: {note}"
+                for name, report in self.missions.items()
+                for note in report.relaxation.notes
+            ),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxedMissionLine:
+    """One relaxed mission as it is shown."""
+
+    mission: str
+    accepted: int = dataclasses.field(metadata={"title": "accepted closures"})
+    used: int
+    switched_off: int
+    cost_before: float
+    cost_after: float
+    mean_correction_m: float
+    max_correction_m: float
+    landmarks_merged: int | None
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxedMissionTable:
+    """What is shown of missions that were relaxed independently."""
+
+    missions: tuple[RelaxedMissionLine, ...] = dataclasses.field(metadata={"title": ""})
+    notes: tuple[str, ...] = ()
+
 
 @command(
     "loopclosure_all_missions",
@@ -224,7 +271,7 @@ def remove_loopclosure(
 ) -> ClosureRemovalReport:
     """Remove loop closures: their edges, and merges that too few others support.
 
-    Later searches refuse them, until the record is dropped.
+    Later searches refuse them, until the record is deleted.
 
     Args:
         closures: Beginnings of the closures' ids as lc_report shows them, separated by commas.

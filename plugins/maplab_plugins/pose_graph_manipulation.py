@@ -43,7 +43,8 @@ def assign_edge_uncertainties(
         orientation_sigma_deg=orientation_std_dev_degrees,
     )
     context.commit(result)
-    return Message(f"set the covariance of {counted(count, f'{edge_type.value} edge')}")
+    kind = edge_type.value.replace("_", " ")
+    return Message(f"set the covariance of {counted(count, f'{kind} edge')}")
 
 
 @command(

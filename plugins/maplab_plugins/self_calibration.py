@@ -193,7 +193,7 @@ def prune_segments(
     Args:
         database: Segment database.
         segments_per_group: Number of segments to keep per group; 0 = all.
-        missions: Remove the segments of missions whose ids begin so, separated by commas.
+        missions: Remove the segments of missions whose ids begin with these digits, separated by commas.
         outdated: Remove segments whose measurements contradict the calibration.
         calibration: Test against this sensors.yaml or map folder; empty = against the joint
             calibration of all segments.

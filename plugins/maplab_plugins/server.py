@@ -213,7 +213,7 @@ def delete_all_robot_missions(
     spool: Path,
     robot_name: str,
 ) -> DeletedMissions:
-    """Remove all missions of a robot from the map of a server; submaps of new ones are welcome.
+    """Remove all missions of a robot from the map of a server; submaps of new ones are accepted.
 
     Args:
         spool: Folder of the spool.

@@ -84,7 +84,7 @@ def test_the_second_evaluation_shows_the_difference_to_the_first(
     assert second.baseline.name == "the last evaluation"
     assert second.baseline.ape_m == first.ape_m.rmse
     difference = second.ape_m.rmse - first.ape_m.rmse
-    assert second.display().errors[0].change.startswith(f"{difference:+.4g} (")
+    assert second.display().errors[0].change.startswith(f"{difference:+.4f} (")
     with_snapshot = session.run(
         "evaluate_trajectory", ground_truth=tmp_path / "truth.csv", baseline="start"
     )

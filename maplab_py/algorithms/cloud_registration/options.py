@@ -88,19 +88,25 @@ class CloudClosureOptions:
     def __post_init__(self) -> None:
         """Check the ranges."""
         if self.voxel_size_m <= 0.0 or self.max_correspondence_m <= 0.0:
-            raise ValueError("lidar_lc_voxel_size_m and max_correspondence_m must be positive")
+            raise ValueError(
+                "--lidar_lc_voxel_size_m and --lidar_lc_max_correspondence_m must be positive"
+            )
         if self.max_candidates < 1 or self.every_nth < 1:
-            raise ValueError("lidar_lc_max_candidates and every_nth must be 1 or greater")
+            raise ValueError(
+                "--lidar_lc_max_candidates and --lidar_lc_every_nth must be 1 or greater"
+            )
         if self.sequence_gap_s < 0.0:
-            raise ValueError("lidar_lc_sequence_gap_s must be 0 or greater")
+            raise ValueError("--lidar_lc_sequence_gap_s must be 0 or greater")
         if not 0.0 <= self.min_overlap <= 1.0 or not 0.0 <= self.max_conflict <= 1.0:
-            raise ValueError("lidar_lc_min_overlap and max_conflict must be between 0 and 1")
+            raise ValueError(
+                "--lidar_lc_min_overlap and --lidar_lc_max_conflict must be between 0 and 1"
+            )
         if self.covariance_scaler <= 0.0 or self.switch_variable_variance <= 0.0:
             raise ValueError(
-                "lidar_lc_covariance_scaler and switch_variable_variance must be positive"
+                "--lidar_lc_covariance_scaler and --lidar_lc_switch_variable_variance must be positive"
             )
         if self.search_globally and self.from_closures:
-            raise ValueError("lidar_lc_global and lidar_lc_from_closures exclude each other")
+            raise ValueError("--lidar_lc_global and --lidar_lc_from_closures exclude each other")
 
 
 @dataclasses.dataclass(frozen=True)

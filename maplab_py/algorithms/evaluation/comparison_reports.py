@@ -13,8 +13,8 @@ class RowCounts:
 
     what: str
     in_both: int
-    only_in_first: int
-    only_in_second: int
+    only_in_first: int = dataclasses.field(metadata={"title": "only in this map"})
+    only_in_second: int = dataclasses.field(metadata={"title": "only in the other"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +24,11 @@ class Difference:
     compared: int
     rmse: float
     largest: float
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the maps have no such values in common."""
+        return self.compared == 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -145,7 +145,7 @@ def _change(rmse: float, before: float | None) -> str:
     difference = rmse - before
     is_comparable = before > 0.0 and abs(difference) < _LARGEST_RATIO * before
     share = f" ({100.0 * difference / before:+.1f} %)" if is_comparable else ""
-    return f"{difference:+.4g}{share}" if difference else "none"
+    return f"{difference:+.4f}{share}" if difference else "none"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -149,12 +149,12 @@ def _relative(
     mission = vi_map.vertices.mission[rows]
     times_s = (vi_map.vertices.timestamp_ns[rows] - vi_map.vertices.timestamp_ns[rows].min()) * 1e-9
     if options.rpe_delta_unit not in DELTA_UNITS:
-        raise EstimationError(f"rpe_delta_unit must be one of {', '.join(DELTA_UNITS)}")
+        raise EstimationError(f"--rpe_delta_unit must be one of {', '.join(DELTA_UNITS)}")
     parts = []
     for members in _groups(mission):
         if options.rpe_delta_unit == "frames":
             if options.rpe_delta != round(options.rpe_delta):
-                raise EstimationError("rpe_delta must be a whole number of frames")
+                raise EstimationError("--rpe_delta must be a whole number of frames")
             pairs = pose_errors.pairs_by_frames(
                 len(members), round(options.rpe_delta), all_pairs=options.rpe_all_pairs
             )

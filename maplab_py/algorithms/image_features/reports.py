@@ -16,7 +16,9 @@ class ExtractionReport(Report):
     images: int
     keypoints: int
     median_per_image: float
-    frames_that_had_some: int = 0
+    frames_that_had_some: int = dataclasses.field(
+        default=0, metadata={"title": "frames with such features before"}
+    )
     frames_without_image: int = 0
     keypoints_removed: int = 0
     landmarks_removed: int = 0

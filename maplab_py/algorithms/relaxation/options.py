@@ -26,7 +26,7 @@ class RelaxationOptions:
         help="How false loop closures are kept from doing harm: 'gnc' (graduated non-convexity) "
         "finds those that agree with one another, trusts them fully and the others not at all; "
         "'switchable' estimates a switch variable for each one, 'dcs' (dynamic covariance scaling) "
-        "lets them go in closed form, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
+        "reduces their weights in closed form, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
         choices=("gnc", "switchable", "dcs", "cauchy", "none"),
     )
     switch_prior: float = option(

@@ -113,8 +113,8 @@ class ComparedParameter:
 
     parameter: str
     unit: str
-    first: float
-    second: float
+    first: float = dataclasses.field(metadata={"title": "map"})
+    second: float = dataclasses.field(metadata={"title": "given"})
     difference: float
 
 

@@ -38,17 +38,21 @@ class Saving:
 
     command: str
     megabytes: float
-    saved: float  # ratio to the current size
-    what: str
+    saved: float = dataclasses.field(metadata={"title": "saved share"})  # of the current size
+    what: str = dataclasses.field(metadata={"title": "result"})
 
 
 @dataclasses.dataclass(frozen=True)
 class MapSize(Report):
     """Size of a map in memory and on disk, and possible savings."""
 
-    megabytes_in_memory: float
-    megabytes_on_disk: float | None  # without resources; None when it has no folder
-    megabytes_of_resources: float | None
+    megabytes_in_memory: float = dataclasses.field(metadata={"title": "in memory", "unit": "MB"})
+    megabytes_on_disk: float | None = dataclasses.field(  # without resources; None without a folder
+        metadata={"title": "on disk", "unit": "MB"}
+    )
+    megabytes_of_resources: float | None = dataclasses.field(
+        metadata={"title": "resources", "unit": "MB"}
+    )
     kinds: tuple[SizeOfKind, ...]
     savings: tuple[Saving, ...]
 
@@ -129,10 +133,14 @@ def _savings(
         tried(
             "keyframe_heuristic",
             thin,
-            f"{report.vertices_after} of {len(vi_map.vertices)} vertices",
+            f"{report.vertices_after} of {len(vi_map.vertices)} vertices stay",
         )
     bad = vi_map.landmarks.quality == LandmarkQuality.BAD
-    tried("remove_bad_landmarks", remove_landmarks(vi_map, bad), f"{int(bad.sum())} landmarks go")
+    tried(
+        "remove_bad_landmarks",
+        remove_landmarks(vi_map, bad),
+        f"{int(bad.sum())} landmarks are removed",
+    )
     progress.step(1, 3, "sparsification")
     good = np.flatnonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD)
     keep = round(_SPARSE_SHARE * len(good))
@@ -153,7 +161,7 @@ def _savings(
         observations = int(np.count_nonzero(described))
         size = observations * _BYTES_PER_OBSERVATION
         size += (len(good) + len(vi_map.vertices)) * _BYTES_PER_POINT
-        what = f"{len(good)} landmarks, {observations} observations, before packing"
+        what = f"{len(good)} landmarks, {observations} observations, before compression"
         lines.append(
             Saving("generate_summary_map_and_save_to_disk", size * 1e-6, 1.0 - size / total, what)
         )

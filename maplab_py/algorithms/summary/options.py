@@ -29,11 +29,11 @@ class SummaryMapOptions:
         unit="m",
     )
     covariances: bool = option(
-        False, help="Write a covariance for every landmark, 24 bytes that hardly pack."
+        False, help="Write a covariance for every landmark, 24 bytes that hardly compress."
     )
     landmark_ids: bool = option(
         False,
-        help="Write the ids of the landmarks, 16 bytes that do not pack; those of the observing "
+        help="Write the ids of the landmarks, 16 bytes that do not compress; those of the observing "
         "vertices are written in any case.",
     )
 

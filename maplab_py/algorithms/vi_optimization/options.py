@@ -225,9 +225,9 @@ class SolverFlags:
     )
     submaps: int = option(
         0,
-        help="Cut the problem into so many submaps where few states hold it together, and keep the equations "
-        "of one submap at a time in memory, the others in the temporary folder (TMPDIR); the steps are those "
-        "of the direct solver; 0 = all in memory.",
+        help="Number of submaps into which the problem is cut where few states connect them; keep the "
+        "equations of one submap at a time in memory, the others in the temporary folder (TMPDIR); the steps "
+        "are those of the direct solver; 0 = all in memory.",
     )
     submap_rounds: int = option(
         0,

@@ -16,7 +16,7 @@ _MORE_DECIMALS = 2
 _MAX_DECIMALS = 6
 _FIXED_POINT_RANGE = (1e-4, 1e9)
 _ROUNDING_NOISE = 1e-12
-"""A column whose numbers are all smaller is one of zeros."""
+"""Smaller numbers are shown as zeros."""
 
 
 def format_cell(value: Any) -> str:
@@ -54,9 +54,15 @@ def format_column(values: Sequence[Any]) -> list[str]:
     smallest = _LEAST_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(min(sizes)))
     decimals = min(max(largest, min(smallest, largest + _MORE_DECIMALS)), _MAX_DECIMALS)
     return [
-        f"{float(value):.{decimals}f}" if _is_number(value) else _format_plain(value)
+        _format_fixed(float(value), decimals) if _is_number(value) else _format_plain(value)
         for value in values
     ]
+
+
+def _format_fixed(value: float, decimals: int) -> str:
+    """Format a number with decimals; what they round to zero has no sign."""
+    text = f"{value:.{decimals}f}"
+    return text if float(text) else text.removeprefix("-")
 
 
 def _is_number(value: Any) -> bool:
@@ -79,6 +85,8 @@ def _format_plain(value: Any) -> str:
 def _format_float(value: float) -> str:
     if not np.isfinite(value):
         return "-" if np.isnan(value) else str(value)
+    if abs(value) < _ROUNDING_NOISE:
+        value = 0.0
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         digits = 4 if abs(value) < 100 else 2
         return f"{value:.{digits}f}" if abs(value) >= 1e-2 or value == 0 else f"{value:.6f}"

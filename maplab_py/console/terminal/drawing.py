@@ -62,7 +62,15 @@ class _Drawing:
 
     def lines(self, block: Block) -> list[str]:
         if isinstance(block, Paragraph):
-            return [line for text in block.text.split("\n") for line in self._folded(text)]
+            lines = block.text.split("\n")
+            if block.is_verbatim:
+                return lines
+            indents = [len(line) - len(line.lstrip()) for line in lines]
+            return [
+                folded_line
+                for line, indent in zip(lines, indents, strict=True)
+                for folded_line in self._folded(line, hanging=indent)
+            ]
         title = [self._in(_TITLE, block.title)] if block.title else []
         if isinstance(block, Pairs):
             return title + self._pairs(block)

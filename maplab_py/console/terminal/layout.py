@@ -32,6 +32,8 @@ _UNIT_SUFFIXES = {
     "_hz": "Hz",
     "_ns": "ns",
 }
+_WHOLE_NAMES = {"seconds": ("time", "s"), "megabytes": ("size", "MB")}
+"""Names of fields that are only a unit, as a quantity and its unit."""
 _WORDS = {
     "imu": "IMU",
     "gyro": "gyroscope",
@@ -45,6 +47,7 @@ _WORDS = {
     "max": "largest",
     "min": "smallest",
     "lidar": "LiDAR",
+    "freedom": "degree of freedom",
     "ransac": "RANSAC",
     "csv": "CSV",
     "json": "JSON",
@@ -57,9 +60,10 @@ _WORDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Paragraph:
-    """Lines of text."""
+    """Lines of text; verbatim ones are not folded."""
 
     text: str
+    is_verbatim: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,12 +103,18 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
         if isinstance(report, Report):
             text = report.as_text()
             if text is not None:
-                return [Paragraph(text)] if text else []
+                return [Paragraph(text, report.is_verbatim)] if text else []
             report = report.display()
     pairs: list[tuple[str, str]] = []
     following: list[Block] = []
+    alike = _records_of_one_kind(report)
     for field in dataclasses.fields(report):
         value = getattr(report, field.name)
+        if field.name in alike:
+            following += _columns_of_records(alike.pop(field.name))
+            continue
+        if _is_record(value) and getattr(value, "is_empty", False):
+            continue
         head = heading(field)
         value = _without_failure(value, failure)
         if _is_absent(value):
@@ -135,6 +145,50 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
     return _under(title, following)
 
 
+def _records_of_one_kind(report: Any) -> dict[str, list[tuple[str, Any]]]:
+    """Return the headings and records of the fields whose records have one kind and single values.
+
+    The key is the name of the field; only the first field of a kind has records. Records that say
+    that they are empty (`is_empty`) are left out.
+    """
+    kinds: dict[type, list[str]] = {}
+    for field in dataclasses.fields(report):
+        value = getattr(report, field.name)
+        if _is_record(value) and not isinstance(value, Report) and _has_single_values(value):
+            kinds.setdefault(type(value), []).append(field.name)
+    fields = {field.name: field for field in dataclasses.fields(report)}
+    groups: dict[str, list[tuple[str, Any]]] = {}
+    for names in (names for names in kinds.values() if len(names) > 1):
+        records = [(heading(fields[name]), getattr(report, name)) for name in names]
+        groups |= {name: [] for name in names}
+        groups[names[0]] = [
+            (head, record) for head, record in records if not getattr(record, "is_empty", False)
+        ]
+    return groups
+
+
+def _has_single_values(record: Any) -> bool:
+    values = [getattr(record, field.name) for field in dataclasses.fields(record)]
+    return all(value is None or isinstance(value, _SINGLE_TYPES) for value in values)
+
+
+def _columns_of_records(records: list[tuple[str, Any]]) -> list[Table]:
+    """Return a table with a column per record and a row per field; none without records."""
+    if not records:
+        return []
+    fields = dataclasses.fields(records[0][1])
+    columns = [
+        format_column([getattr(record, field.name) for field in fields]) for _, record in records
+    ]
+    rows = [
+        [heading(field), *cells]
+        for field, *cells in zip(fields, *columns, strict=True)
+        if not all(_is_absent(getattr(record, field.name)) for _, record in records)
+    ]
+    heads = ["", *(head for head, _ in records)]
+    return [Table("", heads, rows, [False, *(True for _ in records)])]
+
+
 def _under(title: str, blocks: list[Block]) -> list[Block]:
     """Give the title of a record without single values to its first block if that has none."""
     if title and blocks and not isinstance(blocks[0], Paragraph) and not blocks[0].title:
@@ -149,6 +203,7 @@ def heading(field: dataclasses.Field[Any]) -> str:
         unit = field.metadata.get("unit", "")
     else:
         name, unit = field.name, field.metadata.get("unit", "")
+        name, unit = _WHOLE_NAMES.get(name, (name, unit))
         for suffix, meaning in _UNIT_SUFFIXES.items():
             if name.endswith(suffix):
                 unit = unit or meaning
@@ -191,6 +246,7 @@ def _is_lines(value: Any) -> bool:
         and len(value) > 0
         and all(isinstance(item, str) for item in value)
         and sum(len(item) for item in value) > 80
+        and max(len(item) for item in value) > _LONGEST_WORD
     )
 
 
@@ -224,6 +280,9 @@ def _tables(title: str, records: Sequence[Any], *, are_entries: bool = False) ->
 
 
 _NUMBER_TYPES = (int, float, np.integer, np.floating, type(None))
+_LONGEST_WORD = 12
+"""Lists of texts that are no longer are printed as words, separated by commas."""
+_SINGLE_TYPES = (str, int, float, np.integer, np.floating)
 
 
 def _flat(value: Any) -> Any:

@@ -46,7 +46,7 @@ def _named(block: Block, names: Mapping[str, str]) -> Block:
         return text_with_names(text, names)
 
     if isinstance(block, Paragraph):
-        return Paragraph(named(block.text))
+        return dataclasses.replace(block, text=named(block.text))
     if isinstance(block, Pairs):
         return Pairs([(named(name), named(value)) for name, value in block.rows], block.title)
     rows = [[named(cell) for cell in row] for row in block.rows]

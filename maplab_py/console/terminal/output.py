@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +27,8 @@ from maplab_py.console.terminal.streams import write_message, writing_output
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.progress import Progress
 from maplab_py.report import Report
+
+_CLEARED = "\x1b[H\x1b[2J\x1b[3J"
 
 
 class ConsoleTerminal:
@@ -135,6 +138,12 @@ class ConsoleTerminal:
         stream = sys.stdout if sys.stdout.isatty() and not self.as_json else sys.stderr
         _write_line(stream, text, "\x1b[2m")
         self._copy(text)
+
+    def clear(self) -> None:
+        """Clear the screen and what the terminal has scrolled off it; a pipe gets nothing."""
+        if sys.stdout.isatty() and os.environ.get("TERM") != "dumb":
+            sys.stdout.write(_CLEARED)
+            sys.stdout.flush()
 
     def advise(self, text: str) -> None:
         """Print one line on what to do next."""

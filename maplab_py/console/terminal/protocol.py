@@ -34,6 +34,9 @@ class Terminal(Protocol):
     def note(self, text: str) -> None:
         """Print a note outside the report."""
 
+    def clear(self) -> None:
+        """Clear the screen."""
+
     def progress(self, command: str, verbosity: int = 0) -> AbstractContextManager[Progress]:
         """Return the progress display around one command."""
 
@@ -67,6 +70,9 @@ class SilentTerminal:
 
     def note(self, text: str) -> None:
         """Print nothing."""
+
+    def clear(self) -> None:
+        """Clear nothing: there is no screen."""
 
     def progress(
         self,

@@ -153,7 +153,7 @@ def optimize_states(
         problem: Terms and restrictions.
         states: Where to begin.
         options: When to stop.
-        progress: Shown one line an iteration; cancels between iterations.
+        progress: Shown a line and a step of the bar each iteration; cancels between iterations.
         after_step: May exchange weights of the problem (outlier rejection).
 
     Raises:
@@ -167,7 +167,8 @@ def optimize_states(
             raise EstimationError(f"the cost is not finite before the first iteration: {initial}")
         termination, iterations = "iteration limit", 0
         for iteration in range(1, options.num_iterations + 1):
-            progress.check()
+            limit = options.num_iterations
+            progress.step(iteration - 1, limit, f"iteration {iteration} of at most {limit}")
             if time.perf_counter() - began > options.max_time_seconds:
                 termination = "time limit"
                 break

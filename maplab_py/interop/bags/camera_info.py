@@ -79,7 +79,7 @@ def camera_of_info(message: Any, name: str, like: Camera) -> Camera:
     if len(D) < size or D[size:].any():
         raise MapError(
             f"{name}: {message.distortion_model} with {len(D)} coefficients is not supported, "
-            f"{size} are: leave --camera_calibration_topic away"
+            f"{size} are: leave out --camera_calibration_topic"
         )
     return dataclasses.replace(
         like,

@@ -34,7 +34,9 @@ class PoseToBagOptions:
     def __post_init__(self) -> None:
         """Check the rate."""
         if not 0.0 < self.interpolate_to_frequency_hz <= _HIGHEST_RATE_HZ:
-            raise ValueError("interpolate_to_frequency_hz must be positive and at most 1e9")
+            raise ValueError(
+                "--rosbag_plugin_pose_to_bag_interpolate_to_frequency_hz must be positive and at most 1e9"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,5 +102,6 @@ class BagImportOptions:
         """Check the ranges."""
         if self.image_tolerance_ms < 0.0 or self.calibration_tolerance_px < 0.0 or self.camera < -1:
             raise ValueError(
-                "image_tolerance_ms and calibration_tolerance_px must be 0 or greater, camera -1 or greater"
+                "--image_tolerance_ms and --calibration_tolerance_px must be 0 or greater, --camera -1 or "
+                "greater"
             )

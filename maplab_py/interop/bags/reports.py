@@ -45,7 +45,9 @@ class BagImport(Report):
     messages: int
     resource_types: tuple[str, ...]
     attached: int
-    had_some: int  # frames that had such a resource, or times of clouds
+    had_some: int = dataclasses.field(
+        metadata={"title": "with a resource before"}
+    )  # frames or clouds
     frames_without_message: int = 0
     messages_outside_mission: int = 0
     camera: int | None = None

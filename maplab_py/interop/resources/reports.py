@@ -16,7 +16,9 @@ class ImportedResources(Report):
     resource_types: tuple[str, ...]
     files_in_folder: int
     attached: int
-    frames_that_had_some: int = 0
+    frames_that_had_some: int = dataclasses.field(
+        default=0, metadata={"title": "frames with a resource before"}
+    )
     frames_without_file: int = 0
     notes: tuple[str, ...] = ()
 

@@ -25,7 +25,7 @@ class FeatureOptions:
     )
     detector_threshold: int = option(
         20,
-        help="Smallest contrast of a corner; where a cell has too few corners, a third of it will do",
+        help="Smallest contrast of a corner; where a cell has too few corners, a third of it suffices",
     )
     detector_max_feature_count: int = option(250, help="Largest number of keypoints of an image")
     detector_nms_radius: float = option(

@@ -6,11 +6,18 @@ from maplab_plugins.console.jobs import cancel, join, list_jobs
 from maplab_plugins.console.lasting_flags import list_flags, set_flags, unset_flags
 from maplab_plugins.console.new_plugin import new_plugin
 from maplab_plugins.console.schema import show_schema
-from maplab_plugins.console.session import enable_sheep, show_timing, transcript, watch
+from maplab_plugins.console.session import (
+    clear_screen,
+    enable_sheep,
+    show_timing,
+    transcript,
+    watch,
+)
 
 __all__ = [
     "alias",
     "cancel",
+    "clear_screen",
     "enable_sheep",
     "join",
     "list_flags",

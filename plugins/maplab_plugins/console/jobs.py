@@ -51,8 +51,8 @@ def list_jobs(context: CommandContext) -> JobList | Message:
     """List running and finished background commands.
 
     A command goes to the background by `&` at its end: `optvi &`. It works on the maps as they are
-    at its start. What it makes of them becomes theirs when it ends, and can be taken back by undo.
-    If the map has been changed in the meantime, the result becomes a separate map.
+    at its start. Its result replaces them when it ends, and undo reverts it; if the map has been
+    changed in the meantime, the result becomes a separate map.
     """
     jobs = context.session.jobs.jobs
     return JobList(tuple(map(_line, jobs))) if jobs else Message("no jobs (see: help jobs)")

@@ -63,7 +63,7 @@ def unset_flags(context: CommandContext, *names: str) -> Message:
     for name in names:
         if context.session.settings.unset(name) is None:
             raise UserError(f"unset: --{name.lstrip('-')} has not been set")
-    return Message("")
+    return Message("\n".join(f"unset --{name.lstrip('-')}" for name in names))
 
 
 @command("flags", example="flags ba_", needs_map=False)

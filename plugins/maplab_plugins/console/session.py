@@ -29,6 +29,13 @@ class TimingTable(Report):
     timings: tuple[TimingLine, ...]
 
 
+@command("clear", see_also=("clear_storage",), needs_map=False)
+def clear_screen(context: CommandContext) -> Message:
+    """Clear the screen; maps stay as they are."""
+    context.terminal.clear()
+    return Message("")
+
+
 @command("timing", needs_map=False)
 def show_timing(context: CommandContext) -> TimingTable | Message:
     """Show how long the commands of this session took."""

@@ -71,7 +71,7 @@ def join_submaps(
 
     Vertices, landmarks and edges with one id become one. Where cells differ, the copy of a vertex is taken
     from the cell where it is farthest from what the cell lacks, with its images and observations. What only
-    one cell has stays: an entity is gone only if all cells that had it have removed it.
+    one cell has stays: an entity is removed only if all cells that had it have removed it.
 
     Args:
         target_map_key: Key of the new map.

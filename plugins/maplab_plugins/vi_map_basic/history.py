@@ -28,6 +28,11 @@ class MapScript(Report):
 
     commands: tuple[str, ...]
 
+    @property
+    def is_verbatim(self) -> bool:
+        """Return True: lines of a script are copied."""
+        return True
+
     def as_text(self) -> str:
         """Return the script."""
         return "\n".join(self.commands)

@@ -45,13 +45,13 @@ _UNDO = UndoOptions()
     needs_map=False,
 )
 def memory(context: CommandContext, *, undo: UndoOptions = _UNDO) -> MemoryReport:
-    """Show the memory of maps, of what undo keeps, and of the cache of maps; bound that of undo.
+    """Show the memory of maps, of undo and of the cache of maps; limit that of undo.
 
     A column that several maps or former values share counts once, for the first of them. Columns in a
     file of the cache of maps take memory only where they are in use, and the system takes that back
     when it is short.
 
-    A bound that is given holds for the rest of the session.
+    A limit that is given holds for the rest of the session.
     """
     from maplab_py.console.session.settings import Layer
     from maplab_py.console.session.undo import bounded, former_values

@@ -33,6 +33,33 @@ class SavedMaps(Report):
         """List what failed after the first map was saved."""
         return "; ".join(self.problems)
 
+    def display(self) -> SavedMapTable:
+        """Return one row per map."""
+        written = [report.as_dict() for report in self.details]
+        return SavedMapTable(
+            tuple(
+                SavedMapLine(saved.map_key, saved.folder, files["files"], files["megabytes"])
+                for saved, files in zip(self.maps, written, strict=True)
+            )
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedMapLine:
+    """One saved map as it is shown."""
+
+    map_key: str
+    folder: Path
+    files: int
+    megabytes: float
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedMapTable:
+    """What is shown of the saved maps."""
+
+    maps: tuple[SavedMapLine, ...] = dataclasses.field(metadata={"title": ""})
+
 
 @dataclasses.dataclass(frozen=True)
 class PlannedSave:

@@ -106,7 +106,9 @@ def _resolved(vi_map: VIMap, subject: str) -> tuple[str, int]:
             "(lc_report lists closures, map_stats missions)"
         )
     shown = ", ".join(f"{kind} {name[:12]}" for kind, _, name in matches[:4])
-    raise UserError(f"why: '{subject}' is ambiguous: it begins {shown}; give more digits")
+    raise UserError(
+        f"why: '{subject}' is ambiguous: several ids begin with it ({shown}); give more digits"
+    )
 
 
 def _beginning(prefix: str, *ids: tuple[str, IdArray]) -> list[tuple[str, int, str]]:

@@ -206,3 +206,11 @@ def test_unknown_commands_and_flags_are_marked() -> None:
     assert styles["x"] == "value"
     assert styles["--y"] == "unknown"
     assert coloured_parts("solvee", REGISTRY) == [("unknown", "solvee")]
+
+
+def test_clear_clears_the_screen_and_is_proposed_before_clear_storage() -> None:
+    session = Session(load_registry())
+    session.maps.add("office", map_of(3))
+    assert texts("clear", session) == ["clear", "clear_storage"]
+    session.run("clear")
+    assert len(session.maps) == 1

@@ -150,6 +150,7 @@ def test_console_commands(capsys: Capture) -> None:
     assert "--ba_loss  none   set" in out
     assert "--ba_num_iterations  10     default  solve" in out
     assert out.count("all flags have their defaults") == 2
+    assert "\nunset --ba_loss\n" in out
     assert runner.run_text("unset ba_loss") == Status.USER_ERROR
     assert runner.run_text("unset") == Status.USER_ERROR
     assert runner.run_text("help --plugin=nosuch") == Status.USER_ERROR

@@ -134,3 +134,82 @@ class Several(Report):
 def test_a_nested_report_without_a_title_of_its_own_gets_its_key() -> None:
     text = shown(Several({"[1] list": Untitled(PAGE.flags)}), 160)
     assert text.startswith("[1] list\nflag ")
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    median: float
+    largest: float
+    count: int = 1
+
+    @property
+    def is_empty(self) -> bool:
+        return self.count == 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Spreads(Report):
+    queries: int
+    position_m: Spread
+    rotation_deg: Spread
+    time_ms: Spread
+
+
+COLUMNS = """\
+queries  7
+
+         position [m]  rotation [deg]
+-------  ------------  --------------
+median         0.0100            1.50
+largest        0.2500           12.25
+count               1               1"""
+
+
+def test_records_of_one_kind_are_the_columns_of_one_table() -> None:
+    report = Spreads(7, Spread(0.01, 0.25), Spread(1.5, 12.25), Spread(0.0, 0.0, count=0))
+    assert shown(report, 80).replace("─", "-") == COLUMNS
+
+
+def test_a_table_of_empty_records_is_left_out() -> None:
+    nothing = Spread(0.0, 0.0, count=0)
+    assert shown(Spreads(7, nothing, nothing, nothing), 80) == "queries  7"
+
+
+@dataclasses.dataclass(frozen=True)
+class Script(Report):
+    line: str
+
+    @property
+    def is_verbatim(self) -> bool:
+        return True
+
+    def as_text(self) -> str:
+        return self.line
+
+
+def test_a_script_is_not_folded_and_a_note_keeps_its_indentation() -> None:
+    line = "optvi " + "--ba_num_iterations=20 " * 8
+    assert shown(Script(line), 60) == line
+    (first, *others) = shown(Message(f"notes:\n  {line}"), 60).splitlines()[1:]
+    assert [text[:3] for text in (first, *others)] == ["  o", *["  -" for _ in others]]
+    assert others
+
+
+def test_rounding_noise_is_zero_and_has_no_sign() -> None:
+    text = shown(Spreads(1, *(Spread(-3e-17, 2e-15) for _ in range(3))), 80)
+    assert "e-1" not in text
+    assert "-0" not in text
+
+
+@dataclasses.dataclass(frozen=True)
+class Units(Report):
+    seconds: float
+    megabytes: float
+    chi_square_per_freedom: float
+    ids: tuple[str, ...]
+
+
+def test_quantities_have_names_and_ids_stand_in_one_line() -> None:
+    text = shown(Units(1.0, 2.0, 1.0, tuple(f"{n:08x}" for n in range(11))), 200)
+    heads = [line.partition("  ")[0] for line in text.splitlines()]
+    assert heads == ["time [s]", "size [MB]", "chi square per degree of freedom", "ids"]

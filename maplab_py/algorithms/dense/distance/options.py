@@ -32,8 +32,9 @@ class DistanceOptions:
     def __post_init__(self) -> None:
         """Check the ranges."""
         if not 0.0 < self.max_distance_m < float("inf"):
-            raise ValueError("dense_esdf_max_distance_m must be positive")
+            raise ValueError("--dense_esdf_max_distance_m must be positive")
         if not 0.0 <= self.clear_sphere_inner_radius <= self.clear_sphere_outer_radius:
             raise ValueError(
-                "0 <= dense_esdf_clear_sphere_inner_radius <= clear_sphere_outer_radius must hold"
+                "0 <= --dense_esdf_clear_sphere_inner_radius <= --dense_esdf_clear_sphere_outer_radius "
+                "must hold"
             )

@@ -35,18 +35,20 @@ class FusionOptions:
         """Check the ranges."""
         if self.voxel_size_m <= 0.0 or self.truncation_distance_m < 0.0:
             raise ValueError(
-                "dense_tsdf_voxel_size_m must be positive, truncation_distance_m 0 or greater"
+                "--dense_tsdf_voxel_size_m must be positive, --dense_tsdf_truncation_distance_m 0 or "
+                "greater"
             )
         if not 0.0 < self.min_ray_length_m < self.max_ray_length_m:
             raise ValueError(
-                "0 < dense_tsdf_min_ray_length_m < dense_tsdf_max_ray_length_m must hold"
+                "0 < --dense_tsdf_min_ray_length_m < --dense_tsdf_max_ray_length_m must hold"
             )
         if not 0 <= self.weight_depth_power <= 8 or self.integrate_every_nth < 1:
             raise ValueError(
-                "dense_tsdf_weight_depth_power must be 0 to 8, integrate_every_nth 1 or greater"
+                "--dense_tsdf_weight_depth_power must be 0 to 8, --dense_tsdf_integrate_every_nth 1 or "
+                "greater"
             )
         if self.max_weight <= 0.0:
-            raise ValueError("dense_tsdf_max_weight must be positive")
+            raise ValueError("--dense_tsdf_max_weight must be positive")
 
     @property
     def truncation_m(self) -> float:

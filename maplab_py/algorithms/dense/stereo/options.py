@@ -108,23 +108,25 @@ class StereoOptions:
         start = self.debug_reconstruction_start_fraction_of_trajectory
         if not 0.0 <= start < self.debug_reconstruction_end_fraction_of_trajectory <= 1.0:
             raise ValueError(
-                "0 <= dense_stereo_debug_reconstruction_start_fraction_of_trajectory < end <= 1 must hold"
+                "0 <= --dense_stereo_debug_reconstruction_start_fraction_of_trajectory < "
+                "--dense_stereo_debug_reconstruction_end_fraction_of_trajectory <= 1 must hold"
             )
         if not 0.0 < self.downscaling_factor <= 1.0:
-            raise ValueError("dense_stereo_downscaling_factor must be in (0, 1]")
+            raise ValueError("--dense_stereo_downscaling_factor must be in (0, 1]")
         if self.median_window not in (0, 3, 5) or self.edge_margin < 0:
             raise ValueError(
-                "dense_stereo_median_window must be 0, 3 or 5, edge_margin 0 or greater"
+                "--dense_stereo_median_window must be 0, 3 or 5, --dense_stereo_edge_margin 0 or greater"
             )
         if not 0 <= self.bilateral_window <= 31:
-            raise ValueError("dense_stereo_bilateral_window must be 0 to 31")
+            raise ValueError("--dense_stereo_bilateral_window must be 0 to 31")
         if self.min_baseline <= 0.0:
-            raise ValueError("dense_stereo_min_baseline must be positive")
+            raise ValueError("--dense_stereo_min_baseline must be positive")
         if self.multi_view_min_agreeing < 1:
-            raise ValueError("dense_stereo_multi_view_min_agreeing must be 1 or greater")
+            raise ValueError("--dense_stereo_multi_view_min_agreeing must be 1 or greater")
         if self.multi_view_interval_s < 0.0 or self.multi_view_max_difference <= 0.0:
             raise ValueError(
-                "dense_stereo_multi_view_interval_s must be 0 or greater, max_difference positive"
+                "--dense_stereo_multi_view_interval_s must be 0 or greater, "
+                "--dense_stereo_multi_view_max_difference positive"
             )
 
 
