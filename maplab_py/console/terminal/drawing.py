@@ -8,6 +8,7 @@ from maplab_py.console.terminal.fitting import GAP, fitted, text_width
 from maplab_py.console.terminal.layout import Block, Pairs, Paragraph, Table
 
 _NARROWEST_TABLE_OF_ENTRIES = 100
+_NARROWEST_EXPLANATION = 36
 _TITLE, _HEAD, _NAME, _FAINT = "\x1b[1m", "\x1b[1;36m", "\x1b[36m", "\x1b[2m"
 _END = "\x1b[0m"
 
@@ -74,7 +75,7 @@ class _Drawing:
         title = [self._in(_TITLE, block.title)] if block.title else []
         if isinstance(block, Pairs):
             return title + self._pairs(block)
-        if block.are_entries and self._width and self._width < _NARROWEST_TABLE_OF_ENTRIES:
+        if block.are_entries and self._width and _is_too_narrow(block, self._width):
             return title + self._entries(block)
         return title + self._table(block)
 
@@ -122,6 +123,15 @@ class _Drawing:
 
     def _in(self, style: str, text: str) -> str:
         return f"{style}{text}{_END}" if self._coloured else text
+
+
+def _is_too_narrow(entries: Table, width: int) -> bool:
+    """Return whether a table of entries would leave too little room for the explanations."""
+    if width < _NARROWEST_TABLE_OF_ENTRIES:
+        return True
+    shown = fitted(entries, width)
+    longest = max((text_width(row[-1]) for row in entries.rows), default=0)
+    return bool(shown.omitted) or shown.widths[-1] < min(_NARROWEST_EXPLANATION, longest)
 
 
 def _row(cells: list[str], widths: list[int], table: Table) -> list[str]:

@@ -53,6 +53,7 @@ _WORDS = {
     "json": "JSON",
     "url": "URL",
     "localized": "localised",
+    "optimizations": "optimisations",
     "localization": "localisation",
 }
 """Words of field names as they are shown."""

@@ -213,3 +213,12 @@ def test_quantities_have_names_and_ids_stand_in_one_line() -> None:
     text = shown(Units(1.0, 2.0, 1.0, tuple(f"{n:08x}" for n in range(11))), 200)
     heads = [line.partition("  ")[0] for line in text.splitlines()]
     assert heads == ["time [s]", "size [MB]", "chi square per degree of freedom", "ids"]
+
+
+def test_help_never_leaves_out_the_text_of_a_flag() -> None:
+    long = FlagLine(
+        "--" + "f" * 50, "step_quality|ceres|levenberg_marquardt|dogleg|other", "1", "", "x y " * 30
+    )
+    text = shown(Page("optvi", (*PAGE.flags, long)), 100)
+    assert "no room for" not in text
+    assert "\n    Least number of inliers of a closure\n" in text
