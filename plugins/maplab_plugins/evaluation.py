@@ -90,7 +90,7 @@ def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport
     if other_map in context.maps:
         other = context.maps.get(other_map).vi_map
     elif is_map_folder(Path(other_map)):
-        other, _ = load_map(Path(other_map))
+        other, _ = load_map(Path(other_map), progress=context.progress)
     else:
         known = ", ".join(context.maps.keys)
         raise UserError(
@@ -138,7 +138,7 @@ def evaluate_localization(
     T_R_G, alignment = se3.identity(), "none: the map has the frame of the ground truth"
     if map_folder is not None:
         of_map = truth if map_ground_truth is None else read_trajectory(map_ground_truth)
-        vi_map, _ = load_map(map_folder)
+        vi_map, _ = load_map(map_folder, progress=context.progress)
         T_R_G, alignment = evaluation.alignment_of_map(vi_map, of_map), "vertices of the map"
     files = tuple(
         evaluation.localization_errors(evaluation.read_localized(Path(name)), truth, T_R_G)

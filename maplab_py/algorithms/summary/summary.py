@@ -50,6 +50,7 @@ def make_summary_map(
         EstimationError: No good landmark has descriptors of the type, or too few tracks to learn from.
     """
     judged, _ = evaluate_unknown_quality(vi_map, progress)
+    progress.step(0, 3, "project descriptors")
     missions = np.arange(len(judged.missions))
     features, projection = map_features(
         judged, missions, projection=projection, feature_type=feature_type, sizes=sizes
@@ -59,6 +60,7 @@ def make_summary_map(
         raise EstimationError(
             f"no good landmark has {type_name(feature_type)} descriptors: run rtl"
         )
+    progress.step(1, 3, "select observations")
     rows = rows[np.argsort(features.descriptors.label[rows], kind="stable")]
     if options.max_observations_per_landmark:
         rows = _spread(rows, features, options.max_observations_per_landmark)
@@ -70,6 +72,7 @@ def make_summary_map(
     by_landmark = np.argsort(landmark, kind="stable")
     rows, landmark = rows[by_landmark], landmark[by_landmark]
     vertices, observer = np.unique(features.vertex[rows], return_inverse=True)
+    progress.step(2, 3, "landmarks")
     covariance = None
     if options.covariances:
         covariance = landmark_covariances(judged, features)[landmarks].astype(np.float32)

@@ -108,7 +108,7 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
             report = report.display()
     pairs: list[tuple[str, str]] = []
     following: list[Block] = []
-    alike = _records_of_one_kind(report)
+    alike = _records_of_equal_kind(report)
     for field in dataclasses.fields(report):
         value = getattr(report, field.name)
         if field.name in alike:
@@ -146,7 +146,7 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
     return _under(title, following)
 
 
-def _records_of_one_kind(report: Any) -> dict[str, list[tuple[str, Any]]]:
+def _records_of_equal_kind(report: Any) -> dict[str, list[tuple[str, Any]]]:
     """Return the headings and records of the fields whose records have one kind and single values.
 
     The key is the name of the field; only the first field of a kind has records. Records that say

@@ -12,7 +12,7 @@ from maplab_py.console.terminal.drawing import drawn, folded
 from maplab_py.console.terminal.layout import Block, Pairs, Paragraph, blocks_of
 from maplab_py.console.terminal.naming import text_with_names, with_names
 from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.progress import SILENT, Progress
+from maplab_py.progress import Progress, SilentProgress
 from maplab_py.report import Report
 
 WIDTHS = (80, 100, 160)
@@ -26,6 +26,7 @@ class Screen(ConsoleTerminal):
 
     Attributes:
         shown: Blocks of the reports, and lines of notes, advice and errors.
+        steps: How often commands have moved their bar.
     """
 
     def __init__(self) -> None:
@@ -33,6 +34,7 @@ class Screen(ConsoleTerminal):
         super().__init__()
         self.is_prompt = True
         self.shown: list[Block | str] = []
+        self.steps = 0
 
     @property
     def is_interactive(self) -> bool:
@@ -76,8 +78,8 @@ class Screen(ConsoleTerminal):
 
     @contextmanager
     def progress(self, command: str, verbosity: int = 0) -> Iterator[Progress]:
-        """Show no progress."""
-        yield SILENT
+        """Count the steps of the bar."""
+        yield _Counting(self)
 
     def clear(self) -> None:
         """Forget what was shown."""
@@ -88,6 +90,18 @@ class Screen(ConsoleTerminal):
 
     def tick(self) -> None:
         """Do nothing: there are no bars."""
+
+
+class _Counting(SilentProgress):
+    """Progress that is counted and not shown."""
+
+    def __init__(self, screen: Screen) -> None:
+        self._screen = screen
+
+    def step(self, done: float, total: float, what: str = "") -> None:
+        """Count a step."""
+        assert 0 <= done <= total, what
+        self._screen.steps += 1
 
 
 def screen_of(runner: Runner, screen: Screen, line: str) -> list[Block | str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,8 +21,10 @@ from maplab_py.console.terminal.layout import Block, Pairs, Paragraph, Table
 from maplab_py.vimap.ids import to_hex
 from tests.console.screens.recording import Screen, screen_of
 from tests.support.data import shared_data
+from tests.support.machine import slowness
 
 COLUMNS = 80
+MOST_SECONDS_WITHOUT_BAR = 1.0
 
 LINES = (
     "artificially_disturb_vertices",
@@ -87,13 +90,13 @@ LONG_LINES = (
     "collect_segments --database=tango.segments",
     "csv_export --csv_export_path=csv",
     "evaluate_segment_information",
-    "lc",
+    "lc --lc_max_merge_gap_m=2",
     "lc --lc_insert_lc_edge_instead_of_merging",
-    "lc; lc_report",
-    "lc; lc_report --which=refused --sort_by=near_miss",
+    "lc --lc_max_merge_gap_m=2; lc_report",
+    "lc --lc_max_merge_gap_m=2; lc_report --which=refused --sort_by=near_miss",
     "relax",
     "self_calibrate --dry_run",
-    "lc --lc_min_inlier_count=1000; why {closure}",
+    "lc --lc_max_merge_gap_m=2; why {closure}",
     "why {landmark}",
     "srelax",
     "summary_map --summary_map_save_path=summary; localize --localization_map=summary",
@@ -138,8 +141,12 @@ def test_reports(runner: Runner, line: str) -> None:
     *before, last = line.split("; ")
     for earlier in before:
         assert runner.run_text(earlier) == Status.OK
-    shown = screen_of(runner, screen, with_ids(runner.session, last))
+    line = with_ids(runner.session, last)
+    screen.steps, start = 0, time.process_time()
+    shown = screen_of(runner, screen, line)
+    seconds = time.process_time() - start
     assert shown
+    assert screen.steps or seconds < MOST_SECONDS_WITHOUT_BAR * slowness(), f"{seconds:.1f} s"
     errors = [item for item in shown if isinstance(item, str) and item.startswith("error: ")]
     assert errors == []
     blocks = [item for item in shown if not isinstance(item, str)]
