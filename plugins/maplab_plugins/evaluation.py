@@ -106,7 +106,7 @@ def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport
     see_also=("rovioli", "localize", "evaluate_trajectory"),
 )
 def evaluate_localization(
-    context: CommandContext,  # noqa: ARG001
+    context: CommandContext,
     *,
     localization_csv: str = "",
     ground_truth: Path,
