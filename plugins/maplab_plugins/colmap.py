@@ -24,8 +24,8 @@ _IMPORT = ColmapImportOptions()
 )
 def export_colmap(
     context: CommandContext,
-    *,
     colmap_folder: Path | None = None,
+    *,
     missions: str = "",
     options: ColmapExportOptions = _EXPORT,
     overwrite: bool = False,
@@ -60,8 +60,8 @@ def export_colmap(
 )
 def import_colmap(
     context: CommandContext,
-    *,
     colmap_folder: Path | None = None,
+    *,
     database: Path | None = None,
     options: ColmapImportOptions = _IMPORT,
     map_key: str = "",

@@ -38,8 +38,8 @@ class WrittenFiles(Report):
 @command("csv_export", example="csv_export --csv_export_path=csv", writes_files=True)
 def csv_export(
     context: CommandContext,
-    *,
     csv_export_path: Path | None = None,
+    *,
     options: CsvExportOptions = CsvExportOptions(),  # noqa: B008
     export_projected_descriptor: bool = False,
     lc_projection_matrix_filename: str = "",
@@ -90,8 +90,8 @@ def _projection(context: CommandContext, map_mission: str, file: str) -> Descrip
 )
 def csv_export_vertices_only(
     context: CommandContext,
-    *,
     csv_export_path: Path | None = None,
+    *,
     export_absolute_time: bool = False,
     map_mission: str = "",
     overwrite: bool = False,
@@ -185,8 +185,8 @@ def export_trajectory_to_csv(
 )
 def export_ncamera_calibration(
     context: CommandContext,
-    *,
     ncamera_calibration_export_folder: Path | None = None,
+    *,
     overwrite: bool = False,
 ) -> WrittenFiles:
     """Write the calibration of each camera rig of the map to a YAML file.
@@ -219,8 +219,8 @@ def export_ncamera_calibration(
 )
 def export_mission_info(
     context: CommandContext,
-    *,
     mission_info_export_path: Path | None = None,
+    *,
     overwrite: bool = False,
 ) -> WrittenFiles:
     """Write a YAML file that lists the mission ids of every map in memory.

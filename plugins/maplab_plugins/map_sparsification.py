@@ -38,8 +38,8 @@ def keyframe_heuristic(
 )
 def landmark_sparsify(
     context: CommandContext,
-    *,
     num_landmarks_to_keep: int = -1,
+    *,
     options: SparsificationOptions = _SPARSIFICATION,
     coverage_csv: Path | None = None,
     overwrite: bool = False,

@@ -19,9 +19,9 @@ _RELAXATION = RelaxationOptions()
 )
 def relax_external(
     context: CommandContext,
+    relax_external_loop_closures_file: Path | None = None,
     *,
     options: RelaxationOptions = _RELAXATION,
-    relax_external_loop_closures_file: Path | None = None,
     map_mission_list: str = "",
 ) -> RelaxationReport:
     """Relax the trajectories over loop closures from a file and the edges of the map.

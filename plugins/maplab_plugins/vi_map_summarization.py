@@ -24,8 +24,8 @@ _SIZE = SizeOptions()
 )
 def generate_summary_map_and_save_to_disk(
     context: CommandContext,
-    *,
     summary_map_save_path: Path | None = None,
+    *,
     options: SummaryMapOptions = _SUMMARY,
     features: FeatureTypeOptions = _FEATURES,
     overwrite: bool = False,

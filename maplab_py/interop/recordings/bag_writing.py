@@ -73,7 +73,7 @@ def format_of_path(path: Path, name: str = "") -> BagFormat:
     """
     if path.suffix in (".db3", ".mcap"):
         raise UserError(
-            f"{path}: a ROS 2 bag is written as a folder: leave {path.suffix} away and give --bag_format"
+            f"{path}: a ROS 2 bag is written as a folder: leave out {path.suffix} and give --bag_format"
         )
     is_file = path.suffix == ".bag"
     kind = BagFormat(name) if name else BagFormat.ROS1 if is_file else BagFormat.MCAP

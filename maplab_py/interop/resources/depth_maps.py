@@ -51,7 +51,7 @@ class DepthImportOptions:
     def __post_init__(self) -> None:
         """Check the ranges."""
         if self.depth_scale <= 0.0 or self.image_tolerance_ms < 0.0:
-            raise ValueError("depth_scale must be positive, image_tolerance_ms 0 or greater")
+            raise ValueError("--depth_scale must be positive, --image_tolerance_ms 0 or greater")
 
 
 def import_depth_maps(

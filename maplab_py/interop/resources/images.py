@@ -51,7 +51,7 @@ class ImageImportOptions:
     def __post_init__(self) -> None:
         """Check the ranges."""
         if self.image_tolerance_ms < 0.0 or self.every_nth < 1:
-            raise ValueError("image_tolerance_ms must be 0 or greater, every_nth 1 or greater")
+            raise ValueError("--image_tolerance_ms must be 0 or greater, --every_nth 1 or greater")
 
 
 def import_images(

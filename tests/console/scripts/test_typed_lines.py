@@ -273,3 +273,23 @@ def test_the_only_required_flag_may_be_given_by_position() -> None:
         required = [flag.name for flag in command.flags.values() if flag.is_required]
         if len(required) == 1 and not command.variadic:
             assert command.positional[:1] == (required[0],), command.name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "csv_export",
+        "csv_export_vertices_only",
+        "export_colmap",
+        "export_mission_info",
+        "export_ncamera_calibration",
+        "generate_summary_map_and_save_to_disk",
+        "import_colmap",
+        "landmark_sparsify",
+        "relax_external",
+    ],
+)
+def test_a_flag_without_which_a_command_refuses_may_be_given_by_position(name: str) -> None:
+    call = Session(load_registry()).parse([name, "9"])
+    (flag,) = call.command.positional
+    assert str(call.values[flag]) == "9"
