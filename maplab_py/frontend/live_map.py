@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
+from maplab_py.frontend.localization.online import LocalizedFrame
 from maplab_py.frontend.map_builder import MapBuilder
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
@@ -39,13 +40,57 @@ class LiveLandmarks:
         return np.array(list(self._places.values()), dtype=np.float64).reshape(-1, 3)
 
 
-def live_map(builder: MapBuilder, landmarks: LiveLandmarks) -> VIMap:
+class LiveLocalization:
+    """The path in a map in which the run is localised, and the latest matches."""
+
+    def __init__(self) -> None:
+        """Start without a path."""
+        self.T_G_M: F64 | None = None  # as it was estimated last
+        self._path: list[F64] = []
+        self.rays_G: F64 = np.zeros(
+            (0, 2, 3)
+        )  # from the body to the landmarks of the latest matches
+
+    def add(self, frame: LocalizedFrame, p_G: F64) -> None:
+        """Take a frame that is localised in a map with landmarks (L, 3)."""
+        if frame.pose is None:
+            return
+        self.T_G_M = frame.pose.T_G_M
+        position = frame.pose.T_G_I[4:]
+        self._path.append(position)
+        if frame.answer is not None:
+            seen = p_G[frame.answer.landmark]
+            self.rays_G = np.stack([np.broadcast_to(position, seen.shape), seen], axis=1)
+
+    def clear(self) -> None:
+        """Forget T_G_M: a new mission has another frame M. The path in the map stays."""
+        self.T_G_M, self.rays_G = None, np.zeros((0, 2, 3))
+        if self._path:
+            self._path.append(np.full(3, np.nan))
+
+    @property
+    def p_G_I(self) -> F64:
+        """Positions (N, 3) as estimated at their time; not numbers between two missions."""
+        return np.array(self._path).reshape(-1, 3)
+
+
+def live_map(builder: MapBuilder, landmarks: LiveLandmarks, T_G_M: F64 | None = None) -> VIMap:
     """Return the map so far, with the smoother's landmarks of its last mission.
+
+    Args:
+        builder: Of the map.
+        landmarks: Of the smoother.
+        T_G_M: Where the last mission (7,) lies in the map in which it is localised; None = unknown.
 
     Raises:
         EstimationError: There are fewer than two vertices.
     """
     vi_map = builder.make_map()
+    if T_G_M is not None:
+        frames, row = vi_map.baseframes, int(vi_map.missions.baseframe[-1])
+        poses = frames.T_G_M.copy()
+        poses[row] = T_G_M
+        vi_map = vi_map.replace(baseframes=frames.replace(T_G_M=poses))
     p_M = landmarks.p_M
     if not len(p_M):
         return vi_map

@@ -12,7 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, U8
 from maplab_py.errors import Cancelled, EstimationError, MaplabError
-from maplab_py.frontend.localization.online import OnlineLocalization
+from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
 from maplab_py.frontend.localization.opening import opened_localization
 from maplab_py.frontend.localization.record import LocalizationRecord
 from maplab_py.frontend.map_builder import MapBuilder
@@ -48,6 +48,7 @@ class Mapping:
         builder: The map so far; None without a map.
         localization: Where the odometry is in a map; None without a map to localise in.
         localized: What it has said of all frames.
+        localized_frame: What it has said of the newest frame; None before the first.
         statistics: Counts and times.
         problem: Why the run ended before the end of the recording; empty if it did not.
         is_ended_early: The user has ended the run before the end of the recording.
@@ -81,6 +82,7 @@ class Mapping:
         device, localization = recording.device, self.options.localization
         self.localization = opened_localization(localization, device, self.options.odometry.window)
         self.localized = LocalizationRecord()
+        self.localized_frame: LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"
         self.odometry = Odometry(
             device,
@@ -182,6 +184,7 @@ class Mapping:
         had_problem = localization.problem
         frame = localization.after_frame(update, self.odometry.smoother)
         self.localized.add(frame, update)
+        self.localized_frame = frame
         self.statistics.add_stage("localise", sum(frame.stage_ms.values()))
         if localization.problem and not had_problem:
             progress.line(f"not localised any more: {localization.problem}")

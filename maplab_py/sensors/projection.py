@@ -41,16 +41,8 @@ def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F6
     """
     p = np.asarray(p_C, dtype=np.float64)
     xi, focal, centre = _intrinsics(camera)
-    length = np.linalg.norm(p, axis=-1)
-    denominator = p[..., 2] + xi * length
-    visible = (denominator > _MIN_DENOMINATOR) & (p[..., 2] > -_cone(xi) * length)
-    denominator = np.where(visible, denominator, 1.0)
-    x = p[..., :2] / denominator[..., None]
-
-    limit = distortion.largest_radius(camera.distortion, camera.distortion_parameters)
-    inside = np.linalg.norm(x, axis=-1) < limit
-    x = np.where((visible & inside)[..., None], x, 0.0)
-    visible = visible & inside
+    x, length, denominator, visible = _normalised(camera, p)
+    x = np.where(visible[..., None], x, 0.0)
     x_d, dx_d_dx, dx_d_dk = distortion.distort(camera.distortion, camera.distortion_parameters, x)
 
     # d denominator / d p = e_z + xi p / |p|
@@ -65,6 +57,11 @@ def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F6
         dx_dxi = -x * (length / denominator)[..., None]
         columns.insert(0, duv_dx @ dx_dxi[..., None])
     return focal * x_d + centre, duv_dx @ dx_dp, np.concatenate(columns, axis=-1), visible
+
+
+def is_visible(camera: Camera, p_C: ArrayLike) -> Mask:
+    """Tell which points (..., 3) are visible, as `project` does, without projecting them."""
+    return _normalised(camera, np.asarray(p_C, dtype=np.float64))[3]
 
 
 def back_project(camera: Camera, uv: ArrayLike) -> tuple[F64, Mask]:
@@ -102,6 +99,18 @@ def _intrinsics(camera: Camera) -> tuple[float, F64, F64]:
     if camera.projection is Projection.UNIFIED:
         return float(values[0]), values[1:3], values[3:5]
     return 0.0, values[:2], values[2:4]
+
+
+def _normalised(camera: Camera, p: F64) -> tuple[F64, F64, F64, Mask]:
+    """Return x (..., 2), |p|, z + xi |p| (1 where not positive), and which points are visible."""
+    xi = _intrinsics(camera)[0]
+    length = np.linalg.norm(p, axis=-1)
+    denominator = p[..., 2] + xi * length
+    visible = (denominator > _MIN_DENOMINATOR) & (p[..., 2] > -_cone(xi) * length)
+    denominator = np.where(visible, denominator, 1.0)
+    x = p[..., :2] / denominator[..., None]
+    limit = distortion.largest_radius(camera.distortion, camera.distortion_parameters)
+    return x, length, denominator, visible & (np.linalg.norm(x, axis=-1) < limit)
 
 
 def _cone(xi: float) -> float:

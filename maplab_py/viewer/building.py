@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
@@ -18,17 +19,21 @@ from maplab_py.viewer.layers import (
     clouds,
     covariances,
     landmarks,
+    localization,
     paths,
     references,
 )
 from maplab_py.viewer.layers.clouds import Cloud
+from maplab_py.viewer.layers.localization import LocalizedRun
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Extent, Layer, MissionEntry, Scene
+from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
 
 _MAX_RAYS = 60_000
+_OUTLINE_POINTS = 1500
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,6 +49,7 @@ class Subject:
     truth: Trajectory | None = None
     clouds: tuple[Cloud, ...] = ()
     segments: MarkedSegments | None = None
+    localized: LocalizedRun | None = None
     shows_observers: bool = False
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
     only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
@@ -96,6 +102,8 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
         rows = _good_landmarks(drawing)
         layers.append(cameras.landmark_observers(drawing, rows, _MAX_RAYS))
     layers += clouds.layers_of_clouds(drawing, subject.clouds)
+    if subject.localized is not None:
+        layers += localization.localized_layers(drawing, subject.localized)
     if subject.truth is not None:
         layers += references.ground_truth(drawing, subject.truth)
     if subject.other is not None and subject.side_by_side:
@@ -108,6 +116,8 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers += added
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
     extent = drawing.extent
+    if subject.localized is not None:
+        extent = _widened(extent, subject.localized.p_G - drawing.origin_G)
     notes = [note for layer in layers for note in layer.notes] + unreadable + problems
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
@@ -122,12 +132,16 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
 def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:
     """Return the extent of the map together with the path of another state of it."""
     shift = beside.shift_beside(drawing, other) if side_by_side else -drawing.origin_G
-    path = other.T_G_I[:, 4:] + shift
-    path = path[np.isfinite(path).all(axis=1)]
-    outline = np.concatenate([drawing.extent.outline, path])
+    return _widened(drawing.extent, other.T_G_I[:, 4:] + shift)
+
+
+def _widened(extent: Extent, p: F64) -> Extent:
+    """Return an extent that has points (N, 3), too."""
+    p = p[np.isfinite(p).all(axis=1)]
+    outline = np.concatenate([extent.outline, p[spread_rows(p, _OUTLINE_POINTS)]])
     low, high = outline.min(axis=0), outline.max(axis=0)
-    radius = max(0.5 * float(np.linalg.norm(high - low)), drawing.extent.radius_m)
-    return Extent(0.5 * (low + high), radius, drawing.extent.floor_m, outline)
+    radius = max(0.5 * float(np.linalg.norm(high - low)), extent.radius_m)
+    return Extent(0.5 * (low + high), radius, extent.floor_m, outline)
 
 
 def mission_entries(drawing: Drawing) -> tuple[MissionEntry, ...]:

@@ -131,24 +131,29 @@ class _Several:
 
 
 class _Pictures:
-    """Shows a run in the viewer: path, landmarks, image with keypoints."""
+    """Shows a run in the viewer: path, landmarks, image with keypoints, and the map it is localised in."""
 
     def __init__(self, viewer: Viewer, title: str, interval_s: float) -> None:
         """Show at most once in an interval."""
-        from maplab_py.frontend.live_map import LiveLandmarks
+        from maplab_py.frontend.live_map import LiveLandmarks, LiveLocalization
 
         self._viewer, self._title, self._interval_s = viewer, title, interval_s
-        self._landmarks = LiveLandmarks()
+        self._landmarks, self._localized = LiveLandmarks(), LiveLocalization()
         self._mission, self._next_s = -1, 0.0
 
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Take the landmarks of a frame, and show everything when it is time."""
         from maplab_py.frontend.live_map import live_map, picture_of_tracks
         from maplab_py.viewer.building import Subject
+        from maplab_py.viewer.layers.localization import LocalizedRun
 
         if update.mission != self._mission:
             self._mission = update.mission
             self._landmarks.clear()
+            self._localized.clear()
+        localization, frame = mapping.localization, mapping.localized_frame
+        if localization is not None and frame is not None:
+            self._localized.add(frame, localization.p_G)
         if update.window is not None and update.window.is_keyframe:
             self._landmarks.update(*mapping.odometry.landmarks())
         now_s = time.perf_counter()
@@ -158,8 +163,11 @@ class _Pictures:
         self._viewer.show_image(picture_of_tracks(update))
         if mapping.builder is not None:
             with contextlib.suppress(EstimationError):  # there are too few vertices yet
-                vi_map = live_map(mapping.builder, self._landmarks)
-                self._viewer.follow(Subject(vi_map, self._title))
+                live = self._localized
+                vi_map, run = live_map(mapping.builder, self._landmarks, live.T_G_M), None
+                if localization is not None and live.T_G_M is not None:
+                    run = LocalizedRun(localization.p_G, live.p_G_I, live.rays_G)
+                self._viewer.follow(Subject(vi_map, self._title, localized=run))
 
 
 def _observer(context: CommandContext, title: str, interval_s: float) -> Observer:

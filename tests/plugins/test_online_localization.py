@@ -13,6 +13,8 @@ from maplab_py.frontend.reports import MappingReport
 from maplab_py.interop.trajectories import Trajectory, write_euroc
 from maplab_py.storage.native import save_map
 from maplab_py.storage.summary_map import write_summary_map
+from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.viewer import Viewer
 from tests.frontend.localization.places import place, summary
 
 
@@ -144,3 +146,37 @@ def test_a_perfect_trajectory_has_no_errors(folders: Path) -> None:
     assert errors.localized_share == 1.0
     assert errors.largest_m == pytest.approx(0.0, abs=1e-12)
     assert np.isclose(errors.first_localized_s, 0.0)
+
+
+def test_the_viewer_shows_the_map_both_paths_and_the_matches(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Subject] = []
+    monkeypatch.setattr(Viewer, "pages", property(lambda _: 1))
+    monkeypatch.setattr(Viewer, "follow", lambda _, subject: shown.append(subject))
+    with Session() as session:
+        session.run("set", "--viewer_port=0")
+        session.run(
+            "rovioli", datasource_folder=folders / "query", map_publish_interval_s=0.0,
+            vio_localization_map_folder=folders / "summary", rovioli_visualize_map=True,
+        )  # fmt: skip
+    assert shown[0].localized is None  # not localised yet
+    subject = shown[-1]
+    run = subject.localized
+    assert run is not None
+    where = place()
+    np.testing.assert_array_equal(run.p_G, summary().p_G)
+    rows = np.searchsorted(where.times_ns, subject.vi_map.vertices.timestamp_ns)
+    error_m = np.linalg.norm(subject.vi_map.T_G_I[:, 4:] - where.T_G_I[rows, 4:], axis=1)
+    assert np.median(error_m) < 0.1  # the map of the run is drawn in G
+    nearest = np.linalg.norm(run.p_G_I[:, None] - where.T_G_I[:, 4:], axis=2).min(axis=1)
+    assert np.nanmax(nearest) < 0.3
+    assert len(run.rays_G) >= 5
+    scene = build_scene(subject)
+    drawn = {layer.name: layer.drawn for layer in scene.layers}
+    assert drawn["map_landmarks"] == len(run.p_G)
+    assert drawn["localized_path"] == len(run.p_G_I) - 1
+    assert drawn["map_matches"] == len(run.rays_G)
+    assert drawn["trajectories"] > 0
+    outline = scene.extent.outline
+    assert np.all(outline.max(axis=0) >= np.percentile(run.p_G, 90.0, axis=0))

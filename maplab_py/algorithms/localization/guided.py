@@ -19,6 +19,8 @@ from maplab_py.vimap.table import ragged_rows
 _RANGE_FACTOR = 2.0
 _TURN_RAD = np.deg2rad(40.0)
 """Tolerance on the distance and view direction from which a landmark is expected to be visible."""
+_ROUNDING = 1e-9
+"""Of coordinates of unit vectors."""
 
 
 def guided_matches(
@@ -71,10 +73,14 @@ def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
     """Return which landmarks (L,) may be visible from a position, given where they were observed."""
     s = database.sights
     toward = p_G_I - database.p_G
-    distance = np.linalg.norm(toward, axis=1)
-    cosine = np.einsum("li,li->l", toward, s.direction) / np.maximum(distance, 1e-9)
+    x, y, z = toward.T
+    distance = np.sqrt(x * x + y * y + z * z)
     inside = (distance < _RANGE_FACTOR * s.farthest_m) & (distance * _RANGE_FACTOR > s.nearest_m)
-    return np.asarray(inside & (cosine > np.cos(np.minimum(s.spread_rad + _TURN_RAD, np.pi))))
+    rows = np.flatnonzero(inside)
+    (a, b, c), (x, y, z) = s.direction[rows].T, toward[rows].T
+    cosine = (a * x + b * y + c * z) / np.maximum(distance[rows], 1e-9)
+    inside[rows] = cosine > np.cos(np.minimum(s.spread_rad[rows] + _TURN_RAD, np.pi))
+    return np.asarray(inside)
 
 
 def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I64, I64]:
@@ -87,15 +93,37 @@ def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I6
         toward = p_I - centre
         toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-9)[:, None]
         in_view = np.flatnonzero(_in_cone(ray_I[mine], float(radius_rad[mine].max()), toward))
-        x, y, z = toward[in_view].T
+        ray, point = _candidates(ray_I[mine], radius_rad[mine], toward[in_view])
         # written out: BLAS threads do not pay off for an inner dimension of 3
-        cosine = ray_I[mine, :1] * x + ray_I[mine, 1:2] * y + ray_I[mine, 2:] * z
-        ray, point = np.nonzero(cosine > np.cos(radius_rad[mine])[:, None])
+        (a, b, c), (x, y, z) = ray_I[mine[ray]].T, toward[in_view[point]].T
+        near = a * x + b * y + c * z > np.cos(radius_rad[mine])[ray]
+        ray, point = ray[near], point[near]
+        order = np.lexsort((point, ray))
+        ray, point = ray[order], point[order]
         keypoints.append(mine[ray])
         points.append(in_view[point])
     keypoint, point = np.concatenate(keypoints), np.concatenate(points)
     order = np.argsort(keypoint, kind="stable")
     return keypoint[order], point[order]
+
+
+def _candidates(ray: F64, radius_rad: F64, toward: F64) -> tuple[I64, I64]:
+    """Return the pairs of rays (R, 3) and directions (N, 3) that are near in two coordinates.
+
+    Unit vectors no more than an angle apart differ by no more than that angle along any axis.
+    """
+    first_axis, second_axis = np.argsort(-np.ptp(ray, axis=0), kind="stable")[:2]
+    order = np.argsort(toward[:, first_axis], kind="stable")
+    along, across = toward[order, first_axis], toward[order, second_axis]
+    reach, place = radius_rad + _ROUNDING, ray[:, first_axis]
+    first = np.searchsorted(along, place - reach, side="left")
+    count = np.searchsorted(along, place + reach, side="right") - first
+    end = np.cumsum(count)
+    row = np.arange(end[-1]) - np.repeat(end - count - first, count)
+    of_ray = np.repeat(np.arange(len(ray)), count)
+    offset = across[row] - np.repeat(ray[:, second_axis], count)
+    near = np.flatnonzero(np.abs(offset) <= np.repeat(reach, count))
+    return of_ray[near], order[row[near]]
 
 
 def _in_cone(ray: F64, radius_rad: float, toward: F64) -> NDArray[np.bool_]:

@@ -1,9 +1,9 @@
 """Observations of landmarks of a map by the frames of a window, whose base frame T_G_M is estimated.
 
-The residual is e = (proj(T_C_I T_I_M T_M_G p_G) - z) / sigma (Schneider 2019, Paper I, eq. 4.4). A window
-has few of them, so they are evaluated by array operations, with the exact derivatives of
-`sensors.projection`. The landmark p_G is known, or a state with a prior N(p_G, Sigma_G) that is eliminated
-with all its observations, so that several views of a wrong landmark are not independent facts.
+The residual is e = (proj(T_C_I T_I_M T_M_G p_G) - z) / sigma (Schneider 2019, Paper I, eq. 4.4). A
+compiled kernel evaluates it; a window has few of them, so array operations do the rest. The landmark p_G
+is known, or a state with a prior N(p_G, Sigma_G) that is eliminated with all its observations, so that
+several views of a wrong landmark are not independent facts.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
+from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import project_with_jacobians
+from maplab_py.sensors.projection import is_visible
 
 _BEHIND = 1e4
 """Squared whitened residual of a landmark that the camera cannot see: an outlier of a fixed size."""
@@ -110,25 +111,32 @@ class MapTerms:
         """
         seen = self.observations
         count = len(seen)
-        R_G_M, R_M_I = so3.to_matrix(T_G_M[:4]), so3.to_matrix(T_M_I[seen.frame, :4])
-        p_M = (p_G - T_G_M[4:]) @ R_G_M
-        p_M = p_M[seen.landmark]
-        p_I = ((p_M - T_M_I[seen.frame, 4:])[:, None] @ R_M_I)[:, 0]
-        residual, of_I = np.zeros((count, 2)), np.zeros((count, 2, 3))
-        is_visible: Mask = np.zeros(count, dtype=np.bool_)
+        residual, jacobian = np.zeros((count, 2)), np.zeros((count, 2, 15))
+        visible: Mask = np.zeros(count, dtype=np.bool_)
+        p_I = self._in_bodies(T_M_I, T_G_M, p_G)
         for row, camera in enumerate(self._cameras):
-            mine = np.flatnonzero(seen.camera == row)
             R_I_C = so3.to_matrix(self._T_I_C[row, :4])
-            p_C = (p_I[mine] - self._T_I_C[row, 4:]) @ R_I_C
-            uv_px, of_C, _, is_visible[mine] = project_with_jacobians(camera, p_C)
-            residual[mine], of_I[mine] = uv_px - seen.uv_px[mine], of_C @ R_I_C.T
-        weight = np.where(is_visible, 1.0 / seen.sigma_px, 0.0)
-        residual, of_I = residual * weight[:, None], of_I * weight[:, None, None]
-        of_M = of_I @ R_M_I.transpose(0, 2, 1)
-        of_G = of_M @ R_G_M.T
-        of_frame = np.concatenate([-of_M, of_I @ so3.skew(p_I)], axis=2)
-        of_base = np.concatenate([-of_G, of_M @ so3.skew(p_M)], axis=2)
-        return MapResiduals(residual, of_frame, of_base, of_G, is_visible)
+            mine = np.flatnonzero(seen.camera == row)
+            mine = mine[is_visible(camera, (p_I[mine] - self._T_I_C[row, 4:]) @ R_I_C)]
+            visible[mine] = True
+            parameters = np.concatenate([camera.intrinsics, camera.distortion_parameters])
+            arguments = np.empty((len(mine), 26 + len(parameters)))
+            arguments[:, :7], arguments[:, 7:14] = T_M_I[seen.frame[mine]], T_G_M
+            arguments[:, 14:21], arguments[:, 21:-5] = self._T_I_C[row], parameters
+            arguments[:, -5:-2], arguments[:, -2:] = p_G[seen.landmark[mine]], seen.uv_px[mine]
+            weight = np.eye(2) / seen.sigma_px[mine, None, None]
+            kernel = map_reprojection_kernel(camera.projection, camera.distortion)
+            residual[mine], jacobian[mine] = kernel.evaluated(arguments, weight)
+        of_frame, of_base, of_landmark = np.split(jacobian, [6, 12], axis=2)
+        return MapResiduals(residual, of_frame, of_base, of_landmark, visible)
+
+    def _in_bodies(self, T_M_I: F64, T_G_M: F64, p_G: F64) -> F64:
+        """Return the landmark of every observation in the frame of its body (O, 3)."""
+        seen = self.observations
+        p_M = (p_G - T_G_M[4:]) @ so3.to_matrix(T_G_M[:4])
+        R_M_I = so3.to_matrix(T_M_I[:, :4])[seen.frame]
+        from_body = p_M[seen.landmark] - T_M_I[seen.frame, 4:]
+        return np.asarray((from_body[:, None] @ R_M_I)[:, 0])
 
     def errors_px(self, states: WindowStates) -> F64:
         """Return the reprojection error (O,) of every observation; infinite where it is not visible."""

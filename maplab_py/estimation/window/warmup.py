@@ -21,6 +21,7 @@ from maplab_py.estimation.kernels.window_arguments import (
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection, camera_table
+from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
@@ -69,6 +70,7 @@ def _run_landmarks(projection: Projection, distortion: Distortion) -> None:
     module.substitute(data, at, rule, kept, np.zeros(2 * FRAME_SIZE), new)
     module.evaluate(data, at, np.empty((2, 2)))
     BackProjection(module, (camera,), table).rays(row, uv)
+    map_reprojection_kernel(projection, distortion).compile_kernel()
 
 
 def _run_frames() -> None:

@@ -143,6 +143,11 @@ class OnlineLocalization:
                 self.counts.first_localized_ns = update.time_ns
         return LocalizedFrame(update.time_ns, state, pose, answer, spent_ms)
 
+    @property
+    def p_G(self) -> F64:
+        """Landmarks (L, 3) of the map."""
+        return self._matcher.p_G
+
     def take(self, answer: Answer, smoother: FixedLagSmoother) -> bool:
         """Use an answer, which may be late; tell whether it was used.
 

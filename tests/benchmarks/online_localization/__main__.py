@@ -1,8 +1,8 @@
-"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc [options]`.
+"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc|timings [options]`.
 
 `simulated` rebuilds table 4.1 of the thesis: share of the map's landmarks, absolute error of VIL, SWL,
 pose and ODO (median and standard deviation), and NEES of T_G_I. `euroc` localises pieces of V1_01 in
-the others. Without map tracking the matcher is the thesis'.
+the others; `timings` rebuilds table 4.2. Without map tracking the matcher is the thesis'.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ import numpy as np
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from tests.benchmarks.online_localization import euroc
-from tests.benchmarks.online_localization.modes import MODES, PoseErrors, compare, pose_errors
+from tests.benchmarks.online_localization import euroc, timings
+from tests.benchmarks.online_localization.modes import MODES, compare_all, pose_errors
 from tests.benchmarks.online_localization.simulated import SHARES, Setting, searched, setting
 from tests.frontend.known_start import KnownStart
 from tests.support.data import shared_data_folder
+
+Row = dict[str, Any]
 
 VARIANTS = {
     "none": OnlineLocalizationOptions(),
@@ -36,47 +38,54 @@ SPARSE = LocalizationOptions(min_inlier_count=6)
 """Of the simulated maps: 2.5 % are about a hundred landmarks. Two answers have to agree anyway."""
 
 
-def measured(
-    of: Setting, share: float, options: OnlineLocalizationOptions
-) -> tuple[dict[str, PoseErrors], dict[str, Any]]:
-    """Return errors by mode, and counts and processor times, at one share of the landmarks."""
-    summary = of.summary(share)
-    truth = of.truth_in_map(summary)
-    map_ = searched(summary, share, with_covariances=options.rule.estimates_landmarks)
+def of_seed(seed: int, of: Setting, shares: list[float], variants: list[str]) -> list[Row]:
+    """Return errors, counts and processor times of all shares and variants of a seed; print each."""
+    print(f"seed {seed}: {of.landmarks} good landmarks", flush=True)
+    keys, cases, truths = [], [], []
+    for share in shares:
+        summary = of.summary(share)
+        truth = of.truth_in_map(summary)
+        for variant in variants:
+            options = dataclasses.replace(VARIANTS[variant], matching=SPARSE)
+            has_covariances = options.rule.estimates_landmarks
+            cases.append((searched(summary, share, with_covariances=has_covariances), options))
+            keys.append((share, variant))
+            truths.append(truth)
     start = KnownStart(of.start, with_biases=True)
-    result = compare(MapRecording(of.query, 0), map_, options, make_starter=start)
-    errors = {
-        mode: pose_errors(result.results[mode], of.times_ns, truth, result.frames) for mode in MODES
-    }
-    spent = {name: float(np.median(ms)) for name, ms in result.cpu_ms.items() if len(ms)}
-    return errors, {
-        "landmarks": len(map_.database.p_G),
-        "cpu_ms": spent,
-        **dataclasses.asdict(result.counts),
-    }
-
-
-def simulated(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Run all seeds, shares and variants; print each and the medians."""
-    rows: list[dict[str, Any]] = []
-    for seed in arguments.seeds:
-        of = setting(seed, duration_s=arguments.seconds, landmarks=arguments.landmarks)
-        print(f"seed {seed}: {of.landmarks} good landmarks", flush=True)
-        for share in arguments.shares:
-            for variant in arguments.variants:
-                options = dataclasses.replace(VARIANTS[variant], matching=SPARSE)
-                errors, rest = measured(of, share, options)
-                for mode, error in errors.items():
-                    row = {"seed": seed, "share": share, "variant": variant, "mode": mode}
-                    rows.append({**row, **dataclasses.asdict(error), **rest})
-                    print(_line(rows[-1]), flush=True)
-        print_medians(rows)
-        if arguments.json:
-            arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    results = compare_all(MapRecording(of.query, 0), cases, make_starter=start)
+    rows: list[Row] = []
+    for (share, variant), (map_, _), truth, result in zip(
+        keys, cases, truths, results, strict=True
+    ):
+        spent = {name: float(np.median(ms)) for name, ms in result.cpu_ms.items() if len(ms)}
+        counts = dataclasses.asdict(result.counts)
+        for mode in MODES:
+            error = pose_errors(result.results[mode], of.times_ns, truth, result.frames)
+            row = {"seed": seed, "share": share, "variant": variant, "mode": mode}
+            row |= {**dataclasses.asdict(error), **counts}
+            rows.append({**row, "landmarks": len(map_.database.p_G), "cpu_ms": spent})
+            print(_line(rows[-1]), flush=True)
     return rows
 
 
-def print_medians(rows: list[dict[str, Any]]) -> None:
+def simulated(arguments: argparse.Namespace) -> list[Row]:
+    """Run all seeds, or read those that the folder has; print their medians."""
+    rows: list[Row] = []
+    for seed in arguments.seeds:
+        file = None if arguments.folder is None else arguments.folder / f"seed_{seed}.json"
+        if file is not None and file.exists():
+            rows += json.loads(file.read_text(encoding="utf-8"))
+            continue
+        of = setting(seed, duration_s=arguments.seconds, landmarks=arguments.landmarks)
+        rows += of_seed(seed, of, arguments.shares, arguments.variants)
+        if file is not None:
+            chosen = [row for row in rows if row["seed"] == seed]
+            file.write_text(json.dumps(chosen, indent=1) + "\n", encoding="utf-8")
+    print_medians(rows)
+    return rows
+
+
+def print_medians(rows: list[Row]) -> None:
     """Print medians over the seeds, and how often VIL is better than every baseline."""
     keys = dict.fromkeys((row["variant"], row["share"]) for row in rows)
     for variant, share in keys:
@@ -99,7 +108,7 @@ def print_medians(rows: list[dict[str, Any]]) -> None:
         )
 
 
-def real(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def real(arguments: argparse.Namespace) -> list[Row]:
     """Localise pieces of V1_01 in the others; print errors by mode."""
     shared, rows = shared_data_folder(), []
     for variant in arguments.variants:
@@ -126,14 +135,18 @@ def _line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Run a study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("study", choices=("simulated", "euroc"))
+    parser.add_argument("study", choices=("simulated", "euroc", "timings"))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1, 11)))
     parser.add_argument("--shares", type=float, nargs="+", default=list(SHARES))
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=["none", "map"])
     parser.add_argument("--seconds", type=float, default=30.0, help="of a flight")
     parser.add_argument("--landmarks", type=int, default=12_000, help="of the room")
+    parser.add_argument("--folder", type=Path, help="with a file per seed; seeds in it are not run")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    if arguments.study == "timings":
+        timings.main()
+        return
     rows = simulated(arguments) if arguments.study == "simulated" else real(arguments)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

@@ -15,9 +15,10 @@ from maplab_py.frontend.localization.online import LocalizationCounts, OnlineLoc
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.starting import MakeStarter
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.protocol import ImuBatch, Recording, TrackedFrameSet
+from maplab_py.interop.recordings.protocol import Event, ImuBatch, Recording, TrackedFrameSet
 from maplab_py.interop.recordings.stream import EventStream
 
 BASELINES = ("swl", "pose", "odo")
@@ -54,55 +55,108 @@ def compare(
     odometry_options: OdometryOptions | None = None,
 ) -> Comparison:
     """Run the odometry with VIL and, beside it, the odometry without a map with the baselines."""
+    return compare_all(
+        recording,
+        [(searched, options)],
+        make_starter=make_starter,
+        odometry_options=odometry_options,
+    )[0]
+
+
+def compare_all(
+    recording: Recording,
+    cases: list[tuple[SearchedMap, OnlineLocalizationOptions]],
+    *,
+    make_starter: MakeStarter | None = None,
+    odometry_options: OdometryOptions | None = None,
+) -> list[Comparison]:
+    """Compare the modes in several maps or with several options; they share the odometry without a map."""
     odometry_options = odometry_options or OdometryOptions()
     device = recording.device
     plain = Odometry(device, odometry_options, make_starter=make_starter)
-    tight = Odometry(device, odometry_options, make_starter=make_starter, map_rule=options.rule)
-    localization = OnlineLocalization(searched, device, options, odometry_options.window)
-    estimators: dict[str, MapEstimator] = {
-        mode: make_estimator(mode, device, options.rule, odometry_options.window)
-        for mode in BASELINES
-    }
-    rows: dict[str, list[tuple[int, F64, F64, F64]]] = {mode: [] for mode in MODES}
-    spent: dict[str, list[float]] = {
-        name: [] for name in ("odo window", "vil window", "match", "swl")
-    }
+    runs = [
+        _Case(
+            Odometry(device, odometry_options, make_starter=make_starter, map_rule=options.rule),
+            OnlineLocalization(searched, device, options, odometry_options.window),
+            {
+                mode: make_estimator(mode, device, options.rule, odometry_options.window)
+                for mode in BASELINES
+            },
+        )
+        for searched, options in cases
+    ]
     frames = estimated = 0
+    odo_ms: list[float] = []
     for event in EventStream(recording):
-        pushed = []
-        for name, odometry in (("odo window", plain), ("vil window", tight)):
+        of_plain, spent_ms = pushed(plain, event)
+        odo_ms += spent_ms
+        frames += len(of_plain)
+        estimated += sum(update.state is not None for update in of_plain)
+        for case in runs:
+            case.push(event, of_plain, plain.smoother)
+    return [case.result(frames, estimated, odo_ms) for case in runs]
+
+
+def pushed(odometry: Odometry, event: Event) -> tuple[list[OdometryUpdate], list[float]]:
+    """Return the updates of an event, and the processor time of each [ms]."""
+    began = time.process_time()
+    if isinstance(event, ImuBatch):
+        updates = odometry.push_imu(event)
+    else:
+        assert isinstance(event, TrackedFrameSet)
+        updates = odometry.push_tracks(event)
+    spent_ms = 1e3 * (time.process_time() - began)
+    return updates, [spent_ms / len(updates) for _ in updates]
+
+
+class _Case:
+    """VIL and the baselines in one map."""
+
+    def __init__(
+        self,
+        tight: Odometry,
+        localization: OnlineLocalization,
+        estimators: dict[str, MapEstimator],
+    ) -> None:
+        self._tight, self._localization, self._estimators = tight, localization, estimators
+        self._rows: dict[str, list[tuple[int, F64, F64, F64]]] = {mode: [] for mode in MODES}
+        self._spent: dict[str, list[float]] = {name: [] for name in ("vil window", "match", "swl")}
+
+    def push(
+        self, event: Event, of_plain: list[OdometryUpdate], smoother: FixedLagSmoother | None
+    ) -> None:
+        """Take an event, and what the odometry without a map has made of it."""
+        of_tight, spent_ms = pushed(self._tight, event)
+        self._spent["vil window"] += spent_ms
+        for plain, tight in zip(of_plain, of_tight, strict=True):
             began = time.process_time()
-            if isinstance(event, ImuBatch):
-                updates = odometry.push_imu(event)
-            else:
-                assert isinstance(event, TrackedFrameSet)
-                updates = odometry.push_tracks(event)
-            if updates:
-                spent[name].append(1e3 * (time.process_time() - began) / len(updates))
-            pushed.append(updates)
-        for of_plain, of_tight in zip(*pushed, strict=True):
-            frames += 1
-            began = time.process_time()
-            frame = localization.after_frame(of_tight, tight.smoother)
+            frame = self._localization.after_frame(tight, self._tight.smoother)
             if frame.answer is not None:
-                spent["match"].append(1e3 * (time.process_time() - began))
-            smoother = plain.smoother
-            if of_plain.state is None or smoother is None:
+                self._spent["match"].append(1e3 * (time.process_time() - began))
+            if plain.state is None or smoother is None:
                 continue
-            estimated += 1
-            for map_event in localization.events:
-                for mode, estimator in estimators.items():
-                    began = time.process_time()
-                    localization.apply(map_event, smoother, estimator)
-                    if mode == "swl":
-                        spent["swl"].append(1e3 * (time.process_time() - began))
-            if frame.pose is not None and of_tight.state is not None:
-                pose, T_M_I = frame.pose, of_tight.state.T_M_I[0]
-                rows["vil"].append((of_tight.time_ns, pose.T_G_I, T_M_I, pose.covariance))
-            _add_baselines(rows, estimators, smoother, of_plain.time_ns)
-    results = {mode: _result(values) for mode, values in rows.items()}
-    times = {name: np.array(values) for name, values in spent.items()}
-    return Comparison(results, localization.counts, frames, estimated, times)
+            self._tell_baselines(smoother)
+            if frame.pose is not None and tight.state is not None:
+                pose, T_M_I = frame.pose, tight.state.T_M_I[0]
+                self._rows["vil"].append((tight.time_ns, pose.T_G_I, T_M_I, pose.covariance))
+            _add_baselines(self._rows, self._estimators, smoother, plain.time_ns)
+
+    def result(self, frames: int, estimated: int, odo_ms: list[float]) -> Comparison:
+        """Return what all modes have estimated."""
+        times = {name: np.array(values) for name, values in self._spent.items()}
+        return Comparison(
+            {mode: _result(values) for mode, values in self._rows.items()},
+            self._localization.counts, frames, estimated,
+            {"odo window": np.array(odo_ms), **times},
+        )  # fmt: skip
+
+    def _tell_baselines(self, smoother: FixedLagSmoother) -> None:
+        for map_event in self._localization.events:
+            for mode, estimator in self._estimators.items():
+                began = time.process_time()
+                self._localization.apply(map_event, smoother, estimator)
+                if mode == "swl":
+                    self._spent["swl"].append(1e3 * (time.process_time() - began))
 
 
 def _add_baselines(

@@ -11,8 +11,10 @@ from maplab_py.array_types import F64
 from maplab_py.estimation.kernels.window_arguments import DenseSystem
 from maplab_py.estimation.window.alignment import AlignmentProblem, aligned
 from maplab_py.estimation.window.localized import composition_jacobian
+from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
+from maplab_py.estimation.window.warmup import window_jobs
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import project
@@ -229,6 +231,29 @@ def test_alignment_gradient_is_the_derivative_of_its_cost() -> None:
             for s in (1, -1)
         )
         assert linear.gradient[k] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)
+
+
+def test_residuals_are_those_of_the_camera_models() -> None:
+    """The compiled kernel projects as `sensors.projection` does, with every model of cameras."""
+    terms, states = window()
+    now, seen = terms.evaluate(states.T_M_I, states.T_G_M[0], states.p_G), terms.observations
+    cameras, T_I_C = rig()
+    for row, camera in enumerate(cameras):
+        mine = seen.camera == row
+        T_G_C = se3.compose(se3.compose(T_G_M, states.T_M_I[seen.frame[mine]]), T_I_C[row])
+        p_C = se3.transform(se3.inverse(T_G_C), seen.p_G[seen.landmark[mine]])
+        expected = (project(camera, p_C)[0] - seen.uv_px[mine]) / seen.sigma_px[mine, None]
+        np.testing.assert_allclose(now.residual[mine], expected, atol=1e-9)
+
+
+def test_the_warmup_compiles_what_terms_evaluate() -> None:
+    window_jobs()["window PINHOLE RADTAN"]()
+    kernel = map_reprojection_kernel(Projection.PINHOLE, Distortion.RADTAN).evaluate
+    ahead = set(kernel.signatures)
+    terms, states = window()
+    terms.evaluate(states.T_M_I, states.T_G_M[0], states.p_G)
+    assert ahead == set(kernel.signatures)
+    assert ahead
 
 
 def test_composition_jacobian_is_that_of_differences() -> None:
