@@ -21,6 +21,9 @@ from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DescriptorProjection
 
+_TURN_RAD = np.deg2rad(40.0)
+"""Tolerance on the view direction from which a landmark is expected to be visible."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sights:
@@ -30,6 +33,11 @@ class Sights:
     spread_rad: F64  # (L,) largest angle of an observer from there
     nearest_m: F64  # (L,) distances of the observers
     farthest_m: F64  # (L,)
+
+    @cached_property
+    def least_cosine(self) -> F64:
+        """Cosine (L,) of the largest angle from `direction` from which a landmark may be visible."""
+        return np.asarray(np.cos(np.minimum(self.spread_rad + _TURN_RAD, np.pi)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ from maplab_py.geometry import se3
 from maplab_py.vimap.table import ragged_rows
 
 _RANGE_FACTOR = 2.0
-_TURN_RAD = np.deg2rad(40.0)
-"""Tolerance on the distance and view direction from which a landmark is expected to be visible."""
+"""Tolerance on the distance from which a landmark is expected to be visible."""
 _ROUNDING = 1e-9
 """Of coordinates of unit vectors."""
 
@@ -79,7 +78,7 @@ def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
     rows = np.flatnonzero(inside)
     (a, b, c), (x, y, z) = s.direction[rows].T, toward[rows].T
     cosine = (a * x + b * y + c * z) / np.maximum(distance[rows], 1e-9)
-    inside[rows] = cosine > np.cos(np.minimum(s.spread_rad[rows] + _TURN_RAD, np.pi))
+    inside[rows] = cosine > s.least_cosine[rows]
     return np.asarray(inside)
 
 

@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
@@ -49,12 +49,10 @@ class AlignmentProblem:
         damping: float,  # noqa: ARG002
     ) -> AlignmentLinearization:
         """Form the normal equations."""
-        first = FRAME_SIZE * len(states)
-        system = DenseSystem.zeros(first + 6)
-        _, costs = self._terms.add_to(system, states, states)
+        square, gradient, costs = self._terms.of_base_frame(states)
         residual, jacobian = self._prior(states)
-        square = system.matrix[first:, first:] + jacobian.T @ jacobian
-        gradient = system.gradient[first:] + jacobian.T @ residual
+        square = square + jacobian.T @ jacobian
+        gradient = gradient + jacobian.T @ residual
         costs["prior"] = 0.5 * float(residual @ residual)
         return AlignmentLinearization(square, gradient, costs)
 

@@ -185,6 +185,17 @@ class MapTerms:
         system.matrix[np.ix_(columns, columns)] += square
         return kept, self._costs(rho, tilt, states)
 
+    def of_base_frame(self, states: WindowStates) -> tuple[F64, F64, dict[str, float]]:
+        """Return the normal equations (6, 6), (6,) of T_G_M while all else is fixed, and the costs."""
+        now = self._evaluated(states)
+        rho, root = self._weighed(now)
+        J = (now.of_base * root[:, None, None]).reshape(-1, 6)
+        square, gradient = J.T @ J, J.T @ (now.residual * root[:, None]).reshape(-1)
+        tilt, of_tilt = self._tilt(states.T_G_M[0])
+        square[3:, 3:] += of_tilt.T @ of_tilt
+        gradient[3:] += of_tilt.T @ tilt
+        return square, gradient, self._costs(rho, tilt, states)
+
     def _evaluated(self, states: WindowStates) -> MapResiduals:
         """Evaluate all observations, unless these states (values) were the last ones evaluated."""
         if self._latest is None or self._latest[0] is not states:

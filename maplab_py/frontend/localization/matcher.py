@@ -168,8 +168,9 @@ class MapMatcher:
 def angles_px(p_I: F64, origin_I: F64, ray_I: F64, rad_per_px: F64) -> F64:
     """Return the angles (N,) between rays and points (N, 3), in pixels."""
     toward = p_I - origin_I
-    sine = np.linalg.norm(np.cross(ray_I, toward), axis=1)
-    return np.asarray(np.arctan2(sine, np.sum(ray_I * toward, axis=1)) / rad_per_px)
+    (a, b, c), (x, y, z) = ray_I.T, toward.T
+    sine = np.sqrt((b * z - c * y) ** 2 + (c * x - a * z) ** 2 + (a * y - b * x) ** 2)
+    return np.asarray(np.arctan2(sine, a * x + b * y + c * z) / rad_per_px)
 
 
 def _pairs(keypoint: I64, landmark: I64, error_px: F64) -> Mask:

@@ -1,8 +1,9 @@
-"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc|timings [options]`.
+"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc|images|timings`.
 
 `simulated` rebuilds table 4.1 of the thesis: share of the map's landmarks, absolute error of VIL, SWL,
 pose and ODO (median and standard deviation), and NEES of T_G_I. `euroc` localises pieces of V1_01 in
-the others; `timings` rebuilds table 4.2. Without map tracking the matcher is the thesis'.
+the others; `images` localises a flight in the map of another one, images end to end; `timings` rebuilds
+table 4.2. Without map tracking the matcher is the thesis'.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import dataclasses
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ import numpy as np
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from tests.benchmarks.online_localization import euroc, timings
+from tests.benchmarks.online_localization import euroc, images, timings
 from tests.benchmarks.online_localization.modes import MODES, compare_all, pose_errors
 from tests.benchmarks.online_localization.simulated import SHARES, Setting, searched, setting
 from tests.frontend.known_start import KnownStart
@@ -123,6 +125,18 @@ def real(arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def end_to_end(arguments: argparse.Namespace) -> list[Row]:
+    """Localise a flight by its images, with one camera and with both; print errors and times."""
+    rows: list[Row] = []
+    for cameras in ("0", ""):
+        with tempfile.TemporaryDirectory() as work:
+            errors = images.measure(arguments.images, cameras, Path(work))
+        ratios = {"localized_ratio": errors.localized_ratio, "batch_ratio": errors.batch_ratio}
+        rows.append({**dataclasses.asdict(errors), **ratios})
+        print({name: round(value, 4) for name, value in rows[-1].items()}, flush=True)
+    return rows
+
+
 def _line(row: dict[str, Any]) -> str:
     return (
         f"seed {row['seed']}  {100 * row['share']:5.1f} %  {row['variant']:5}  {row['mode']:4}  "
@@ -135,19 +149,21 @@ def _line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Run a study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("study", choices=("simulated", "euroc", "timings"))
+    parser.add_argument("study", choices=("simulated", "euroc", "images", "timings"))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1, 11)))
     parser.add_argument("--shares", type=float, nargs="+", default=list(SHARES))
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=["none", "map"])
     parser.add_argument("--seconds", type=float, default=30.0, help="of a flight")
     parser.add_argument("--landmarks", type=int, default=12_000, help="of the room")
     parser.add_argument("--folder", type=Path, help="with a file per seed; seeds in it are not run")
+    parser.add_argument("--images", type=Path, help="folder with the rendered flights; else MH_01")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     if arguments.study == "timings":
         timings.main()
         return
-    rows = simulated(arguments) if arguments.study == "simulated" else real(arguments)
+    studies = {"simulated": simulated, "euroc": real, "images": end_to_end}
+    rows = studies[arguments.study](arguments)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     sys.stdout.flush()

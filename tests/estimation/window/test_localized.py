@@ -95,6 +95,14 @@ def test_replay_without_noise_is_exact(estimates_landmarks: bool) -> None:
     assert np.abs(errors[10:]).max() < 1e-4
 
 
+def test_at_constant_velocity_data_without_noise_give_the_pose_to_a_micrometre() -> None:
+    """Samples of a uniform motion are integrated exactly, so that nothing is left."""
+    tracks = simulated(scenario(duration_s=3.0, noise=False, keypoints=80, kind="straight"))
+    off = se3.retract(T_G_M, [0.05, -0.03, 0.02, 0.002, -0.001, 0.02])
+    errors = run(smoother_of(tracks), tracks, sigma=PERFECT, start=off)
+    assert np.abs(errors[10:]).max() < 1e-6
+
+
 def test_errors_agree_with_covariances(noisy: SimulatedTracks) -> None:
     smoother = smoother_of(noisy)
     errors = run(smoother, noisy)

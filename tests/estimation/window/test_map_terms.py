@@ -256,6 +256,16 @@ def test_the_warmup_compiles_what_terms_evaluate() -> None:
     assert ahead
 
 
+def test_equations_of_the_base_frame_are_those_of_the_whole_system() -> None:
+    terms, states = window()
+    system = DenseSystem.zeros(15 * FRAMES + 6)
+    _, costs = terms.add_to(system, states, states)
+    square, gradient, of_base = terms.of_base_frame(states)
+    np.testing.assert_allclose(square, system.matrix[-6:, -6:], rtol=1e-12)
+    np.testing.assert_allclose(gradient, system.gradient[-6:], rtol=1e-10)
+    assert of_base == costs
+
+
 def test_composition_jacobian_is_that_of_differences() -> None:
     T_M_I = se3.make(so3.exp([0.4, -0.2, 1.0]), [1.0, 2.0, -0.5])
     J = composition_jacobian(T_G_M, T_M_I)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64, U8, Mask
+from maplab_py.estimation.window.frame import Motion
 from maplab_py.frontend.localization.map_source import SearchedMap, of_map
 from maplab_py.frontend.localization.online import LocalizedFrame
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
@@ -17,11 +18,23 @@ from tests.frontend.localization.places import Place, place_of, run
 
 OPTIONS = OnlineLocalizationOptions()
 WALK = SessionOptions(duration_s=44.0, turns=2.0, start_turn=0.2, height_m=1.7)
-OUTAGE_S = (8.0, 38.0)
+OUTAGES = (
+    (WALK, (8.0, 38.0)),
+    (dataclasses.replace(WALK, duration_s=140.0, turns=6.0), (8.0, 134.0)),
+)
 RESTS = (
     MotionOptions(kind="room_scan", duration_s=8.0, turns=0.4, start_turn=0.2),
     MotionOptions(kind="stationary", duration_s=60.0),
 )
+STOPS = (
+    RESTS[0],
+    MotionOptions(kind="stationary", duration_s=6.0),
+    MotionOptions(kind="room_scan", duration_s=5.0, turns=0.2),
+    MotionOptions(kind="stationary", duration_s=6.0),
+    MotionOptions(kind="room_scan", duration_s=5.0, turns=0.2),
+)
+SLOW_MPS = 0.2
+SLOWLY = (RESTS[0], MotionOptions(kind="straight", duration_s=9.0, speed_mps=SLOW_MPS))
 TURNS = (RESTS[0], MotionOptions(kind="rotation", duration_s=10.0, turns=1.0))
 
 
@@ -79,19 +92,22 @@ def test_false_matches_give_no_wrong_pose() -> None:
 
 
 @pytest.mark.slow
-def test_after_an_outage_the_pose_comes_back_without_a_jump_of_the_odometry() -> None:
-    where = place_of(WALK)
+@pytest.mark.parametrize(("walk", "outage_s"), OUTAGES, ids=["30 s", "minutes"])
+def test_after_an_outage_the_pose_comes_back_without_a_jump_of_the_odometry(
+    walk: SessionOptions, outage_s: tuple[float, float]
+) -> None:
+    where = place_of(walk)
     query = where.query
     time_s = (query.vertices.timestamp_ns[query.keypoint_vertex] - where.times_ns[0]) * 1e-9
-    is_out = (time_s >= OUTAGE_S[0]) & (time_s < OUTAGE_S[1])
+    is_out = (time_s >= outage_s[0]) & (time_s < outage_s[1])
     localization, frames, updates = run(
         OPTIONS, searched(where), with_random_descriptors(where, is_out)
     )
     at_s = seconds(where, frames)
     answered = np.array([frame.answer is not None for frame in frames])
-    assert not answered[(at_s > OUTAGE_S[0]) & (at_s < OUTAGE_S[1])].any()
-    first_s = float(at_s[answered & (at_s >= OUTAGE_S[1])].min())
-    assert first_s - OUTAGE_S[1] < 1.0
+    assert not answered[(at_s > outage_s[0]) & (at_s < outage_s[1])].any()
+    first_s = float(at_s[answered & (at_s >= outage_s[1])].min())
+    assert first_s - outage_s[1] < 1.0
     error = np.linalg.norm(differences(where, frames)[:, :3], axis=1)
     assert np.nanmax(error[at_s > first_s + 1.0]) < 0.05
     truth = where.start.truth
@@ -120,3 +136,35 @@ def test_the_pose_stays_where_it_is(phases: tuple[MotionOptions, ...]) -> None:
     later = error[at_s > phases[0].duration_s + 1.0]
     assert np.isfinite(later).all()
     assert np.linalg.norm(later - before, axis=1).max() < 0.03
+
+
+@pytest.mark.slow
+def test_the_pose_stays_where_it_is_at_every_stop() -> None:
+    where = place_of(SessionOptions(phases=STOPS, duration_s=0.0), keypoint_sigma_px=0.15)
+    _, frames, _ = run(OPTIONS, searched(where), where)
+    at_s, error = seconds(where, frames), differences(where, frames)[:, :3]
+    end_s = np.cumsum([phase.duration_s for phase in STOPS])
+    for row in (1, 3):  # the stops
+        before = error[at_s <= end_s[row - 1]][-1]
+        during = error[(at_s > end_s[row - 1] + 1.0) & (at_s <= end_s[row])]
+        assert len(during) > 10
+        assert np.linalg.norm(during - before, axis=1).max() < 0.03
+    assert np.nanmax(np.linalg.norm(error[at_s > 3.0], axis=1)) < 0.05
+
+
+@pytest.mark.slow
+def test_a_slow_constant_velocity_is_not_taken_for_rest() -> None:
+    where = place_of(SessionOptions(phases=SLOWLY, duration_s=0.0), keypoint_sigma_px=0.15)
+    _, frames, updates = run(OPTIONS, searched(where), where)
+    at_s, error = seconds(where, frames), differences(where, frames)[:, :3]
+    straight = at_s > RESTS[0].duration_s + 1.5  # phases are joined smoothly
+    truth, v_M = where.start.truth, []
+    assert truth.v_R is not None
+    for update in (u for u, is_straight in zip(updates, straight, strict=True) if is_straight):
+        assert update.motion is Motion.MOVING
+        assert update.state is not None
+        v_M.append(update.state.v_M_I[0])
+    expected = truth.v_R[np.searchsorted(truth.times_ns, [f.time_ns for f in frames])][straight]
+    np.testing.assert_allclose(np.linalg.norm(expected, axis=1), SLOW_MPS, atol=0.03)
+    np.testing.assert_allclose(np.array(v_M), expected, atol=0.03)
+    assert np.linalg.norm(error[straight], axis=1).max() < 0.05
