@@ -1,6 +1,7 @@
 """Many sessions round one loop of 200 m: what a factor takes, in time and in memory.
 
 `python -m tests.benchmarks.loop_sessions SESSIONS KEYFRAMES [--iterations N] [--forcing X | --submaps N]`
+`[--max_memory_gb GB]`
 
 Keyframes are 0.75 m apart and look outwards at a wall; every landmark has been merged over all
 sessions and laps. With inertial samples, so that each keyframe has 15 states.
@@ -19,6 +20,7 @@ from maplab_py.estimation.problem.iterative import IterativeOptions, IterativePr
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.problem.submaps import SubmapProblem
+from maplab_py.memory import memory_limited
 from maplab_py.progress import SILENT
 from tests.benchmarks.maplab_solver import inertial_parts
 from tests.benchmarks.problems import (
@@ -102,11 +104,13 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=3)
     parser.add_argument("--forcing", type=float, default=0.0, help="of pcg; 0 = direct")
     parser.add_argument("--submaps", type=int, default=0, help="solved one by one; 0 = jointly")
+    parser.add_argument("--max_memory_gb", type=float, default=0.0, help="for a factor; 0 = all")
     arguments = parser.parse_args()
     _solve(make_loop(2, 20), arguments.forcing, arguments.submaps, 1)  # loads compiled kernels
     problem = make_loop(arguments.sessions, arguments.keyframes)
     print(f"{len(problem.visual.T_G_I)} keyframes, {len(problem.visual.keyframe)} observations")
-    print(_solve(problem, arguments.forcing, arguments.submaps, arguments.iterations))
+    with memory_limited(arguments.max_memory_gb):
+        print(_solve(problem, arguments.forcing, arguments.submaps, arguments.iterations))
 
 
 def _solve(made: InertialProblem, forcing: float, submaps: int, iterations: int) -> str:
