@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from maplab_py.algorithms.anchoring.pairs import USED
 from maplab_py.algorithms.anchoring.reports import AnchoringReport
-
-USED = "used"
-"""Verdict of an alignment that holds."""
 
 
 class OpenAlignments:
