@@ -118,7 +118,8 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     extent = drawing.extent
     if subject.localized is not None:
         extent = _widened(extent, subject.localized.p_G - drawing.origin_G)
-    notes = [note for layer in layers for note in layer.notes] + unreadable + problems
+    notes = [note for layer in layers if not layer.choices for note in layer.notes]
+    notes += unreadable + problems
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
         where = "beside it" if subject.side_by_side else "in grey"

@@ -6,14 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
+from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure.explanation import explain_closure
 from maplab_py.algorithms.loop_closure.listing import describe_closure
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.report import counted
 from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import IdArray, to_hex
 from maplab_py.vimap.queries import mission_labels
 from maplab_py.vimap.table import ragged_rows
 
@@ -105,15 +108,28 @@ def loop_closure_facts(vi_map: VIMap, row: int) -> Facts:
         ("correction", f"{np.linalg.norm(wrong[:3]):.3f} m"),
         ("correction of heading", f"{np.degrees(np.linalg.norm(wrong[3:])):.2f} deg"),
         ("inliers", f"{common} landmarks in common"),
+        *_recorded_gates(vi_map, edges.id[row]),
     )
 
 
+def _recorded_gates(vi_map: VIMap, edge: IdArray) -> Facts:
+    """Return the gates of the recorded closure that an edge (id) was made from; none without one."""
+    try:
+        closures = read_record(vi_map).closures
+    except MapError:
+        return ()
+    rows = np.flatnonzero((closures.id == edge).all(axis=1))
+    return gate_facts(vi_map, int(rows[0])) if len(rows) else ()
+
+
 def closure_facts(vi_map: VIMap, row: int) -> Facts:
-    """Return the recorded facts of a closure, as lc_report lists them."""
+    """Return the recorded facts of a closure, as lc_report lists them, and its gates, as why does."""
     line = describe_closure(vi_map, row)
+    why, *gates = gate_facts(vi_map, row)
     return (
         ("closure", line.id),
         ("verdict", line.verdict),
+        why,
         ("served for", line.use or "nothing"),
         ("query", f"mission {line.query} at {line.query_s:.2f} s"),
         ("target", f"mission {line.place} at {line.place_s:.2f} s"),
@@ -125,7 +141,19 @@ def closure_facts(vi_map: VIMap, row: int) -> Facts:
         ("agreeing neighbours", str(line.support)),
         ("landmarks merged", str(line.merged)),
         ("weight", f"{line.weight:.3f}"),
+        *gates,
     )
+
+
+def gate_facts(vi_map: VIMap, row: int) -> Facts:
+    """Return why a recorded closure was accepted or refused: every gate, the failed ones first."""
+    explanation = explain_closure(vi_map, row, LoopClosureOptions())
+    gates = sorted(explanation.gates, key=lambda gate: gate.result)
+    lines = [
+        (f"{gate.result}: {gate.gate}", f"{gate.value}, wanted {gate.wanted} {gate.flag}".rstrip())
+        for gate in gates
+    ]
+    return (("why", explanation.summary), *lines)
 
 
 def _landmarks_of(vi_map: VIMap, vertex: int) -> NDArray[np.int32]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar, Literal
 
+from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.errors import FlagError
 from maplab_py.options import option
 from maplab_py.vimap.descriptors import type_of_name
@@ -84,6 +85,13 @@ class VisualizationOptions:
     max_points: int = option(
         300_000, help="Draw at most this many landmarks, and as many points of dense clouds."
     )
+    max_refused_closures: int = option(
+        200, help="Draw at most this many refused closures, those nearest to acceptance first."
+    )
+    refused_closures_reason: str = option(
+        "",
+        help="Draw refused closures whose reason contains this text only, such as inliers; empty = all.",
+    )
     lc_edge_covariances: bool = option(
         False, help="Show the covariance of the position of each loop closure edge as an ellipsoid."
     )
@@ -115,6 +123,16 @@ class VisualizationOptions:
         for name in ("max_points", "landmarks_max_observers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--vis_{name}={getattr(self, name)}: must be 1 or greater")
+        if self.max_refused_closures < 0:
+            raise ValueError(
+                f"--vis_max_refused_closures={self.max_refused_closures}: must be 0 or greater"
+            )
+        reason = self.refused_closures_reason
+        if reason and not any(reason.lower() in verdict.value for verdict in Verdict):
+            known = ", ".join(verdict.value for verdict in Verdict)
+            raise ValueError(
+                f"--vis_refused_closures_reason={reason}: no reason contains this text (there are: {known})"
+            )
         for name in ("scale", "covariance_scale"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"--vis_{name}={getattr(self, name):g}: must be greater than 0")

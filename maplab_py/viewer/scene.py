@@ -105,6 +105,7 @@ class Layer:
     is_visible: bool = True
     legend: tuple[LegendEntry, ...] = ()
     notes: tuple[str, ...] = ()  # why parts draw fewer
+    choices: tuple[str, ...] = ()  # texts that the panel offers to restrict the layer to
 
     @property
     def drawn(self) -> int:

@@ -40,6 +40,7 @@ class VertexImages:
         """
         self._store = ResourceStore(vi_map, folder)
         self._row_of_vertex = _first_of_vertices(vi_map, (name,) if name else IMAGE_TYPES)
+        self._frame_of_row = vi_map.resources.owner
         self._depth_of_vertex: dict[int, int] = {}
         if with_depth:
             self._depth_of_vertex = _first_of_vertices(vi_map, DEPTH_TYPES)
@@ -49,12 +50,22 @@ class VertexImages:
 
     def __call__(self, vertex: int) -> U8 | None:
         """Return the picture (H, W, 3) RGB of a vertex (row), None when it has none that can be read."""
-        image = self._load(self._row_of_vertex.get(vertex))
+        image = self.image(vertex)
         depth = self._load(self._depth_of_vertex.get(vertex))
-        parts = [] if image is None else [as_rgb(image)]
+        parts = [] if image is None else [image]
         if depth is not None and depth.ndim == 2:
             parts.append(depth_picture(depth, parts[0].shape[1] if parts else depth.shape[1]))
         return np.concatenate(parts) if parts else None
+
+    def image(self, vertex: int) -> U8 | None:
+        """Return the image (H, W, 3) RGB of a vertex (row) without its depth."""
+        image = self._load(self._row_of_vertex.get(vertex))
+        return None if image is None else as_rgb(image)
+
+    def frame(self, vertex: int) -> int:
+        """Return the frame (row) that the image of a vertex (row) belongs to, -1 = it has none."""
+        row = self._row_of_vertex.get(vertex)
+        return -1 if row is None else int(self._frame_of_row[row])
 
     def _load(self, row: int | None) -> U8 | None:
         if row is None:

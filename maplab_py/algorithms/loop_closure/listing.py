@@ -11,7 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.closure_record import USES, LoopRecord, read_record
+from maplab_py.algorithms.loop_closure.closure_record import (
+    USES,
+    ClosureRecord,
+    LoopRecord,
+    read_record,
+)
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.gate_values import gate_values, shortfalls
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
@@ -63,7 +68,7 @@ def list_closures(
     if reason:
         chosen = chosen & np.isin(c.verdict, _verdicts_with(reason))
     key = {
-        "near_miss": np.zeros(len(c)) if sort_by != "near_miss" else _near_misses(vi_map, record),
+        "near_miss": np.zeros(len(c)) if sort_by != "near_miss" else near_miss_order(vi_map, c),
         "time": np.zeros(len(c)),
         "gap": -gap,
         "correction": -c.correction_m,
@@ -105,9 +110,14 @@ def _verdicts_with(reason: str) -> list[int]:
     return codes
 
 
-def _near_misses(vi_map: VIMap, record: LoopRecord) -> F64:
-    """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses."""
-    gates = gate_values(vi_map, record.closures, LoopClosureOptions())
+def near_miss_order(vi_map: VIMap, closures: ClosureRecord) -> F64:
+    """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses.
+
+    Args:
+        vi_map: The map.
+        closures: All recorded closures (N).
+    """
+    gates = gate_values(vi_map, closures, LoopClosureOptions())
     total = shortfalls(gates)
     failed = np.sum([gate.failed for gate in gates], axis=0)
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)

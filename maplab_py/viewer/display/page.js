@@ -8,9 +8,11 @@
   const FAST_MS = 25;
   const REST_MS = 300;
   const STARTING_MS = 1500;
-  const FEWEST_POINTS = 10000;
+  const FEWEST_POINTS = 6000;
   const LARGEST_FACTOR = 2; // on the size of the points that stand for all
   const SMALL_CLOUD = 2000; // drawn as it is
+  const FAINT_LAYER = "/map/refused_closures/";
+  const FAINT = 0.4; // opacity
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
   let budget = Infinity; // points that are drawn while the camera moves
   let isReduced = false;
@@ -22,6 +24,7 @@
   let lastFrame = -1;
   let lastTime = 0;
   let isWatching = false;
+  let isCapturing = false;
 
   const store = () => {
     let found = null;
@@ -75,7 +78,9 @@
     if (instanceColorStart) set("color", instanceColorStart);
     const material = new Material({
       vertexColors: Boolean(instanceColorStart),
-      uniforms: { plain: { value: wide.material.color } },
+      transparent: wide.material.transparent,
+      depthWrite: wide.material.depthWrite,
+      uniforms: { plain: { value: wide.material.color }, alpha: { value: wide.material.opacity } },
       vertexShader: `
         uniform vec3 plain;
         varying vec3 lineColor;
@@ -87,9 +92,10 @@
           gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
         }`,
       fragmentShader: `
+        uniform float alpha;
         varying vec3 lineColor;
         void main() {
-          gl_FragColor = vec4(lineColor, 1.0);
+          gl_FragColor = vec4(lineColor, alpha);
           #include <colorspace_fragment>
         }`,
     });
@@ -192,12 +198,12 @@
   const watch = () => {
     const now = performance.now();
     if (hasMoved()) lastMove = now;
-    if (now - lastMove > REST_MS) {
+    if (isCapturing || now - lastMove > REST_MS) {
       isWatching = false;
       if (isReduced) restore();
       return;
     }
-    const frame = window.__viserTestpoints.rendererInfo.render.frame;
+    const frame = testpoints.rendererInfo.render.frame;
     if (lastFrame >= 0 && frame > lastFrame) adapt((now - lastTime) / (frame - lastFrame));
     if (frame !== lastFrame) lastTime = now;
     lastFrame = frame;
@@ -205,7 +211,7 @@
   };
 
   const begin = () => {
-    if (isWatching) return;
+    if (isWatching || isCapturing) return;
     isWatching = true;
     lastMove = performance.now();
     lastFrame = -1;
@@ -218,6 +224,42 @@
     if (readyAt === Infinity) readyAt = performance.now() + STARTING_MS;
     if (performance.now() > readyAt) begin();
   }, 50);
+
+  // a picture that the console asks for is a full one
+  let testpoints;
+  Object.defineProperty(window, "__viserTestpoints", {
+    configurable: true,
+    get: () => testpoints,
+    set: (value) => {
+      testpoints = value;
+      const mutable = window.__viserMutable;
+      let state = mutable.getRenderRequestState;
+      Object.defineProperty(mutable, "getRenderRequestState", {
+        configurable: true,
+        get: () => state,
+        set: (next) => {
+          state = next;
+          isCapturing = next !== "ready";
+          if (isCapturing && isReduced) restore();
+        },
+      });
+    },
+  });
+
+  // viser draws lines opaque only
+  setInterval(() => {
+    const nodes = window.__viserMutable ? window.__viserMutable.nodeRefFromName : {};
+    Object.keys(nodes).forEach((name) => {
+      if (!name.startsWith(FAINT_LAYER) || !nodes[name]) return;
+      nodes[name].traverse(({ isLineSegments2, material }) => {
+        if (!isLineSegments2 || material.transparent) return;
+        Object.assign(material, { transparent: true, depthWrite: false, opacity: FAINT });
+        material.needsUpdate = true;
+        window.__viserMutable.requestRender();
+      });
+    });
+  }, 200);
+
   // where drawing is slow, the first frame of a movement shall not be a full one
   const expectMovement = (event) => {
     const isTurning = event.type === "wheel" || (event.type === "pointermove" && event.buttons);
@@ -225,4 +267,20 @@
   };
   window.addEventListener("pointermove", expectMovement, { capture: true, passive: true });
   window.addEventListener("wheel", expectMovement, { capture: true, passive: true });
+})();
+
+// Lets the first picture come sooner: logs of shaders, each of which waits for the process that draws,
+// are read of those alone that failed.
+(() => {
+  if (!window.WebGL2RenderingContext) return;
+  const context = WebGL2RenderingContext.prototype;
+  const { getProgramInfoLog, getShaderInfoLog } = context;
+  let hasFailed = false;
+  context.getProgramInfoLog = function (program) {
+    hasFailed = !this.getProgramParameter(program, this.LINK_STATUS);
+    return hasFailed ? getProgramInfoLog.call(this, program) : "";
+  };
+  context.getShaderInfoLog = function (shader) {
+    return hasFailed ? getShaderInfoLog.call(this, shader) : "";
+  };
 })();

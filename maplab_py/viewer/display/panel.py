@@ -16,6 +16,7 @@ from maplab_py.viewer.display import text
 from maplab_py.viewer.display.callbacks import by_user
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.facts import Facts
+from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
 from maplab_py.viewer.scene import MissionEntry, Scene
 
@@ -26,6 +27,7 @@ MAX_LAYERS = 9
 """Of more layers, those that are hidden at first are in a folder that is closed at first."""
 
 _ALL = "all missions"
+_ANY = "any reason"
 _HINT = "Click a vertex, a landmark or a loop closure."
 
 
@@ -40,6 +42,9 @@ class Actions(Protocol):
 
     def set_colouring(self, colouring: str, only_mission: str = "") -> None:
         """Colour landmarks by another rule, all or those of a mission (id) alone."""
+
+    def set_refused_reason(self, reason: str) -> None:
+        """Show refused closures whose reason contains a text only, empty = all."""
 
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
@@ -85,9 +90,13 @@ class Panel:
         with self._gui.add_folder("Colours", order=3):
             self.colouring: Any = self._gui.add_dropdown("landmarks by", COLOURINGS)
             self.coloured_mission: Any = self._gui.add_dropdown("of", (_ALL,), visible=False)
+            self.refused: Any = self._gui.add_dropdown(
+                "refused for", (_ANY,), visible=False, hint="show refused closures of this reason"
+            )
             self.legend = self._gui.add_html("")
         self._bind(self.colouring, lambda _: self._choose_colouring())
         self._bind(self.coloured_mission, lambda _: self._choose_colouring())
+        self._bind(self.refused, lambda event: self._choose_reason(event.target.value))
         self._add_selection()
         self._add_view()
 
@@ -97,6 +106,21 @@ class Panel:
     def _choose_colouring(self) -> None:
         mission_id = self._mission_of_label.get(self.coloured_mission.value, "")
         self._actions.set_colouring(self.colouring.value, mission_id)
+
+    def _choose_reason(self, reason: str) -> None:
+        self._actions.set_refused_reason("" if reason == _ANY else reason)
+
+    def show_reasons(self, scene: Scene, chosen: str) -> None:
+        """Offer the reasons of the scene's refused closures, chosen = a part of one's text."""
+        reasons = next((layer.choices for layer in scene.layers if layer.name == REFUSED), ())
+        options = (_ANY, *reasons)
+        if tuple(self.refused.options) != options:
+            self.refused.options = options
+        value = next((reason for reason in reasons if chosen and chosen.lower() in reason), _ANY)
+        if self.refused.value != value:
+            self.refused.value = value
+        if self.refused.visible != (len(reasons) > 1):
+            self.refused.visible = len(reasons) > 1
 
     def show_colouring(
         self, options: VisualizationOptions, missions: tuple[MissionEntry, ...]
@@ -118,8 +142,8 @@ class Panel:
 
     def _add_selection(self) -> None:
         with self._gui.add_folder("Selection", order=4):
-            self.facts = self._gui.add_html(text.hint(_HINT))
             self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
+            self.facts = self._gui.add_html(text.hint(_HINT))
             self.jump: Any = self._gui.add_text(
                 "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
             )
@@ -249,7 +273,7 @@ class Panel:
     def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
         """Show what was picked; without facts the hint."""
         table = text.fact_table(facts) if facts else text.hint(_HINT)
-        self.facts.content = table + (text.hint(note) if note else "")
+        self.facts.content = (text.hint(note) if note else "") + table
         self.clear.visible = bool(facts)
         self.show_image(image)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import U8
 from maplab_py.viewer import colours
+from maplab_py.viewer.closure_picture import closure_picture
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import add_part
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
@@ -26,6 +27,7 @@ from maplab_py.viewer.layers.cameras import (
 from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.scene import Entity, Part
+from maplab_py.viewer.vertex_images import VertexImages
 from maplab_py.vimap.table import ragged_rows
 
 ImageOf = Callable[[int], "U8 | None"]
@@ -51,6 +53,7 @@ class Selection:
         self._panel = panel
         self._handles: list[Any] = []
         self._anchor: Pick | None = None  # the first of two picks to measure between
+        self._ends: tuple[int, ...] = ()  # vertices (rows) of the picked closure
         self.is_measuring = False
         self.picked: Pick | None = None
         self.distance_m: float | None = None
@@ -59,13 +62,19 @@ class Selection:
         """Mark what was clicked and show its facts."""
         previous, self.picked, self.distance_m = self.picked, picked, None
         self._clear_marks()
+        self._ends = ()
         note = ""
         if self.is_measuring and previous is not None:
             self._anchor = previous
             self.distance_m = float(np.linalg.norm(picked.p - previous.p))
             note = f"distance to the pick before: {self.distance_m:.3f} m"
         self._mark(drawing, picked)
-        image = image_of(picked.row) if picked.entity is Entity.VERTEX else None
+        image = None
+        if picked.entity is Entity.VERTEX:
+            image = image_of(picked.row)
+        elif self._ends and isinstance(image_of, VertexImages):
+            pair = closure_picture(drawing.vi_map, image_of, *self._ends)
+            image, note = pair or (None, note)
         self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
 
     def clear(self) -> None:
@@ -102,6 +111,7 @@ class Selection:
             self._mark_distance(picked, self._anchor, self.distance_m, size)
 
     def _mark_closure(self, drawing: Drawing, ends: NDArray[np.int64]) -> None:
+        self._ends = tuple(ends.tolist())
         p = drawing.p_vertices[ends]
         self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, ends[:1], 6.0))
         self._add_frusta(drawing, ends, 0.05, 2.0)

@@ -9,6 +9,8 @@ from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
 
 _SMALL = "font-size:0.78em;line-height:1.45;"
+_NAMES = "38%"
+"""Width of the names in a table of facts."""
 _PADDED = "padding:0.15em 0.9em 0.45em 0.9em;"
 
 
@@ -53,7 +55,7 @@ def short_count(count: int) -> str:
 
 def layer_hint(layer: Layer) -> str:
     """Return what is shown while the pointer rests on a layer's checkbox."""
-    return f"{layer.title}: {layer.total:,} in the map"
+    return ". ".join((f"{layer.title}: {layer.total:,} in the map", *layer.notes))
 
 
 def mission_label(mission: MissionEntry) -> str:
@@ -96,11 +98,11 @@ def _legend_line(entry: LegendEntry) -> str:
 def fact_table(facts: Facts) -> str:
     """Return names and values as a table."""
     rows = "".join(
-        f"<tr><td style='opacity:0.65;padding:0 0.8em 0 0;vertical-align:top;white-space:nowrap'>"
+        f"<tr><td style='opacity:0.65;padding:0 0.8em 0 0;vertical-align:top;width:{_NAMES}'>"
         f"{escape(name)}</td><td style='overflow-wrap:anywhere'>{escape(value)}</td></tr>"
         for name, value in facts
     )
-    return f"<div style='{_SMALL}{_PADDED}'><table style='border:0'>{rows}</table></div>"
+    return f"<div style='{_SMALL}{_PADDED}'><table style='border:0;width:100%'>{rows}</table></div>"
 
 
 def hint(text: str) -> str:

@@ -8,6 +8,7 @@ under one lock; maps are values, so what is being drawn cannot change underneath
 from __future__ import annotations
 
 import atexit
+import dataclasses
 import logging
 import threading
 import time
@@ -29,6 +30,7 @@ from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
+from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.live import moved_scene
 from maplab_py.viewer.lookup import MIN_DIGITS, find_by_id
 from maplab_py.viewer.options import PlaybackOptions
@@ -304,6 +306,15 @@ class Viewer:
             options = self.subject.options.with_colouring(colouring, only_mission)
             self.follow(self.subject.replace(options=options))
 
+    def set_refused_reason(self, reason: str) -> None:
+        """Show refused closures whose reason contains a text only, empty = all."""
+        with self._lock:
+            if self.subject is None:
+                return
+            options = dataclasses.replace(self.subject.options, refused_closures_reason=reason)
+            self._choices[REFUSED] = True
+            self.follow(self.subject.replace(options=options))
+
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
         with self._lock:
@@ -454,6 +465,7 @@ class Viewer:
         if is_new_place:
             self._show_ground(scene)
         self._panel.show_colouring(subject.options, scene.missions)
+        self._panel.show_reasons(scene, subject.options.refused_closures_reason)
         self.redraw()
 
     def redraw(self) -> None:

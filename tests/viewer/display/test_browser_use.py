@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import threading
@@ -14,12 +15,25 @@ import cv2
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.loop_closure.closure_record import (
+    ClosureRecord,
+    read_record,
+    write_record,
+)
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.reports import Verdict
+from maplab_py.geometry import se3
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display import picture
 from maplab_py.viewer.display.picture import find_browser
 from maplab_py.viewer.display.viewer import Viewer
+from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.picking import Pick
+from maplab_py.viewer.scene import Entity
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.ids import random_ids
 from tests.support.machine import slowness
 from tests.support.waiting import wait_until
 from tests.viewer.display.browsing import IN_BROWSER, Page, chromium, colour_count, is_blank
@@ -161,3 +175,56 @@ def test_a_killed_browser_does_no_harm(capfd: pytest.CaptureFixture[str]) -> Non
     assert viewer.wait(10.0)
     viewer.stop()
     assert capfd.readouterr() == ("", "")
+
+
+def _with_closures() -> VIMap:
+    """Return the map with three recorded closures, the last two refused for different reasons."""
+    count = 3
+    closures = ClosureRecord.filled(
+        count,
+        id=random_ids(count, np.random.default_rng(0)),
+        query=MAP.vertices.id[[0, 1, 2]],
+        place=MAP.vertices.id[[11, 12, 13]],
+        T_A_B=se3.relative(MAP.T_G_I[[0, 1, 2]], MAP.T_G_I[[11, 12, 13]]),
+        matches=np.full(count, 40, dtype=np.int32),
+        inliers=np.array([30, 5, 30], dtype=np.int32),
+        tilt_deg=np.array([0.1, 0.1, 9.0], dtype=np.float32),
+        verdict=np.array(
+            [VERDICTS.index(v) for v in (Verdict.ACCEPTED, Verdict.FEW_INLIERS, Verdict.TILTED)],
+            dtype=np.int8,
+        ),
+    )
+    return write_record(MAP, dataclasses.replace(read_record(MAP), closures=closures))
+
+
+_FAINT = """() => {
+  let faint = 0;
+  const nodes = window.__viserMutable.nodeRefFromName;
+  Object.keys(nodes).filter((name) => name.startsWith("/map/refused_closures/")).forEach((name) =>
+    nodes[name].traverse(({ isLineSegments2, material }) => {
+      if (isLineSegments2 && material.transparent && material.opacity < 0.5) faint += 1;
+    }));
+  return faint;
+}"""
+
+
+def test_refused_closures_are_faint_and_tell_why(browser: Any) -> None:
+    vi_map = _with_closures()
+    viewer = Viewer(0)
+    viewer.show(Subject(vi_map, "closed", VisualizationOptions(scale=2.0)))
+    page = Page(browser, viewer.url)
+    assert page.wait_until(lambda: viewer.pages == 1)
+    viewer.set_layer(REFUSED, True)
+    assert page.wait_until(lambda: page.page.evaluate(_FAINT) == 1)
+    viewer.set_refused_reason("gravity")
+    assert viewer.wait(30.0)
+    assert viewer.scene is not None
+    assert viewer.scene.layer(REFUSED).drawn == 1
+    assert page.wait_until(lambda: page.page.evaluate(_FAINT) == 1)
+    chosen = page.page.locator("xpath=//*[text()='refused for']/ancestor::*[.//input][1]//input")
+    assert page.wait_until(lambda: chosen.first.input_value() == "gravity deviates")
+    viewer.select(Pick(Entity.CLOSURE, 1, viewer.drawing.p_vertices[1], 0.0))
+    assert page.wait_until(lambda: page.page.get_by_text("failed: inliers").count() == 1)
+    assert page.errors == []
+    page.page.close()
+    viewer.stop()

@@ -9,7 +9,9 @@ import pytest
 
 from maplab_py.algorithms.loop_closure.closure_record import FIELD_NUMBER, read_record, write_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.listing import list_closures
+from maplab_py.algorithms.loop_closure.explanation import explain_closure
+from maplab_py.algorithms.loop_closure.listing import list_closures, near_miss_order
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.storage.extension_fields import with_extension
@@ -17,9 +19,10 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.facts import facts
 from maplab_py.viewer.layers.closures import ACCEPTED, REFUSED
+from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.picking import pick
-from maplab_py.viewer.scene import WHOLE_MAP, Entity, Segments
-from maplab_py.vimap import VIMap
+from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Segments
+from maplab_py.vimap import LoopClosureEdges, VIMap
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 
@@ -88,3 +91,73 @@ def test_a_damaged_record_is_said_and_the_map_shown(closed: VIMap) -> None:
     scene = build_scene(Subject(damaged))
     assert ACCEPTED not in {layer.name for layer in scene.layers}
     assert any("record of loop closures is damaged" in note for note in scene.notes)
+
+
+def test_a_click_tells_why_gate_by_gate(closed: VIMap) -> None:
+    row = _rows(closed, accepted=False)[0]
+    named = dict(facts(closed, Entity.CLOSURE, row))
+    explanation = explain_closure(closed, row, LoopClosureOptions())
+    assert named["why"] == explanation.summary
+    shown = {name: value for name, value in named.items() if name.startswith(("passed", "failed"))}
+    assert len(shown) == len(explanation.gates) >= 4
+    for gate in explanation.gates:
+        assert shown[f"{gate.result}: {gate.gate}"].startswith(
+            f"{gate.value}, wanted {gate.wanted}"
+        )
+    assert "--lc_min_inlier_count" in named["passed: inliers"]
+
+
+def test_an_edge_tells_the_gates_of_the_closure_it_was_made_from(closed: VIMap) -> None:
+    record = read_record(closed).closures
+    row = _rows(closed, accepted=True)[0]
+    edges = LoopClosureEdges.filled(
+        2,
+        id=np.array([record.id[row], [5, 6]], dtype=np.uint64),
+        from_vertex=closed.vertex_index.rows(record.query[[row, row]]),
+        to_vertex=closed.vertex_index.rows(record.place[[row, row]]),
+    )
+    with_edges = closed.replace(loop_closure_edges=edges)
+    assert "passed: inliers" in dict(facts(with_edges, Entity.LOOP_CLOSURE, 0))
+    assert "why" not in dict(facts(with_edges, Entity.LOOP_CLOSURE, 1))
+
+
+def _refused(vi_map: VIMap, **flags: object) -> Layer:
+    options = VisualizationOptions(**flags)  # type: ignore[arg-type]
+    return build_scene(Subject(vi_map, options=options)).layer(REFUSED)
+
+
+def _drawn_rows(layer: Layer) -> list[int]:
+    part = layer.parts[WHOLE_MAP]
+    assert isinstance(part, Segments)
+    return part.rows.tolist()
+
+
+def test_refused_closures_are_restricted_to_a_reason(closed: VIMap) -> None:
+    record = read_record(closed)
+    verdict = record.closures.verdict.copy()
+    verdict[-1] = VERDICTS.index(Verdict.TILTED)
+    closures = record.closures.replace(verdict=verdict)
+    mixed = write_record(closed, dataclasses.replace(record, closures=closures))
+    layer = _refused(mixed, refused_closures_reason="Gravity")
+    assert _drawn_rows(layer) == [len(verdict) - 1]
+    assert layer.choices == ("too few inliers", "gravity deviates")
+    assert layer.notes == ("Refused closures: 1 of 3 are drawn (left out: 2 for another reason)",)
+    assert _refused(mixed).notes == ()
+
+
+def test_the_best_refused_closures_are_drawn(closed: VIMap) -> None:
+    order = near_miss_order(closed, read_record(closed).closures)
+    rows = np.array(_rows(closed, accepted=False))
+    best = rows[np.argsort(order[rows], kind="stable")[:2]]
+    layer = _refused(closed, max_refused_closures=2)
+    assert _drawn_rows(layer) == sorted(best.tolist())
+    assert layer.total == 3
+    assert "1 by --vis_max_refused_closures" in layer.notes[0]
+
+
+@pytest.mark.parametrize(
+    "flags", [{"max_refused_closures": -1}, {"refused_closures_reason": "weather"}]
+)
+def test_bad_restrictions_are_refused(flags: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=f"--vis_{next(iter(flags))}"):
+        VisualizationOptions(**flags)  # type: ignore[arg-type]
