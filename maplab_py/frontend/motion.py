@@ -6,11 +6,17 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.window.frame import Motion
+from maplab_py.frontend.disparity import Keypoints, RecentKeypoints
 from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.frontend.odometry_options import RestOptions
+from maplab_py.vision.tracking.tracks import TrackedImages
 
 _DISPARITY_TIME_S = 0.1
 """Time that the limit of the disparity is for."""
+_LONG_SHARE = 0.5
+"""Limit over half a second, noise removed, as a share of that of two images, which see a start earlier."""
+_NOISE_FACTOR = 1.25
+"""The median disparity of two images is below this multiple of its expectation."""
 
 
 class MotionDetector:
@@ -24,10 +30,12 @@ class MotionDetector:
         """
         self._options = options or RestOptions()
         self._options.check()
+        self._keypoints = RecentKeypoints(self._options.imu_time_s)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the samples."""
+        """Forget samples and keypoints."""
+        self._keypoints.clear()
         self._times_ns: I64 = np.zeros(0, dtype=np.int64)
         self._acceleration: F64 = np.zeros((0, 3))
 
@@ -47,10 +55,9 @@ class MotionDetector:
     def classify(
         self,
         interval: ImuInterval,
-        disparity_px: float,
+        tracked: TrackedImages,
         *,
         turn_rad: float,
-        is_turn_only: bool,
         speed_mps: float,
     ) -> Motion:
         """Return the motion of the interval between two frames.
@@ -60,23 +67,39 @@ class MotionDetector:
 
         Args:
             interval: IMU samples between the frames.
-            disparity_px: Median disparity of the tracks between the frames, turn removed; NaN =
-                unknown.
+            tracked: Keypoints of the later frame, and what they say about the motion.
             turn_rad: Angle of the turn between the frames, without the gyroscope's bias.
-            is_turn_only: The tracks agree with a turn without translation.
             speed_mps: Estimated speed before the interval; 0 while nothing has been estimated.
         """
         self._add(interval)
+        self._keypoints.push(Keypoints.of_images(tracked))
         options = self._options
-        per_time = disparity_px * _DISPARITY_TIME_S / interval.duration_s
         if (
-            per_time < options.max_disparity_px
-            and turn_rad < options.max_turn_rate * interval.duration_s
+            turn_rad < options.max_turn_rate * interval.duration_s
             and self.acceleration_deviation < options.max_acceleration_deviation
             and speed_mps < options.max_speed
+            and self._has_still_tracks(tracked.disparity_px, interval.duration_s)
         ):
             return Motion.RESTING
-        return Motion.TURNING if is_turn_only else Motion.MOVING
+        return Motion.TURNING if tracked.is_turn_only else Motion.MOVING
+
+    def _has_still_tracks(self, disparity_px: float, duration_s: float) -> bool:
+        """Tell whether keypoints rest but for their noise.
+
+        Args:
+            disparity_px: Median between the two newest frames, turn removed; NaN = unknown.
+            duration_s: Time between these frames.
+        """
+        limit = self._options.max_disparity_px / _DISPARITY_TIME_S
+        is_below = disparity_px < limit * duration_s
+        if not self._keypoints.is_complete:
+            return False
+        half, whole = self._keypoints.rates()
+        if np.isnan(half.px_per_s + whole.px_per_s):
+            return is_below
+        is_noise = self._keypoints.newest_px < _NOISE_FACTOR * whole.noise_px
+        is_slow = half.px_per_s < limit and whole.px_per_s < _LONG_SHARE * limit
+        return (is_below or is_noise) and is_slow
 
     def _add(self, interval: ImuInterval) -> None:
         """Append samples, and forget those that are too old."""

@@ -206,9 +206,8 @@ class Odometry:
         if interval is not None:
             motion = self._detector.classify(
                 interval,
-                tracked.disparity_px,
+                tracked,
                 turn_rad=self._turn_rad(interval),
-                is_turn_only=tracked.is_turn_only,
                 speed_mps=self._speed_mps,
             )
         update = OdometryUpdate(

@@ -9,13 +9,17 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.window.frame import StartState, WindowFrame
+from maplab_py.frontend.disparity import Keypoints, disparity_px, rate
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.frontend.initialization.refinement import mission_frame
 from maplab_py.geometry import se3
 from maplab_py.sensors import Imu
 
 _COMPARED_S = 0.1
-_MIN_TRACKS = 15
+_LONG_S = 0.5
+"""Keypoints with noise are compared over this time or longer."""
+_LONG_SHARE = 0.5
+"""Limit over that time, noise removed, as a share of the limit of 0.1 s."""
 _VELOCITY_SIGMA_MPS = 0.02
 _POSITION_SIGMA_M = 1e-4
 _LEAST_GYRO_SIGMA_RADPS = 2e-4
@@ -26,13 +30,15 @@ class Motionlessness:
     """What speaks for rest over some time; NaN where nothing can be said."""
 
     disparity_px: float  # largest median in 0.1 s
+    rate_px: float  # over longer times, noise removed: per 0.1 s
     accel_deviation_mps2: float
     gyro_deviation_radps: float
 
     def is_rest(self, options: InitializationOptions) -> bool:
         """Tell whether the device rests."""
+        limit = options.rest_disparity_px
         return (
-            self.disparity_px < options.rest_disparity_px
+            (self.disparity_px < limit or self.rate_px < _LONG_SHARE * limit)
             and self.accel_deviation_mps2 < options.rest_accel_deviation_mps2
             and self.gyro_deviation_radps < options.rest_gyro_deviation_radps
         )
@@ -41,9 +47,20 @@ class Motionlessness:
 def motionlessness(frames: list[WindowFrame], accel_gyro: F64) -> Motionlessness:
     """Compare frames about 0.1 s apart, and IMU samples (S, 6) with their mean."""
     deviation = np.sqrt(np.sum(np.var(accel_gyro, axis=0).reshape(2, 3), axis=1))
-    disparity = [_disparity_px(a, b) for a, b in _pairs(frames)]
-    largest = float(np.max(disparity)) if disparity else float("nan")
-    return Motionlessness(largest, float(deviation[0]), float(deviation[1]))
+    chosen = _spaced(frames)
+    times_s = np.array([image.time_ns for image in chosen]) * 1e-9
+    short_px = np.array([disparity_px(a, b) for a, b in itertools.pairwise(chosen)])
+    in_limit_time = short_px * _COMPARED_S / np.diff(times_s)
+    is_long = times_s[-1] - times_s >= _LONG_S - 5e-3
+    long_px = [disparity_px(image, chosen[-1]) for image in itertools.compress(chosen, is_long)]
+    mean_s = float(times_s[-1] - times_s[0]) / max(len(chosen) - 1, 1)
+    apart = rate(short_px, mean_s, np.array(long_px), (times_s[-1] - times_s)[is_long])
+    return Motionlessness(
+        float(np.max(in_limit_time)) if len(in_limit_time) else float("nan"),
+        apart.px_per_s * _COMPARED_S,
+        float(deviation[0]),
+        float(deviation[1]),
+    )
 
 
 def start_at_rest(imu: Imu, times_ns: I64, accel_gyro: F64, accel_bias_sigma: float) -> StartState:
@@ -86,21 +103,11 @@ def start_at_rest(imu: Imu, times_ns: I64, accel_gyro: F64, accel_bias_sigma: fl
     return StartState(T_M_I, np.zeros(3), gyro_bias, accel_bias, sigma)
 
 
-def _pairs(frames: list[WindowFrame]) -> list[tuple[WindowFrame, WindowFrame]]:
-    """Return frames that are at least 0.1 s apart, each with the next of them."""
+def _spaced(frames: list[WindowFrame]) -> list[Keypoints]:
+    """Return the keypoints of frames that are at least 0.1 s apart, the newest among them."""
     chosen = frames[-1:]
     for frame in reversed(frames[:-1]):
         if (chosen[-1].time_ns - frame.time_ns) * 1e-9 >= _COMPARED_S - 5e-3:
             chosen.append(frame)
     chosen.reverse()
-    return list(itertools.pairwise(chosen))
-
-
-def _disparity_px(first: WindowFrame, second: WindowFrame) -> float:
-    """Return the median motion of common keypoints in 0.1 s; infinite when there are too few."""
-    keys = [frame.track_id * 256 + frame.camera for frame in (first, second)]
-    _, i, j = np.intersect1d(keys[0], keys[1], return_indices=True)
-    if len(i) < _MIN_TRACKS:
-        return float("inf")
-    moved = np.linalg.norm(second.uv_px[j] - first.uv_px[i], axis=1)
-    return float(np.median(moved)) * _COMPARED_S / ((second.time_ns - first.time_ns) * 1e-9)
+    return [Keypoints.of_frame(frame) for frame in chosen]

@@ -66,7 +66,8 @@ def _scenario(name: str, cameras: int, folder: Path, *, has_recorded_imu: bool) 
     (folder / file).write_text(text.replace("V101.gt", f"{name}.gt"), encoding="utf-8")
     scenario = load_scenario(folder / file)
     session = dataclasses.replace(
-        scenario.sessions[0], recorded_imu=f"{name}.imu.csv" if has_recorded_imu else ""
+        scenario.sessions[0],
+        recorded_imu=str(folder / f"{name}.imu.csv") if has_recorded_imu else "",
     )
     return dataclasses.replace(
         scenario,

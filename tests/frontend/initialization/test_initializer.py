@@ -118,10 +118,11 @@ def test_scale_and_gravity_over_many_flights(cameras: int, monkeypatch: pytest.M
     assert max(tilts_deg) < InitializationOptions().max_tilt_sigma_deg
 
 
+@pytest.mark.parametrize("noise_px", [0.05, 0.8])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_at_rest_it_starts_after_a_second(cameras: int) -> None:
+def test_at_rest_it_starts_after_a_second(cameras: int, noise_px: float) -> None:
     flight = fly(resting(3, 1.5), seed=3, cameras=cameras, points=800, outlier_share=0.0)
-    quiet = [with_pixels(frame, flight.frames[0]) for frame in flight.frames]
+    quiet = [with_pixels(frame, flight.frames[0], noise_px) for frame in flight.frames]
     result = start(dataclasses.replace(flight, frames=quiet))
     state = result.state
     assert state is not None
