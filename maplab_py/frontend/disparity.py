@@ -18,7 +18,7 @@ from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.window.frame import WindowFrame
 from maplab_py.vision.tracking.tracks import TrackedImages
 
-_MIN_TRACKS = 15
+_MIN_TRACKS = 8
 _MAX_NOISE_PX = 2.0
 """Median disparity from image to image above which it is not noise (0.8 px of each keypoint: 1.3)."""
 
@@ -74,11 +74,13 @@ def rate(short_px: F64, short_s: float, long_px: F64, long_s: F64) -> Rate:
     Args:
         short_px: Disparities (N,) over neighbouring images.
         short_s: Mean time between them.
-        long_px: Disparities (M,) over longer times; the fastest motion counts.
+        long_px: Disparities (M,) over longer times; the fastest motion counts. NaN = unknown.
         long_s: These times (M,), longer than the short one.
     """
-    if not len(short_px) or not len(long_px) or not np.isfinite([*short_px, *long_px]).all():
+    is_known = np.isfinite(long_px)
+    if not len(short_px) or not np.isfinite(short_px).all() or not is_known.any():
         return UNKNOWN
+    long_px, long_s = long_px[is_known], long_s[is_known]
     near2 = float(np.median(short_px)) ** 2
     speed2 = float(np.max((long_px**2 - near2) / (long_s**2 - short_s**2)))
     # disparity from image to image that is too large for noise is an oscillation

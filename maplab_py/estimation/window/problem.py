@@ -152,6 +152,16 @@ class WindowProblem:
             return self._latest
         return self.linearize(states, _LANDMARK_DAMPING)
 
+    def covariance_of_frames(self, linear: WindowLinearization) -> F64:
+        """Return the joint covariance (15 F, 15 F) of all frames, each [p, theta, v, b_g, b_a].
+
+        Raises:
+            NotPositiveDefinite: The measurements do not determine the frames.
+        """
+        lower, _ = scipy.linalg.lapack.dpotri(_factorised(linear.system.matrix.copy()), lower=0)
+        upper = np.triu(lower)
+        return np.asarray(upper + np.triu(upper, 1).T)
+
     def covariance(self, linear: WindowLinearization, frame: int) -> F64:
         """Return the covariance (15, 15) of a frame, order [p, theta, v, b_g, b_a].
 

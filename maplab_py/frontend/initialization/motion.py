@@ -15,6 +15,7 @@ from maplab_py.frontend.initialization.gyro_bias import (
     integrate_turns,
     ray_pairs,
 )
+from maplab_py.frontend.initialization.imu_noise import with_least_noise
 from maplab_py.frontend.initialization.linear import LinearMotion, solve_motion
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.frontend.initialization.rays import RayMaker, SegmentRays
@@ -35,6 +36,14 @@ _BIAS_WALK_S = 3600.0
 _MAX_BIAS_SIGMAS = 4.0
 
 
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Largest standard deviations with which the estimator may start."""
+
+    scale_sigma: float  # as a share of the scale
+    tilt_deg: float
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Attempt:
     """A start in motion, or why there is none."""
@@ -53,23 +62,23 @@ class MotionStart:
         """Prepare for cameras with poses T_I_C (C, 7) on the IMU."""
         self._options = options
         # vibrations and errors of scale are not in the densities of a data sheet
-        self.imu = dataclasses.replace(
-            imu,
-            gyro_noise_density=max(imu.gyro_noise_density, options.least_gyro_noise_density),
-            acc_noise_density=max(imu.acc_noise_density, options.least_accel_noise_density),
+        self.imu = with_least_noise(
+            imu, options.least_gyro_noise_density, options.least_accel_noise_density
         )
         self._rays = RayMaker(cameras, T_I_C)
         self._accel_bias_sigma = accel_bias_sigma(imu, options)
         biases = BiasSigmas(options.gyro_bias_sigma_radps, self._accel_bias_sigma)
-        self._refinement = Refinement(cameras, T_I_C, self.imu, biases)
+        self._refinement = Refinement(cameras, T_I_C, self.imu, biases, imu)
 
-    def solve(self, segment: Segment, leniency: float = 1.0) -> Attempt:
+    def solve(self, segment: Segment, limits: Limits | None = None) -> Attempt:
         """Estimate the state of the last frame of a segment.
 
         Args:
             segment: Frames.
-            leniency: Factor of the limits of scale and gravity.
+            limits: Of scale and gravity; None = those of the options.
         """
+        options = self._options
+        limits = limits or Limits(options.max_scale_sigma, options.max_tilt_sigma_deg)
         rays = self._rays.of(segment)
         pairs = ray_pairs(rays)
         if len(pairs.first_frame) < _MIN_PAIRS:
@@ -93,13 +102,15 @@ class MotionStart:
                 f"{100 * (1 - motion.share_in_front):.0f} % of the points would lie behind the "
                 "cameras: move the camera sideways, and faster",
             )
-        refined = self._refinement.refine(segment, _states(turns, gyro_bias, motion))
-        reason = self._objection(refined, rays, leniency)
+        refined = self._refinement.refine(
+            segment, _states(turns, gyro_bias, motion), estimates_noise=not shares_points(rays)
+        )
+        reason = self._objection(refined, rays, limits)
         if refined is None or reason:
             return Attempt(None, reason, refined)
         return Attempt(_start_state(refined), "", refined)
 
-    def _objection(self, refined: Refined | None, rays: SegmentRays, leniency: float) -> str:
+    def _objection(self, refined: Refined | None, rays: SegmentRays, limits: Limits) -> str:
         """Return what is still unknown, empty when the estimator may start."""
         options = self._options
         if refined is None:
@@ -125,19 +136,17 @@ class MotionStart:
                 "and turn; if this stays, calibrate the IMU"
             )
         tilt_deg = float(np.degrees(refined.tilt_sigma_rad))
-        max_tilt_deg = leniency * options.max_tilt_sigma_deg
-        if tilt_deg > max_tilt_deg:
+        if tilt_deg > limits.tilt_deg:
             return (
                 f"the direction of gravity is known to {tilt_deg:.1f} deg, "
-                f"{max_tilt_deg:.1f} are needed: change speed and direction, and turn"
+                f"{limits.tilt_deg:.1f} are needed: change speed and direction, and turn"
             )
-        scale_sigma = refined.travelled_sigma_m / max(refined.travelled_m, 1e-6)
+        scale_sigma = refined.scale_sigma
         is_known = shares_points(rays) and refined.travelled_sigma_m <= options.max_rig_sigma_m
-        max_scale_sigma = leniency * options.max_scale_sigma
-        if scale_sigma > max_scale_sigma and not is_known:
+        if scale_sigma > limits.scale_sigma and not is_known:
             return (
-                f"the scale is known to {100 * min(scale_sigma, 9.99):.0f} %, "
-                f"{100 * max_scale_sigma:.0f} % are needed: change speed and direction more"
+                f"the scale is known to {100 * min(scale_sigma, 9.99):.1f} %, "
+                f"{100 * limits.scale_sigma:.1f} % are needed: change speed and direction more"
             )
         return ""
 

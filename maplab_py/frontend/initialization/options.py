@@ -30,14 +30,30 @@ class InitializationOptions:
     )
     min_mono_s: float = option(1.5, unit="s", help="Shortest time in motion for a single camera")
     longest_s: float = option(4.0, unit="s", help="Time in motion that is used, the latest part")
-    retry_s: float = option(0.25, unit="s", help="Time between two attempts")
+    retry_s: float = option(
+        0.25,
+        unit="s",
+        help="Shortest time between two attempts; it grows where the scale is far from known, and with "
+        "the time that has passed",
+    )
     keyframe_interval_s: float = option(
         0.1, unit="s", help="Shortest time between the frames that are used"
     )
-    most_keyframes: int = option(16, help="Largest number of frames that are used")
+    most_keyframes: int = option(
+        16, help="Largest number of frames that are used of cameras that see the same points"
+    )
+    most_mono_keyframes: int = option(
+        28, help="Largest number of frames that are used of a single camera"
+    )
     min_landmarks: int = option(20, help="Smallest number of landmarks")
     max_scale_sigma: float = option(
         0.03, help="Largest standard deviation of the scale, as a share of it"
+    )
+    early_scale_sigma: float = option(
+        0.02, help="The same for a single camera before --vio_initialization_early_s has passed"
+    )
+    early_s: float = option(
+        3.75, unit="s", help="Time during which a single camera waits for the better scale"
     )
     max_rig_sigma_m: float = option(
         0.01,
@@ -85,10 +101,11 @@ class InitializationOptions:
                 raise FlagError(
                     f"--{self.flag_prefix}{field.name}={value:g}: wants a number above 0"
                 )
-        if self.most_keyframes < 4:
-            raise FlagError(
-                f"--{self.flag_prefix}most_keyframes={self.most_keyframes}: wants 4 or more"
-            )
+        for name in ("most_keyframes", "most_mono_keyframes"):
+            if getattr(self, name) < 4:
+                raise FlagError(
+                    f"--{self.flag_prefix}{name}={getattr(self, name)}: wants 4 or more"
+                )
         for name in ("rest_s", "min_rig_s", "min_mono_s"):
             if getattr(self, name) > self.longest_s:
                 raise FlagError(

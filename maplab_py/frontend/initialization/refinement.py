@@ -23,6 +23,7 @@ from maplab_py.estimation.window.standstill import Standstill
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
+from maplab_py.frontend.initialization.imu_noise import noise_factor, with_least_noise
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import so3
 from maplab_py.progress import SILENT
@@ -35,6 +36,8 @@ _WIDE_GATE_CHI2 = 30.0**2
 _ITERATIONS = (15, 40)
 _TOLERANCE = 1e-5
 _MIN_SHARE_IN_FRONT = 0.9
+_NOISE_SCALE_SIGMA = 0.1
+"""Deviation of the scale above which the noise of the IMU is not worth an estimate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +52,7 @@ class BiasSigmas:
 class Refined:
     """States of F frames, and the uncertainty of the last and of the scale."""
 
+    time_ns: I64  # (F,)
     states: WindowStates
     covariance: F64  # (15, 15) of the last frame, order [p, theta, v, b_g, b_a]
     travelled_m: float  # largest distance from the first position
@@ -56,6 +60,7 @@ class Refined:
     median_error_px: float
     num_landmarks: int
     num_rejected: int  # tracks with parallax that fit no point
+    imu: Imu  # with the noise that was assumed or estimated
 
     @property
     def tilt_sigma_rad(self) -> float:
@@ -64,14 +69,57 @@ class Refined:
         in_M = R @ self.covariance[3:6, 3:6] @ R.T
         return float(np.sqrt(max(float(np.linalg.eigvalsh(in_M[:2, :2])[-1]), 0.0)))
 
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale, as a share of it."""
+        return self.travelled_sigma_m / max(self.travelled_m, 1e-6)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Round:
+    """How a segment is solved once."""
+
+    segment: Segment
+    observed: tuple[I64, Observations]  # rows of the segment's observations that have rays
+    imu: Imu
+    gate_chi2: float
+    loss: Loss
+    iterations: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Solved:
+    """What a round has found."""
+
+    problem: WindowProblem
+    chain: InertialChain
+    states: WindowStates
+    imu: Imu
+    landmarks: int
+    rejected: int
+    has_converged: bool
+
 
 class Refinement:
     """Solves segments of a rig with an IMU; made once, since kernels are prepared."""
 
     def __init__(
-        self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu, biases: BiasSigmas
+        self,
+        cameras: tuple[Camera, ...],
+        T_I_C: F64,
+        imu: Imu,
+        biases: BiasSigmas,
+        data_sheet: Imu,
     ) -> None:
-        """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU."""
+        """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU.
+
+        Args:
+            cameras: The cameras.
+            T_I_C: Their poses.
+            imu: With the noise that is assumed.
+            biases: What is known of them.
+            data_sheet: The IMU with the least noise that it can have.
+        """
         models, self._cameras = camera_table(cameras, T_I_C)
         self._kernels = window_kernels(models)
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
@@ -81,35 +129,95 @@ class Refinement:
             residual_kernel("relative_pose", sources.relative_pose), options.standstill
         )
         self._options = options
-        self._imu, self._biases = imu, biases
+        self._imu, self._biases, self._data_sheet = imu, biases, data_sheet
 
-    def refine(self, segment: Segment, states: WindowStates) -> Refined | None:
-        """Refine the states (F) of a segment; None when they are not determined."""
+    def refine(
+        self, segment: Segment, states: WindowStates, *, estimates_noise: bool = False
+    ) -> Refined | None:
+        """Refine the states (F) of a segment; None when they are not determined.
+
+        Args:
+            segment: Frames.
+            states: Their approximate states.
+            estimates_noise: Estimate the noise of the IMU, too, where the scale is nearly known.
+        """
         with single_thread():
-            return self._refined(segment, states)
-
-    def _refined(self, segment: Segment, states: WindowStates) -> Refined | None:
-        prior, seen = self._prior(states), self._observations(segment)
-        for gate_chi2, loss, iterations in (
-            (_WIDE_GATE_CHI2, Loss.CAUCHY, _ITERATIONS[0]),
-            (self._options.gate_chi2, Loss.HUBER, _ITERATIONS[1]),
-        ):
-            tracks, candidates = self._tracks(segment, seen, states, gate_chi2)
-            rows = tracks.landmark_rows
-            if not len(rows):
+            round_ = _Round(
+                segment, self._observations(segment), self._imu, _WIDE_GATE_CHI2, Loss.CAUCHY,
+                _ITERATIONS[0],
+            )  # fmt: skip
+            solved = self._solved(round_, states)
+            if solved is None:
                 return None
-            problem, order = self._problem(segment, tracks, states, prior, loss)
-            start = WindowStates(states.T_M_I, states.motion, tracks.h[rows])
-            solver = SolverOptions(num_iterations=iterations, function_tolerance=_TOLERANCE)
-            states, summary = optimize_states(problem, start, solver, SILENT)
+            round_ = dataclasses.replace(
+                round_,
+                gate_chi2=self._options.gate_chi2,
+                loss=Loss.HUBER,
+                iterations=_ITERATIONS[1],
+            )
+            solved = self._solved(round_, solved.states)
+            refined = self._judged(segment, solved)
+            if not estimates_noise or refined is None or refined.scale_sigma > _NOISE_SCALE_SIGMA:
+                return refined
+            assert solved is not None
+            imu = self._with_estimated_noise(solved)
+            again = self._solved(dataclasses.replace(round_, imu=imu), solved.states)
+            return self._judged(segment, again)
+
+    def _with_estimated_noise(self, solved: _Solved) -> Imu:
+        """Return the IMU with the noise that the residuals show; as assumed when they cannot tell."""
+        try:
+            linear = solved.problem.undamped_near(solved.states)
+            covariance = solved.problem.covariance_of_frames(linear)
+        except NotPositiveDefinite:
+            return self._imu
+        factor = noise_factor(solved.chain, solved.states, covariance)
+        return with_least_noise(
+            self._data_sheet,
+            factor * self._imu.gyro_noise_density,
+            factor * self._imu.acc_noise_density,
+        )
+
+    def _solved(self, round_: _Round, states: WindowStates) -> _Solved | None:
+        """Triangulate landmarks from states and solve; None without landmarks."""
+        segment = round_.segment
+        tracks, candidates = self._tracks(segment, round_.observed, states, round_.gate_chi2)
+        rows = tracks.landmark_rows
+        if not len(rows):
+            return None
+        chain = InertialChain(self._inertial, round_.imu)
+        samples = [segment.samples(edge) for edge in range(len(segment) - 1)]
+        chain.extend(samples, states.motion[:-1])
+        none = np.zeros(len(segment), dtype=np.bool_)
+        factors = FrameFactors(chain, self._standstill, none, none)
+        data, order = tracks.data(rows, self._options.huber_sigmas)
+        prior = self._prior(states)
+        problem = WindowProblem(
+            self._kernels, data, self._cameras, factors, prior, loss=round_.loss
+        )
+        start = WindowStates(states.T_M_I, states.motion, tracks.h[rows])
+        solver = SolverOptions(num_iterations=round_.iterations, function_tolerance=_TOLERANCE)
+        states, summary = optimize_states(problem, start, solver, SILENT)
+        has_converged = summary.iterations < round_.iterations and len(order) > 0
+        return _Solved(
+            problem, chain, states, round_.imu, len(rows), candidates - len(rows), has_converged
+        )
+
+    @staticmethod
+    def _judged(segment: Segment, solved: _Solved | None) -> Refined | None:
+        """Compute covariances; None when the states are not determined."""
+        if solved is None:
+            return None
+        states, problem = solved.states, solved.problem
+        if not solved.has_converged or not np.isfinite(states.motion).all():
+            return None
         error_px, depth = problem.errors(states)
-        has_converged = summary.iterations < _ITERATIONS[1] and np.isfinite(states.motion).all()
-        if not len(order) or not has_converged or np.mean(depth > 0.0) < _MIN_SHARE_IN_FRONT:
+        if np.mean(depth > 0.0) < _MIN_SHARE_IN_FRONT:
             return None
         far = int(np.argmax(np.linalg.norm(states.T_M_I[:, 4:] - states.T_M_I[0, 4:], axis=1)))
         try:
             linear = problem.undamped_near(states)
-            covariance = problem.covariance(linear, len(segment) - 1)
+            covariance = problem.covariance(linear, len(states) - 1)
             covariance_far = problem.covariance(linear, far)[:3, :3]
         except NotPositiveDefinite:
             return None
@@ -117,13 +225,15 @@ class Refinement:
         length = float(np.linalg.norm(way))
         ahead = way / max(length, 1e-9)
         return Refined(
+            time_ns=segment.time_ns,
             states=states,
             covariance=covariance,
             travelled_m=length,
             travelled_sigma_m=float(np.sqrt(max(float(ahead @ covariance_far @ ahead), 0.0))),
             median_error_px=float(np.median(error_px)),
-            num_landmarks=len(rows),
-            num_rejected=candidates - len(rows),
+            num_landmarks=solved.landmarks,
+            num_rejected=solved.rejected,
+            imu=solved.imu,
         )
 
     def _prior(self, states: WindowStates) -> WindowPrior:
@@ -168,22 +278,6 @@ class Refinement:
             tracks, candidates, states.T_M_I, only_stereo=False
         )
         return tracks, min(len(candidates), options.max_landmarks)
-
-    def _problem(
-        self,
-        segment: Segment,
-        tracks: Tracks,
-        states: WindowStates,
-        prior: WindowPrior,
-        loss: Loss,
-    ) -> tuple[WindowProblem, I64]:
-        chain = InertialChain(self._inertial, self._imu)
-        samples = [segment.samples(edge) for edge in range(len(segment) - 1)]
-        chain.extend(samples, states.motion[:-1])
-        none = np.zeros(len(segment), dtype=np.bool_)
-        factors = FrameFactors(chain, self._standstill, none, none)
-        data, order = tracks.data(tracks.landmark_rows, self._options.huber_sigmas)
-        return WindowProblem(self._kernels, data, self._cameras, factors, prior, loss=loss), order
 
 
 def mission_frame(g_A: F64) -> F64:
