@@ -21,7 +21,10 @@ class RestOptions:
     flag_prefix: ClassVar[str] = "vio_rest_"
 
     max_disparity_px: float = option(
-        0.5, help="Standing still: largest median disparity in 0.1 s, turn removed", unit="px"
+        0.5,
+        help="Standing still: largest median disparity in 0.1 s, turn removed; half of it over half a "
+        "second, noise of the tracks removed",
+        unit="px",
     )
     max_acceleration_deviation: float = option(
         0.25,

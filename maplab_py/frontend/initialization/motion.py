@@ -102,9 +102,10 @@ class MotionStart:
                 f"{100 * (1 - motion.share_in_front):.0f} % of the points would lie behind the "
                 "cameras: move the camera sideways, and faster",
             )
-        refined = self._refinement.refine(
-            segment, _states(turns, gyro_bias, motion), estimates_noise=not shares_points(rays)
-        )
+        # cameras that share points know the scale without the IMU
+        wanted = 0.0 if shares_points(rays) else limits.scale_sigma
+        states = _states(turns, gyro_bias, motion)
+        refined = self._refinement.refine(segment, states, wanted_scale_sigma=wanted)
         reason = self._objection(refined, rays, limits)
         if refined is None or reason:
             return Attempt(None, reason, refined)

@@ -17,7 +17,10 @@ class InitializationOptions:
 
     rest_s: float = option(1.0, unit="s", help="Time at rest from which the estimator starts")
     rest_disparity_px: float = option(
-        0.5, unit="px", help="Largest median disparity in 0.1 s at rest, turns included"
+        0.5,
+        unit="px",
+        help="Largest median disparity in 0.1 s at rest, turns included; or half of it over half a second "
+        "and longer, noise of the tracks removed",
     )
     rest_accel_deviation_mps2: float = option(
         0.25, unit="m/s^2", help="Largest deviation of the accelerometer at rest"

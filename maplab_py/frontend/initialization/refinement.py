@@ -36,8 +36,8 @@ _WIDE_GATE_CHI2 = 30.0**2
 _ITERATIONS = (15, 40)
 _TOLERANCE = 1e-5
 _MIN_SHARE_IN_FRONT = 0.9
-_NOISE_SCALE_SIGMA = 0.1
-"""Deviation of the scale above which the noise of the IMU is not worth an estimate."""
+_NEAR_SCALE_FACTOR = 2.0
+"""The scale is not known more than so much better with less noise of the IMU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,14 +132,15 @@ class Refinement:
         self._imu, self._biases, self._data_sheet = imu, biases, data_sheet
 
     def refine(
-        self, segment: Segment, states: WindowStates, *, estimates_noise: bool = False
+        self, segment: Segment, states: WindowStates, *, wanted_scale_sigma: float = 0.0
     ) -> Refined | None:
         """Refine the states (F) of a segment; None when they are not determined.
 
         Args:
             segment: Frames.
             states: Their approximate states.
-            estimates_noise: Estimate the noise of the IMU, too, where the scale is nearly known.
+            wanted_scale_sigma: Estimate the noise of the IMU, too, where the deviation of the scale comes
+                near to this; 0 = never.
         """
         with single_thread():
             round_ = _Round(
@@ -157,7 +158,7 @@ class Refinement:
             )
             solved = self._solved(round_, solved.states)
             refined = self._judged(segment, solved)
-            if not estimates_noise or refined is None or refined.scale_sigma > _NOISE_SCALE_SIGMA:
+            if refined is None or refined.scale_sigma > _NEAR_SCALE_FACTOR * wanted_scale_sigma:
                 return refined
             assert solved is not None
             imu = self._with_estimated_noise(solved)
