@@ -50,7 +50,7 @@ class MissionStatistics:
     landmarks_unknown: int
     observations: int
     cameras: tuple[CameraStatistics, ...]
-    distance_m: float
+    distance_m: float = dataclasses.field(metadata={"title": "length", "unit": "m"})
     start_ns: int
     end_ns: int
     duration_s: float

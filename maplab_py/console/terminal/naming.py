@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from maplab_py.console.terminal.layout import Block, Pairs, Paragraph
 
 SHORT_ID_DIGITS = 8
+_ID_ITSELF = "id"
+"""A value of this name stays an id."""
 _ID = re.compile(rf"\b[0-9a-f]{{{SHORT_ID_DIGITS}}}(?:[0-9a-f]{{24}})?\b")
 
 
@@ -48,6 +50,7 @@ def _named(block: Block, names: Mapping[str, str]) -> Block:
     if isinstance(block, Paragraph):
         return dataclasses.replace(block, text=named(block.text))
     if isinstance(block, Pairs):
-        return Pairs([(named(name), named(value)) for name, value in block.rows], block.title)
+        pairs = [(named(n), value if n == _ID_ITSELF else named(value)) for n, value in block.rows]
+        return Pairs(pairs, block.title)
     rows = [[named(cell) for cell in row] for row in block.rows]
     return dataclasses.replace(block, heads=[named(head) for head in block.heads], rows=rows)

@@ -44,7 +44,7 @@ class TerminalProgress:
         self._is_closed = False
 
     def step(self, done: float, total: float, what: str = "") -> None:
-        """Say that `done` of `total` is finished.
+        """Say that `done` of `total` is finished; a total of 0 is not known.
 
         Raises:
             Cancelled: The user has asked to stop.
@@ -53,10 +53,11 @@ class TerminalProgress:
         now = time.monotonic()
         if not self._is_live or now - self._start < SECONDS_BEFORE_BAR:
             return
-        if now - self._updated < SECONDS_BETWEEN_UPDATES and done < total:
+        is_end = 0.0 < total <= done
+        if now - self._updated < SECONDS_BETWEEN_UPDATES and not is_end:
             return
         self._updated = now
-        self._update(done, total, what or self._what)
+        self._update(done, total or None, what or self._what)
 
     def tick(self) -> None:
         """Show that a silent command is running; any thread may call this."""

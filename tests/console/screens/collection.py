@@ -51,10 +51,34 @@ LONG = {
 """Commands that take more than half a second with what precedes them."""
 
 
+_CLOSED = f"{MERGED}; sbk --map_mission=59f0; lc"
+FURTHER = {
+    "evaluate_trajectory_again": (
+        f"{MERGED}; evaluate_trajectory V1_01_easy.csv",
+        "evaluate_trajectory V1_01_easy.csv",
+    ),
+    "help_of_a_plugin": ("", "help --plugin=vi_map_basic"),
+    "history_of_a_map": (f"{MERGED}; rlq; undo", "history"),
+    "lc_report_accepted": (_CLOSED, "lc_report --which=accepted --limit=3"),
+    "lc_report_refused": (_CLOSED, "lc_report --which=refused --sort_by=near_miss --limit=3"),
+    "load_without_map": ("", "load maps"),
+    "map_stats_of_a_mission": (MERGED, "map_stats --map_mission=59f0"),
+    "mission_coobservability_stats_of_joined": (_CLOSED, "mission_coobservability_stats"),
+    "save_dry_run": (MERGED, "save --map_folder=maps/v1_01 --overwrite --dry_run"),
+    "set_wrong_value": ("", "set --ba_loss=hubert"),
+    "snapshots": (f"{MERGED}; snapshot before; snapshot after", "snapshot"),
+    "unknown_mission": (MERGED, "sbk --map_mission=nosuch"),
+    "why_closure": (_CLOSED, "why {closure}"),
+    "why_landmark": (MERGED, "why {landmark}"),
+    "why_pair": (_CLOSED, "why 59f0 a1b2"),
+}
+"""Further reports of commands, by a name: the lines that are typed first, and the line."""
+
+
 def recorded_commands(registry: Registry) -> list[str]:
-    """Return the names of the commands that have a golden screen."""
+    """Return the names of the commands, and of the further reports, that have a golden screen."""
     names = [command.name for command in registry.commands if registry.is_built_in(command)]
-    return sorted(name for name in names if name not in NOT_RECORDED)
+    return sorted([*FURTHER, *(name for name in names if name not in NOT_RECORDED)])
 
 
 class Collection:
@@ -90,8 +114,11 @@ class Collection:
         session = Session(self._registry, screen)
         runner = Runner(session, screen)
         try:
-            self._prepare(runner, name)
-            line = self._registry.find(name).example
+            before, line = FURTHER.get(name) or (
+                lines_before(name),
+                self._registry.find(name).example,
+            )
+            self._prepare(runner, name, before)
             shown = screen_of(runner, screen, self._completed(session, name, line))
         finally:
             screen.transcribe(None)
@@ -99,10 +126,9 @@ class Collection:
         stable = Stable(name)
         return line, changed(shown, stable.text, stable.value)
 
-    def _prepare(self, runner: Runner, name: str) -> None:
-        """Run the lines that precede an example."""
-        lines = lines_before(name)
-        if lines.startswith(MERGED) and name not in ("history", "timing", "undo"):
+    def _prepare(self, runner: Runner, name: str, lines: str) -> None:
+        """Run the lines that precede a line; those that most lines need only once."""
+        if lines.startswith(MERGED) and not name.startswith(("history", "timing", "undo")):
             if self._merged is None:
                 _run(runner, MERGED)
                 self._merged = runner.session.maps.state
@@ -118,6 +144,11 @@ class Collection:
         if name == "import_point_clouds":
             imu_id = to_hex(session.vi_map.missions.sensor_id[0, MissionSensor.IMU])
             return line.replace("5c1a", imu_id)
+        if "{closure}" in line:
+            closures = session.run("lc_report", which="refused", sort_by="near_miss").as_dict()
+            return line.format(closure=closures["closures"][0]["id"])
+        if "{landmark}" in line:
+            return line.format(landmark=to_hex(session.vi_map.landmarks.id[0]))
         return line
 
 

@@ -99,8 +99,8 @@ class _Counting(SilentProgress):
         self._screen = screen
 
     def step(self, done: float, total: float, what: str = "") -> None:
-        """Count a step."""
-        assert 0 <= done <= total, what
+        """Count a step; a total of 0 is not known."""
+        assert total == 0 or 0 <= done <= total, what
         self._screen.steps += 1
 
 

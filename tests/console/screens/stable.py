@@ -8,6 +8,7 @@ from pathlib import Path
 
 _FRACTION = re.compile(r"-?\d+(?:\.\d+(?:e[+-]\d+)?|e[+-]\d+)|\bnan\b")
 _NUMBER = re.compile(r"(?<![\w.#-])-?\d+(?:\.\d+)?(?:e[+-]\d+)?(?![\w.#])")
+_ID = re.compile(r"\b[0-9a-f]{8}\b")
 _MEASURED = re.compile(r"\btime\b|\[ms\]|\[MB\]|\[GB\]|\[MB/s\]|^fingerprint$")
 """Headings of values that depend on the machine or on the version of a compressor."""
 _REPLACED = (
@@ -34,8 +35,11 @@ ESTIMATES = {
     "extract_features",
     "landmark_sparsify",
     "localize",
+    "lc_report_accepted",
+    "lc_report_refused",
     "loopclosure_all_missions",
     "loopclosure_one_mission",
+    "mission_coobservability_stats_of_joined",
     "optimize_visual",
     "optimize_visual_inertial",
     "prune_segments",
@@ -56,6 +60,8 @@ ESTIMATES = {
     "visualize_esdf",
     "visualize_loop_closures",
     "visualize_mesh",
+    "why_closure",
+    "why_pair",
 }
 """Commands whose numbers come from iterations, images or clocks: only their layout is compared."""
 
@@ -85,6 +91,7 @@ class Stable:
         for pattern, replacement in _REPLACED:
             text = pattern.sub(replacement, text)
         if self._is_estimate:
+            text = _ID.sub("########", text)
             text = _NUMBER.sub(_masked, text)
         return text
 

@@ -102,6 +102,21 @@ def test_missions_are_shown_by_name_wherever_their_id_stands() -> None:
     assert text_with_names("x61dc0de3 61dc0de", names) == "x61dc0de3 61dc0de"
 
 
+@dataclasses.dataclass(frozen=True)
+class Identified(Report):
+    id: str
+    mission: str
+
+
+def test_the_id_of_a_mission_itself_stays() -> None:
+    names = names_by_id([(IDS[0], "monday")])
+    blocks = with_names(blocks_of(Identified(IDS[0], IDS[0])), names)
+    assert drawn(blocks[0], 80, coloured=False).splitlines() == [
+        f"id       {IDS[0]}",
+        "mission  monday",
+    ]
+
+
 def test_a_short_id_of_two_missions_stays() -> None:
     names = names_by_id([(IDS[0], "monday"), (IDS[0][:-1] + "1", "tuesday")])
     assert text_with_names("61dc0de3", names) == "61dc0de3"
