@@ -67,18 +67,19 @@ FURTHER = {
     "save_dry_run": (MERGED, "save --map_folder=maps/v1_01 --overwrite --dry_run"),
     "set_wrong_value": ("", "set --ba_loss=hubert"),
     "snapshots": (f"{MERGED}; snapshot before; snapshot after", "snapshot"),
+    "timing": ("list", "timing"),  # more commands would be sorted by their times
     "unknown_mission": (MERGED, "sbk --map_mission=nosuch"),
     "why_closure": (_CLOSED, "why {closure}"),
     "why_landmark": (MERGED, "why {landmark}"),
     "why_pair": (_CLOSED, "why 59f0 a1b2"),
 }
-"""Further reports of commands, by a name: the lines that are typed first, and the line."""
+"""Further reports by a name, or other lines for a command: what is typed first, and the line."""
 
 
 def recorded_commands(registry: Registry) -> list[str]:
     """Return the names of the commands, and of the further reports, that have a golden screen."""
     names = [command.name for command in registry.commands if registry.is_built_in(command)]
-    return sorted([*FURTHER, *(name for name in names if name not in NOT_RECORDED)])
+    return sorted({*FURTHER, *(name for name in names if name not in NOT_RECORDED)})
 
 
 class Collection:
@@ -128,7 +129,7 @@ class Collection:
 
     def _prepare(self, runner: Runner, name: str, lines: str) -> None:
         """Run the lines that precede a line; those that most lines need only once."""
-        if lines.startswith(MERGED) and not name.startswith(("history", "timing", "undo")):
+        if lines.startswith(MERGED) and not name.startswith(("history", "undo")):
             if self._merged is None:
                 _run(runner, MERGED)
                 self._merged = runner.session.maps.state
