@@ -9,6 +9,7 @@
   const REST_MS = 300;
   const STARTING_MS = 1500;
   const FEWEST_POINTS = 6000;
+  const FIRST_POINTS = 20000; // in software, before frames are measured
   const LARGEST_FACTOR = 2; // on the size of the points that stand for all
   const SMALL_CLOUD = 2000; // drawn as it is
   const FAINT_LAYER = "/map/refused_closures/";
@@ -143,7 +144,9 @@
   const reduce = () => {
     const all = clouds();
     const total = all.reduce((sum, [, count]) => sum + count, 0);
-    if (budget === Infinity) budget = Math.max(FEWEST_POINTS, (drawsInSoftware() ? 0.1 : 0.2) * total);
+    if (budget === Infinity) {
+      budget = drawsInSoftware() ? FIRST_POINTS : Math.max(FEWEST_POINTS, 0.2 * total);
+    }
     const part = Math.min(1, budget / Math.max(total, 1));
     all.forEach(([cloud, count]) => drawPart(cloud, count, part));
     const state = store();
