@@ -108,7 +108,7 @@ class Intake:
                 problem = self._collect(item, item.future.result())
                 if problem:
                     return problem
-            elif item.needs_worker:
+            elif item.needs_worker and not self._take_prepared(item):
                 item.attempts += 1
                 item.future = self._preparation.start(item.entry)
         return ""
@@ -142,6 +142,7 @@ class Intake:
         """Take what a worker has made of a submap."""
         item.future = None
         if outcome.ending is Ending.DONE:
+            self._preparation.note(item.entry)
             return self._load(item)
         if _DISK_FULL in outcome.error:
             item.attempts -= 1
@@ -154,13 +155,29 @@ class Intake:
             return ""
         return self.reject(item, f"{outcome.error}, {item.attempts} times")
 
-    def _load(self, item: Item) -> str:
-        folder = self._spool.folder(item.entry)
+    def _take_prepared(self, item: Item) -> bool:
+        """Take what a worker of an earlier server has made; False where a worker is needed."""
+        if item.attempts or not self._preparation.is_done(item.entry):
+            return False
         try:
-            submap, _ = load_map(folder / "prepared")
-            check_submap(submap)
-            submap = self._publisher.with_resources(submap, folder / "submap")
+            item.submap = self._prepared(item)
+        except (
+            MaplabError
+        ):  # damaged: it is made again, or refused for what is wrong with the submap
+            return False
+        return True
+
+    def _load(self, item: Item) -> str:
+        try:
+            item.submap = self._prepared(item)
         except MaplabError as error:
             return self.reject(item, str(error))
-        item.submap = named(submap, [item.entry.robot] * len(submap.missions))
         return ""
+
+    def _prepared(self, item: Item) -> VIMap:
+        """Return the prepared submap; raises MapError, or UserError where resources have no place."""
+        folder = self._spool.folder(item.entry)
+        submap, _ = load_map(folder / "prepared")
+        check_submap(submap)
+        submap = self._publisher.with_resources(submap, folder / "submap")
+        return named(submap, [item.entry.robot] * len(submap.missions))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
 import shlex
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,19 +12,22 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
-from maplab_py.errors import MapError
+from maplab_py.atomic import write_file
+from maplab_py.errors import MapError, MaplabError
 from maplab_py.pipeline.execution import execute
 from maplab_py.pipeline.fingerprint import program_version
 from maplab_py.pipeline.orders import Order, Outcome
 from maplab_py.pipeline.plan import RESULT_TEMPLATE
 from maplab_py.server.options import SubmapOptions
 from maplab_py.server.spool import Entry, Spool
+from maplab_py.storage.native import is_map_folder
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import has_link
 
 _MAX_IMU_STEP_NS = 1_000_000_000
 """IMU samples that are farther apart are those of a clock that jumped."""
+_NOTE = "prepared.sha256"
 
 
 class Preparation:
@@ -38,6 +43,24 @@ class Preparation:
     def start(self, entry: Entry) -> Future[Outcome]:
         """Prepare a submap; the result is in `prepared` of its folder, what was wrong in the outcome."""
         return self._pool.submit(execute, self._order(entry), lambda: self._is_stopping)
+
+    def note(self, entry: Entry) -> None:
+        """Note how the result of a submap was made, so that a later server can use it."""
+        with contextlib.suppress(MaplabError, OSError):  # it is made again
+            write_file(self._spool.folder(entry) / _NOTE, [self._key(entry).encode()])
+
+    def is_done(self, entry: Entry) -> bool:
+        """Tell whether there is a result that this server would make in the same way."""
+        folder = self._spool.folder(entry)
+        try:
+            is_noted = (folder / _NOTE).read_text(encoding="utf-8") == self._key(entry)
+        except (OSError, ValueError):
+            return False
+        return is_noted and is_map_folder(folder / "prepared")
+
+    def _key(self, entry: Entry) -> str:
+        script = self._script(self._spool.folder(entry) / "submap")
+        return hashlib.sha256(f"{program_version()}\n{script}".encode()).hexdigest()
 
     def stop(self) -> None:
         """Kill what runs, and wait for its end."""

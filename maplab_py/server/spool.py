@@ -5,6 +5,7 @@
     accepted/000012/entry.json      who sent it, and its SHA-256
                    /submap/         the submap as it came
                    /prepared/       the same after its own optimisation
+                   /prepared.sha256 of how it was made: a later server uses it if it would do the same
                    /worker.log, worker.jsonl
     merged/000012/                  the same folder, once the published map has the submap
     rejected/000012/                the same folder, with reason.txt

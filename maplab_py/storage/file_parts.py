@@ -80,6 +80,25 @@ class FileParts:
         elif len(entries):
             budget.give_back(sum(int(ids[-1].nbytes) for ids in self._ids.values()))
 
+    @property
+    def has_messages(self) -> bool:
+        """Whether entities are kept as messages: edges, missions, base frames."""
+        return any(self._entities.values())
+
+    def add(self, other: FileParts) -> None:
+        """Add what other files hold, as if they had been read after those of this object."""
+        first = len(self.facts)
+        self.facts += other.facts
+        self.vertices += other.vertices
+        self.unpacked_bytes += other.unpacked_bytes
+        for name, entities in other._entities.items():
+            self._entities[name] += entities
+        for name, ids in other._ids.items():
+            self._ids.setdefault(name, []).extend(ids)
+        for name, places in other._file_of.items():
+            self._file_of.setdefault(name, []).extend(place + first for place in places)
+        self._index_path = self._index_path or other._index_path
+
     def _read_large_index(self, path: Path, data: bytes | bytearray) -> bool:
         """Read a landmark index without its entries becoming objects; tell whether that was done."""
         entry = pb.LandmarkIndexEntry.DESCRIPTOR.fields_by_name

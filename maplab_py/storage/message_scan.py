@@ -32,10 +32,10 @@ _OPAQUE, _PACKED_VARINTS, _PACKED_8, _PACKED_4 = -1, -2, -3, -4
 class MemoryBudget:
     """Memory budget of all messages of a map: twice the bound of one file."""
 
-    def __init__(self, max_bytes: int) -> None:
-        """Allow files up to `max_bytes` each, and messages of twice that size together."""
+    def __init__(self, max_bytes: int, left: int | None = None) -> None:
+        """Allow files up to `max_bytes` each, and messages of `left`, or twice that size, together."""
         self.max_bytes = max_bytes
-        self._left = 2 * max_bytes
+        self._left = 2 * max_bytes if left is None else left
         self._admitted = 0  # by the latest message
         # messages that only the quick estimate was made for, at most a sixtieth of the budget
         self._quick: list[tuple[int, bytes | bytearray, Any]] = []
@@ -54,13 +54,31 @@ class MemoryBudget:
             self._quick.clear()
             needed = estimate(data, kind)
         if needed > self._left:
-            raise MapError(
-                f"{path}: its entries need more than {2 * self.max_bytes / 1e6:g} MB of memory "
-                "with those of the files before it; raise --proto_max_size_megabytes if the map "
-                "is really that large"
-            )
+            raise self._exceeded(path)
         self._left -= needed
         self._admitted = needed
+
+    @property
+    def left(self) -> int:
+        """What is left, in bytes."""
+        return self._left
+
+    def keep(self, path: Path, kept_bytes: int) -> None:
+        """Subtract what is kept of a message that another process has admitted.
+
+        Raises:
+            MapError: It exceeds the remaining budget; names the file.
+        """
+        if kept_bytes > self._left:
+            raise self._exceeded(path)
+        self._left -= kept_bytes
+
+    def _exceeded(self, path: Path) -> MapError:
+        return MapError(
+            f"{path}: its entries need more than {2 * self.max_bytes / 1e6:g} MB of memory "
+            "with those of the files before it; raise --proto_max_size_megabytes if the map "
+            "is really that large"
+        )
 
     def give_back(self, kept_bytes: int) -> None:
         """Replace what the latest message was admitted with by what is kept of it."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import I32, I64
+from maplab_py.array_types import I32, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, with_p_G
 from maplab_py.vimap.selection import as_mask, keep_rows
@@ -62,7 +62,24 @@ class Excerpt:
         quality = whole.landmarks.quality.copy()
         quality[rows] = edited.landmarks.quality
         whole = whole.replace(landmarks=whole.landmarks.replace(quality=quality))
-        return with_p_G(whole, rows, edited.p_G)
+        moved = self._moved(whole, rows, edited)
+        return with_p_G(whole, rows[moved], edited.p_G[moved])
+
+    def _moved(self, whole: VIMap, rows: I64, edited: VIMap) -> Mask:
+        """Return which landmarks of the edited part, rows of the whole, must get their positions.
+
+        The others keep their p_I to the last bit: they, and the vertex that stores them, are where they were.
+        """
+        before = self.vi_map.landmark_index.rows(edited.landmarks.id)
+        has_moved = (edited.p_G != self.vi_map.p_G[before]).any(axis=1)
+        source = self.source.vertices
+        vertex = whole.landmarks.vertex[rows]
+        state_is_new = (whole.vertices.T_M_I[vertex] != source.T_M_I[vertex]).any(axis=1)
+        frame = whole.missions.baseframe[whole.vertices.mission[vertex]]
+        frame_is_new = (whole.baseframes.T_G_M[frame] != self.source.baseframes.T_G_M[frame]).any(
+            axis=1
+        )
+        return np.asarray(has_moved | state_is_new | frame_is_new)
 
     def _with_states(self, edited: VIMap, changed: NDArray[Any]) -> VIMap:
         v, whole = edited.vertices, self.source.vertices

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from maplab_py.errors import UserError
+from maplab_py.pipeline.orders import Order, Outcome
 from maplab_py.server.journal import Journal, MergedSubmap, read_journal, write_journal
 from maplab_py.server.merging import Stretch
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Spool
 from maplab_py.server.status import status_without_server
-from tests.server.support import ROBOTS, Servers, submaps
+from tests.server.support import ROBOTS, Servers, copying, submaps
 from tests.support.waiting import wait_until
 
 
@@ -48,6 +51,36 @@ def test_it_goes_on_wherever_it_died(
     assert len(list(servers.spool.merged.iterdir())) == 3
     assert not list(servers.spool.accepted.iterdir())
     assert servers.reasons() == []
+
+
+@pytest.mark.parametrize(
+    ("what", "times"), [("nothing", 0), ("flags", 1), ("damaged", 1), ("lost", 1)]
+)
+def test_what_a_worker_has_made_is_used_after_a_kill(
+    servers: Servers, what: str, times: int
+) -> None:
+    servers.put("ant", 0)
+    servers.run_until_killed(Publisher, "publish", 1, after=False)
+    prepared = servers.spool.accepted / "000001" / "prepared"
+    assert prepared.is_dir()
+    if what == "flags":
+        servers.options = dataclasses.replace(
+            servers.options, remove_outliers_in_absolute_pose_constraints=False
+        )
+    elif what == "damaged":
+        (prepared / "vi_map" / "vertices0").write_bytes(b"damaged")
+    elif what == "lost":
+        shutil.rmtree(prepared)
+    calls = []
+
+    def counted(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+        calls.append(order.title)
+        return copying(order, is_cancelled)
+
+    servers.work(counted)
+    servers.run()
+    assert len(calls) == times
+    assert len(servers.published().vertices) == len(submaps("ant")[0].vertices)
 
 
 def test_a_mission_that_was_being_deleted_is_deleted(servers: Servers) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,9 +11,11 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.undo import UndoOptions
 from maplab_py.errors import FlagError, UserError
+from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.memory_use import SharedColumns, forget_lookups
 from tests.support.scene import Scene
+from tests.vimap.builders import walk_map
 
 
 def changed(vi_map: VIMap, table: str, column: str) -> VIMap:
@@ -94,3 +98,20 @@ def test_memory_says_what_is_kept_and_bounds_it(session: Session) -> None:
 def test_a_bound_below_zero_is_refused(session: Session) -> None:
     with pytest.raises(FlagError, match="--undo_max_gb=-1: must be a number of gigabytes"):
         session.run("memory", undo_max_gb=-1.0)
+
+
+def test_merging_maps_one_by_one_keeps_to_the_bound(tmp_path: Path) -> None:
+    folders = [tmp_path / f"map_{number}" for number in range(6)]
+    for number, folder in enumerate(folders):
+        save_map(walk_map(seed=number, first_ns=10**9 * (1 + 100 * number)), folder)
+    bound_gb = 2.5e-9 * load_map(folders[0])[0].nbytes()
+    session = Session(load_registry())
+    session.set_flags([f"--undo_max_gb={bound_gb}"])
+    session.run("load", map_folder=folders[0])
+    for count, folder in enumerate(folders[1:], start=2):
+        session.run("load_merge_map", map_folder=folder)
+        (line,) = session.run("memory").as_dict()["maps"]
+        assert line["undo_gb"] <= bound_gb
+        assert line["undo_values"] + line["dropped_values"] == count - 1
+    assert line["dropped_values"] > 0
+    assert len(session.vi_map.missions) == len(folders)
