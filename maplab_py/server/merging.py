@@ -224,8 +224,8 @@ class Merger:
         if not self._merging.enable_visual_loop_closure:
             return []
         frequencies = self._places.frequencies(submap)
-        found = self._places.similar(frequencies, self._incremental.similar_stretches)
-        return found.tolist()  # type: ignore[no-any-return]
+        numbers = self._places.similar(frequencies, self._incremental.similar_stretches)
+        return numbers.tolist()  # type: ignore[no-any-return]
 
     def _surroundings(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
         """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
