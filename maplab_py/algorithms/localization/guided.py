@@ -70,16 +70,12 @@ def guided_matches(
 
 def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
     """Return which landmarks (L,) may be visible from a position, given where they were observed."""
-    s = database.sights
-    toward = p_G_I - database.p_G
-    x, y, z = toward.T
+    s, (p_G, direction) = database.sights, database.coordinates
+    x, y, z = p_G_I[0] - p_G[0], p_G_I[1] - p_G[1], p_G_I[2] - p_G[2]
     distance = np.sqrt(x * x + y * y + z * z)
     inside = (distance < _RANGE_FACTOR * s.farthest_m) & (distance * _RANGE_FACTOR > s.nearest_m)
-    rows = np.flatnonzero(inside)
-    (a, b, c), (x, y, z) = s.direction[rows].T, toward[rows].T
-    cosine = (a * x + b * y + c * z) / np.maximum(distance[rows], 1e-9)
-    inside[rows] = cosine > s.least_cosine[rows]
-    return np.asarray(inside)
+    along = direction[0] * x + direction[1] * y + direction[2] * z
+    return np.asarray(inside & (along > s.least_cosine * np.maximum(distance, 1e-9)))
 
 
 def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I64, I64]:

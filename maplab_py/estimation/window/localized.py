@@ -12,6 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
@@ -150,9 +151,15 @@ class LocalizedSmoother(FixedLagSmoother):
         self.map_tracks.p_G[self._map_rows] = self._states.p_G
 
     def _covariance(self, problem: WindowProblem) -> F64:
-        if self.is_localized:
-            self._estimate = self._estimated(problem)
-        return super()._covariance(problem)
+        if not self.is_localized:
+            return super()._covariance(problem)
+        newest = len(self._states) - 1
+        try:
+            joint = problem.covariance_with_base(problem.undamped_near(self._states), newest)
+        except NotPositiveDefinite:
+            joint = np.full((FRAME_SIZE + 6, FRAME_SIZE + 6), np.inf)
+        self._estimate = self._estimated(joint)
+        return joint[:FRAME_SIZE, :FRAME_SIZE]
 
     def _remove_outliers(self, problem: WindowProblem, order: I64) -> float:
         error_px = super()._remove_outliers(problem, order)
@@ -181,18 +188,15 @@ class LocalizedSmoother(FixedLagSmoother):
         rows = np.searchsorted(tracks.id, self.map_tracks.matches.track_id)
         return np.flatnonzero(tracks.is_seen_by(0)[rows] & ~tracks.is_active[rows])
 
-    def _estimated(self, problem: WindowProblem) -> MapEstimate:
+    def _estimated(self, joint: F64) -> MapEstimate:
+        """Return the estimate, with the covariance (21, 21) of the newest frame and the base frame."""
         states, terms = self._states, self._latest_terms
         assert terms is not None  # the problem has them
-        newest = len(states) - 1
         T_M_I, T_G_M = states.T_M_I[-1], states.T_G_M[0]
         covariance = np.full((6, 6), np.inf)
-        try:
-            joint = problem.covariance_of_pose_and_base(problem.undamped_near(states), newest)
-            J = composition_jacobian(T_G_M, T_M_I)
-            covariance = J @ joint @ J.T
-        except NotPositiveDefinite:
-            pass
+        if np.isfinite(joint).all():
+            J, poses = composition_jacobian(T_G_M, T_M_I), np.r_[:6, FRAME_SIZE : FRAME_SIZE + 6]
+            covariance = J @ joint[np.ix_(poses, poses)] @ J.T
         error_px = terms.errors_px(states)
         seen = np.isfinite(error_px)
         return MapEstimate(

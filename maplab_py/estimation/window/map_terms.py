@@ -9,6 +9,7 @@ several views of a wrong landmark are not independent facts.
 from __future__ import annotations
 
 import dataclasses
+from types import ModuleType
 
 import numpy as np
 
@@ -74,6 +75,37 @@ class MapElimination:
         return p_G + moved, -0.5 * float(np.vdot(self.gradient, moved))
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _View:
+    """The observations of a camera, and what the kernel needs of them that no state changes."""
+
+    camera: Camera
+    T_I_C: F64  # (7,)
+    R_I_C: F64  # (3, 3)
+    rows: I64  # (N,) of the observations
+    frame: I32  # (N,)
+    landmark: I64  # (N,)
+    weight: F64  # (N, 2, 2)
+    arguments: (
+        F64  # (N, 26 + parameters) T_M_I, T_G_M, T_I_C, parameters, p_G, uv; states are filled in
+    )
+    kernel: ModuleType
+
+    @classmethod
+    def of(cls, seen: MapObservations, row: int, camera: Camera, T_I_C: F64) -> _View:
+        """Return the view of the camera in a row of the rig."""
+        rows = np.flatnonzero(seen.camera == row)
+        parameters = np.concatenate([camera.intrinsics, camera.distortion_parameters])
+        arguments = np.empty((len(rows), 26 + len(parameters)))
+        arguments[:, 14:21], arguments[:, 21:-5] = T_I_C, parameters
+        arguments[:, -2:] = seen.uv_px[rows]
+        return cls(
+            camera, T_I_C, so3.to_matrix(T_I_C[:4]), rows, seen.frame[rows], seen.landmark[rows],
+            np.eye(2) / seen.sigma_px[rows, None, None], arguments,
+            map_reprojection_kernel(camera.projection, camera.distortion),
+        )  # fmt: skip
+
+
 class MapTerms:
     """All residuals that a window localised in a map has beyond those of its odometry."""
 
@@ -96,7 +128,9 @@ class MapTerms:
             tilt_sigma_rad: How level the frames G and M are to each other; infinite = not stated.
         """
         self.observations = observations
-        self._cameras, self._T_I_C = cameras, T_I_C
+        self._views = [
+            _View.of(observations, row, camera, T_I_C[row]) for row, camera in enumerate(cameras)
+        ]
         self._huber2, self._tilt_weight = huber_sigmas**2, 1.0 / tilt_sigma_rad
         self._latest: tuple[WindowStates, MapResiduals] | None = None
         self.estimates_landmarks = observations.information_G is not None and len(observations) > 0
@@ -109,34 +143,21 @@ class MapTerms:
             T_G_M: Base frame (7,).
             p_G: Landmarks (A, 3).
         """
-        seen = self.observations
-        count = len(seen)
-        residual, jacobian = np.zeros((count, 2)), np.zeros((count, 2, 15))
+        count = len(self.observations)
+        residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 15))
         visible: Mask = np.zeros(count, dtype=np.bool_)
-        p_I = self._in_bodies(T_M_I, T_G_M, p_G)
-        for row, camera in enumerate(self._cameras):
-            R_I_C = so3.to_matrix(self._T_I_C[row, :4])
-            mine = np.flatnonzero(seen.camera == row)
-            mine = mine[is_visible(camera, (p_I[mine] - self._T_I_C[row, 4:]) @ R_I_C)]
-            visible[mine] = True
-            parameters = np.concatenate([camera.intrinsics, camera.distortion_parameters])
-            arguments = np.empty((len(mine), 26 + len(parameters)))
-            arguments[:, :7], arguments[:, 7:14] = T_M_I[seen.frame[mine]], T_G_M
-            arguments[:, 14:21], arguments[:, 21:-5] = self._T_I_C[row], parameters
-            arguments[:, -5:-2], arguments[:, -2:] = p_G[seen.landmark[mine]], seen.uv_px[mine]
-            weight = np.eye(2) / seen.sigma_px[mine, None, None]
-            kernel = map_reprojection_kernel(camera.projection, camera.distortion)
-            residual[mine], jacobian[mine] = kernel.evaluated(arguments, weight)
+        p_M = (p_G - T_G_M[4:]) @ so3.to_matrix(T_G_M[:4])
+        R_M_I = so3.to_matrix(T_M_I[:, :4])
+        for view in self._views:
+            rows, frame, arguments = view.rows, view.frame, view.arguments
+            p_I = ((p_M[view.landmark] - T_M_I[frame, 4:])[:, None] @ R_M_I[frame])[:, 0]
+            visible[rows] = is_visible(view.camera, (p_I - view.T_I_C[4:]) @ view.R_I_C)
+            arguments[:, :7], arguments[:, 7:14] = T_M_I[frame], T_G_M
+            arguments[:, -5:-2] = p_G[view.landmark]
+            residual[rows], jacobian[rows] = view.kernel.evaluated(arguments, view.weight)
+        residual[~visible], jacobian[~visible] = 0.0, 0.0
         of_frame, of_base, of_landmark = np.split(jacobian, [6, 12], axis=2)
         return MapResiduals(residual, of_frame, of_base, of_landmark, visible)
-
-    def _in_bodies(self, T_M_I: F64, T_G_M: F64, p_G: F64) -> F64:
-        """Return the landmark of every observation in the frame of its body (O, 3)."""
-        seen = self.observations
-        p_M = (p_G - T_G_M[4:]) @ so3.to_matrix(T_G_M[:4])
-        R_M_I = so3.to_matrix(T_M_I[:, :4])[seen.frame]
-        from_body = p_M[seen.landmark] - T_M_I[seen.frame, 4:]
-        return np.asarray((from_body[:, None] @ R_M_I)[:, 0])
 
     def errors_px(self, states: WindowStates) -> F64:
         """Return the reprojection error (O,) of every observation; infinite where it is not visible."""

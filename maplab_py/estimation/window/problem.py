@@ -132,14 +132,15 @@ class WindowProblem:
         self._kernels.evaluate(self._data, self._point(states), result)
         return result[:, 0], result[:, 1]
 
-    def covariance_of_pose_and_base(self, linear: WindowLinearization, frame: int) -> F64:
-        """Return the joint covariance (12, 12) of a frame's pose and the base frame, [p, theta] each.
+    def covariance_with_base(self, linear: WindowLinearization, frame: int) -> F64:
+        """Return the joint covariance (21, 21) of a frame, as `covariance`, and of the base frame.
 
         Raises:
             NotPositiveDefinite: The measurements do not determine them.
         """
         size = len(linear.system.matrix)
-        rows = np.concatenate([FRAME_SIZE * frame + np.arange(6), np.arange(size - 6, size)])
+        of_frame = FRAME_SIZE * frame + np.arange(FRAME_SIZE)
+        rows = np.concatenate([of_frame, np.arange(size - 6, size)])
         return self._covariance(linear, rows)
 
     def undamped_near(self, states: WindowStates) -> WindowLinearization:

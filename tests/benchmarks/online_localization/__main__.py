@@ -84,6 +84,7 @@ def simulated(arguments: argparse.Namespace) -> list[Row]:
             chosen = [row for row in rows if row["seed"] == seed]
             file.write_text(json.dumps(chosen, indent=1) + "\n", encoding="utf-8")
     print_medians(rows)
+    print_ratios(rows)
     return rows
 
 
@@ -108,6 +109,34 @@ def print_medians(rows: list[Row]) -> None:
             f"NEES {nees:.1f}",
             flush=True,
         )
+
+
+def print_ratios(rows: list[Row]) -> None:
+    """Print medians over the seeds of the ratios that the thesis' table shows."""
+    by_key = {(r["variant"], r["seed"], r["share"], r["mode"]): r for r in rows}
+    seeds = sorted({row["seed"] for row in rows})
+    for variant in dict.fromkeys(row["variant"] for row in rows):
+        for share in dict.fromkeys(row["share"] for row in rows):
+            pairs = [
+                (by_key[variant, seed, share, "vil"], by_key[variant, seed, share, "swl"])
+                for seed in seeds
+                if (variant, seed, share, "vil") in by_key
+            ]
+            if not pairs:
+                continue
+            parts = [
+                f"{name} {np.nanmedian([vil[field] / swl[field] for vil, swl in pairs]):.2f}"
+                for name, field in (("median", "median_m"), ("std", "std_m"))
+            ]
+            print(f"{variant}, {100 * share:g} %, VIL / SWL: {', '.join(parts)}", flush=True)
+        sparse = [
+            by_key[variant, seed, 0.05, "vil"]["median_m"]
+            / by_key[variant, seed, 0.5, "vil"]["median_m"]
+            for seed in seeds
+            if (variant, seed, 0.05, "vil") in by_key and (variant, seed, 0.5, "vil") in by_key
+        ]
+        if sparse:
+            print(f"{variant}, VIL 5 % / VIL 50 %: median {np.median(sparse):.2f}", flush=True)
 
 
 def real(arguments: argparse.Namespace) -> list[Row]:

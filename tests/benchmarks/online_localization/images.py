@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
@@ -47,6 +48,7 @@ class Flight:
 
     folder: Path
     stream: StreamOptions = StreamOptions()
+    keyframing: KeyframingOptions = KeyframingOptions()
 
     def recording(self, cameras: str) -> Recording:
         """Open it with some cameras; "" = all."""
@@ -65,7 +67,7 @@ def flights(folder: Path | None) -> tuple[Flight, Flight]:
     recorded = shared_data_folder() / "euroc_mh01_10s"
     half_s = 5.0
     return (
-        Flight(recorded, StreamOptions(end_s=half_s)),
+        Flight(recorded, StreamOptions(end_s=half_s), KeyframingOptions(every_nth_vertex=1)),
         Flight(recorded, StreamOptions(start_s=half_s)),
     )
 
@@ -115,7 +117,8 @@ def make_map(flight: Flight, cameras: str, target: Path) -> F64:
     mapping = Mapping(flight.recording(cameras), RunOptions(stream=flight.stream))
     mapping.run()
     assert mapping.builder is not None
-    vi_map, _ = make_localization_map(mapping.builder.finish()[0], WorkflowOptions())
+    options = WorkflowOptions(keyframing=flight.keyframing)
+    vi_map, _ = make_localization_map(mapping.builder.finish()[0], options)
     write_summary_map(make_summary_map(vi_map, SummaryMapOptions()), target, overwrite=True)
     truth = flight.truth
     T_R_I, known = interpolate_poses(

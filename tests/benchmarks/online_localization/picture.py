@@ -1,4 +1,4 @@
-"""Draw docs/images/online_localization.svg: errors of the four modes over time.
+"""Draw docs/images/online_localization.svg: paths of the four modes in the map, and their errors.
 
 python -m tests.benchmarks.online_localization.picture [SEED [SHARE]]
 """
@@ -33,23 +33,30 @@ def draw(of: Setting, share: float, target: Path = TARGET) -> None:
         make_starter=KnownStart(of.start, with_biases=True),
     )  # fmt: skip
     mpl.rcParams["svg.hashsalt"] = "maplab"
-    figure, axes = plt.subplots(figsize=(7.0, 2.8), layout="constrained")
+    figure, (above, axes) = plt.subplots(
+        1, 2, figsize=(9.0, 3.0), layout="constrained", width_ratios=(1.0, 1.6)
+    )
+    above.plot(truth[:, 4], truth[:, 5], color="#222222", linewidth=3.0, alpha=0.25, label="truth")
     for mode, name in NAMES.items():
         poses = result.results[mode]
         rows = np.searchsorted(of.times_ns, poses.times_ns)
         error_m = np.linalg.norm(poses.T_G_I[:, 4:] - truth[rows, 4:], axis=1)
         seconds = (poses.times_ns - of.times_ns[0]) * 1e-9
+        above.plot(poses.T_G_I[:, 4], poses.T_G_I[:, 5], color=COLOURS[mode], linewidth=0.9)
         axes.plot(seconds, 100.0 * error_m, label=name, color=COLOURS[mode], linewidth=1.2)
+    above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    above.legend(frameon=False, loc="center")
     axes.set(xlabel="time [s]", ylabel="position error in the map [cm]", ylim=(0.0, None))
-    axes.spines[["top", "right"]].set_visible(False)
+    for each in (above, axes):
+        each.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, ncols=4, loc="upper left")
     figure.savefig(target, metadata={"Date": None})
 
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    number = int(words[0]) if words else 13
+    number = int(words[0]) if words else 1
     draw(
-        setting(number, duration_s=20.0, landmarks=12_000),
+        setting(number, duration_s=30.0, landmarks=12_000),
         float(words[1]) if len(words) > 1 else 0.05,
     )
