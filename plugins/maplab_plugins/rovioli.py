@@ -17,6 +17,7 @@ from maplab_py.plugin import (
     command,
     key_of_folder,
 )
+from maplab_py.report import counted
 from maplab_py.server.options import SubmapOutput
 
 if TYPE_CHECKING:
@@ -107,12 +108,16 @@ def rovioli(
         )
     if mapping.is_ended_early:
         _tell_end(context, finished)
+    pushed = writer.pushed if writer is not None else 0
+    if pushed:
+        where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
+        context.terminal.note(f"pushed {counted(pushed, 'submap')} to {where}")
     if finished.vi_map is not None:
         context.maps.add(
             key,
             finished.vi_map,
             folder=folder if finished.disk_copy is not None else None,
-            is_saved=finished.disk_copy is not None,
+            is_saved=finished.disk_copy is not None or pushed > 0,
             disk_copy=finished.disk_copy,
         )
     return finished.report

@@ -28,6 +28,7 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
             robot_name="ant",
         )
         whole = session.vi_map
+        assert session.maps.unsaved == []  # the server has it
     folders = find_maps(spool / "incoming" / "ant")
     parts = [load_map(folder)[0] for folder in folders]
     assert len(parts) >= 3
