@@ -86,11 +86,9 @@ class MissionLine:
     length_m: float | None
     duration_s: float | None = dataclasses.field(metadata={"title": "duration", "unit": "s"})
     vertices: int
-    good: int = dataclasses.field(metadata={"title": "good landmarks"})
-    bad: int = dataclasses.field(metadata={"title": "bad landmarks"})
-    unknown: int | str = dataclasses.field(  # empty: there are none in the map
-        metadata={"title": "unknown landmarks"}
-    )
+    good: int  # landmarks; the line below the table says so, longer heads leave no room for names
+    bad: int
+    unknown: int | str  # empty: there are none in the map
     closures: int | None
     known: str
 

@@ -167,6 +167,7 @@ def optimize_states(
             raise EstimationError(f"the cost is not finite before the first iteration: {initial}")
         termination, iterations = "iteration limit", 0
         for iteration in range(1, options.num_iterations + 1):
+            progress.check()
             limit = options.num_iterations
             progress.step(iteration - 1, limit, f"iteration {iteration} of at most {limit}")
             if time.perf_counter() - began > options.max_time_seconds:

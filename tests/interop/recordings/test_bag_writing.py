@@ -212,7 +212,7 @@ def test_names_and_formats_fit(tmp_path: Path) -> None:
     for name, kind in (("walk.bag", "mcap"), ("walk", "ros1")):
         with pytest.raises(UserError, match=f"--bag_format={kind} is a "):
             format_of_path(tmp_path / name, kind)
-    with pytest.raises(UserError, match=r"leave \.mcap away"):
+    with pytest.raises(UserError, match=r"leave out \.mcap"):
         format_of_path(tmp_path / "walk.mcap")
 
 
