@@ -11,6 +11,7 @@ from collections import Counter
 from types import TracebackType
 from typing import Any, Self
 
+from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import available_bytes
 from maplab_py.pipeline.execution import execute
@@ -19,6 +20,7 @@ from maplab_py.pipeline.orders import Ending, Order, Outcome
 
 _SECONDS_TO_CONNECT = 10.0
 _SECONDS_TO_CLOSE = 10.0
+_SECONDS_BETWEEN_LOOKS = 0.02
 _SHARE = 0.9
 """Fraction of the memory that all local workers share."""
 
@@ -149,6 +151,9 @@ class Cluster:
 
     def next_outcome(self) -> Outcome:
         """Wait until an order ends; see `Engine.next_outcome`."""
+        while not self._done.has_ready() and not self._done.is_empty():
+            check_cancelled()
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
         future = next(self._done)
         title = self._titles.pop(future.key)
         try:

@@ -11,6 +11,7 @@ from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag, parse_words
 from maplab_py.console.scripts.batch import Batch
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
+from maplab_py.console.terminal.foreground import cancelling_interrupts
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.console.terminal.stage_table import StageTable
 from maplab_py.errors import Cancelled, FlagError
@@ -95,7 +96,7 @@ def run_as_pipeline(
     results = options.results_folder or Path(f"{path.stem}_results")
     start = time.monotonic()
     try:
-        with StageTable(terminal) as table:
+        with StageTable(terminal) as table, cancelling_interrupts():
             report = run_pipeline(
                 pipeline,
                 results,

@@ -228,3 +228,26 @@ def terminal_lent() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def cancelling_interrupts() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, and `check_cancelled` raise from then on.
+
+    Python discards exceptions inside finalisers and some callbacks: there an interrupt would be lost.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    token = CancelToken()
+
+    def handle(signal_number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        token.cancelled = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        with obeying(token):
+            yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -19,6 +19,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.foreground import (
     SECONDS_OF_GRACE,
+    cancelling_interrupts,
     in_waiting_thread,
     run_in_foreground,
 )
@@ -300,3 +301,23 @@ def test_inside_a_command_another_runs_under_the_same_token() -> None:
     with pytest.raises(Cancelled):
         run_in_foreground("outer", outer)
     check_cancelled()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_that_python_discards_still_cancels() -> None:
+    class Finalised:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+
+    before = signal.getsignal(signal.SIGINT)
+    with cancelling_interrupts():
+        check_cancelled()
+        finalised = Finalised()
+        del finalised
+        with pytest.raises(Cancelled):
+            check_cancelled()
+        with pytest.raises(KeyboardInterrupt):
+            press_ctrl_c()
+    check_cancelled()
+    assert signal.getsignal(signal.SIGINT) is before
