@@ -161,9 +161,7 @@ class Intake:
             return False
         try:
             item.submap = self._prepared(item)
-        except (
-            MaplabError
-        ):  # damaged: it is made again, or refused for what is wrong with the submap
+        except MaplabError:  # a worker makes it again, or says what is wrong with the submap
             return False
         return True
 

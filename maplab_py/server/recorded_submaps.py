@@ -25,12 +25,13 @@ class SubmapWriter:
 
     Attributes:
         pushed: How many parts were pushed.
+        is_whole: No vertices were left out.
     """
 
     def __init__(self, output: SubmapOutput) -> None:
         """Prepare; the spool is made at the first part."""
         assert output.submap_spool is not None
-        self.pushed = 0
+        self.pushed, self.is_whole = 0, True
         self._spool, self._output = Spool(output.submap_spool), output
         self._mission, self._first, self._begin_ns = -1, 0, 0
         self._start_ns = 0
@@ -41,6 +42,9 @@ class SubmapWriter:
         if builder is None or update.state is None or not builder.missions:
             return
         if builder.missions - 1 != self._mission:
+            self.is_whole &= builder.missions - 1 == self._mission + 1 and (
+                self._mission < 0 or self._first >= builder.count(self._mission) - 1
+            )
             self._mission, self._first = builder.missions - 1, 0
             self._start_ns = self._begin_ns = update.time_ns
         if update.time_ns - self._begin_ns >= 1e9 * self._output.submap_interval_s:

@@ -108,16 +108,16 @@ def rovioli(
         )
     if mapping.is_ended_early:
         _tell_end(context, finished)
-    pushed = writer.pushed if writer is not None else 0
-    if pushed:
+    is_at_server = writer is not None and writer.pushed > 0 and writer.is_whole
+    if writer is not None and writer.pushed:
         where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
-        context.terminal.note(f"pushed {counted(pushed, 'submap')} to {where}")
+        context.terminal.note(f"pushed {counted(writer.pushed, 'submap')} to {where}")
     if finished.vi_map is not None:
         context.maps.add(
             key,
             finished.vi_map,
             folder=folder if finished.disk_copy is not None else None,
-            is_saved=finished.disk_copy is not None or pushed > 0,
+            is_saved=finished.disk_copy is not None or is_at_server,
             disk_copy=finished.disk_copy,
         )
     return finished.report

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError
 from maplab_py.server.options import SubmapOutput
+from maplab_py.server.recorded_submaps import SubmapWriter
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.submaps import append_submaps
@@ -47,3 +49,14 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
 def test_the_interval_must_be_positive() -> None:
     with pytest.raises(FlagError, match="submap_interval_s=0"):
         SubmapOutput(submap_interval_s=0.0)
+
+
+def test_vertices_of_a_mission_that_was_given_up_are_missing(tmp_path: Path) -> None:
+    writer = SubmapWriter(SubmapOutput(submap_spool=tmp_path / "spool"))
+    builder = SimpleNamespace(missions=1, count=lambda mission: 5)
+    update = SimpleNamespace(state=object(), time_ns=0)
+    writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
+    assert writer.is_whole
+    builder.missions = 2
+    writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
+    assert not writer.is_whole

@@ -42,7 +42,7 @@ class FrameTimes:
     largest_ms: float
 
 
-class _Watch:
+class FrameWatch:
     """Processor time from frame to frame."""
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ def measure(
     recording = open_recording(folder, SourceOptions(rovio_active_camera_indices=cameras))
     odometry = OdometryOptions(initialization=NEVER) if never_starts else OdometryOptions()
     options = RunOptions(odometry=odometry, output=OutputOptions(run_map_builder=builds_map))
-    watch = _Watch()
+    watch = FrameWatch()
     mapping = Mapping(recording, options, observer=watch)
     try:
         mapping.run()

@@ -11,7 +11,6 @@ optimisation, aligned by SE(3).
 from __future__ import annotations
 
 import dataclasses
-import time
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.mapping import Mapping
-from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
@@ -36,6 +34,7 @@ from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.storage.summary_map import write_summary_map
+from tests.benchmarks.frontend.frame_times import FrameWatch
 from tests.benchmarks.frontend.sequences import TRUTH, position_errors
 from tests.support.data import shared_data_folder
 
@@ -97,21 +96,6 @@ class ImageErrors:
         return self.batch_rmse_m / self.odometry_rmse_m
 
 
-class _FrameTimes:
-    """Processor time from frame to frame [ms]."""
-
-    def __init__(self) -> None:
-        self.spent_ms: list[float] = []
-        self._last_s = time.process_time()
-
-    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
-        """Note the time since the frame before."""
-        del update, mapping
-        now_s = time.process_time()
-        self.spent_ms.append(1e3 * (now_s - self._last_s))
-        self._last_s = now_s
-
-
 def make_map(flight: Flight, cameras: str, target: Path) -> F64:
     """Write the summary map of a flight; return T_G_R (7,), by the vertices of the map."""
     mapping = Mapping(flight.recording(cameras), RunOptions(stream=flight.stream))
@@ -129,7 +113,7 @@ def make_map(flight: Flight, cameras: str, target: Path) -> F64:
 
 def without_map(flight: Flight, cameras: str) -> tuple[float, float, float]:
     """Return the RMSE of the odometry and of the batch [m], and the median time of a frame [ms]."""
-    times = _FrameTimes()
+    times = FrameWatch()
     mapping = Mapping(flight.recording(cameras), RunOptions(stream=flight.stream), observer=times)
     mapping.run()
     truth, online = flight.truth, mapping.trajectory()
@@ -145,9 +129,9 @@ def without_map(flight: Flight, cameras: str) -> tuple[float, float, float]:
 
 def with_map(
     flight: Flight, cameras: str, map_folder: Path, T_G_R: F64
-) -> tuple[F64, float, _FrameTimes]:
+) -> tuple[F64, float, FrameWatch]:
     """Return position errors of the localised frames (N,), their share, and times; without a map builder."""
-    times = _FrameTimes()
+    times = FrameWatch()
     localization = OnlineLocalizationOptions(map_folder=map_folder)
     output = OutputOptions(run_map_builder=False)
     options = RunOptions(localization=localization, output=output, stream=flight.stream)
