@@ -11,6 +11,7 @@ import pytest
 from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
+from maplab_py.report import Report
 from maplab_py.simulation.scenario_file import parse_scenario
 from tests.docs.markdown import blocks, links
 from tests.support.data import REPOSITORY
@@ -68,23 +69,48 @@ def test_commands_on_pages_exist_with_their_flags(path: Path) -> None:
             assert call.arguments() is not None
 
 
-def test_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _tutorial(part: str) -> list[tuple[str, str]]:
+    """Return the blocks of the tutorial before or after the heading of its second part."""
+    every = list(blocks(DOCS / "tutorial.md", "maplab", "python"))
+    second = next(i for i, (_, text) in enumerate(every) if "three_sessions" in text)
+    return every[:second] if part == "recording" else every[second:]
+
+
+def _run(session: Session, texts: list[str], shown: str) -> list[Report]:
+    """Run the commands of some blocks; return the reports of one of the commands."""
+    reports = []
+    for words in (words for text in texts for words in split_commands(text)):
+        report = session.execute(session.parse(words))
+        assert report.failure == ""
+        if words[0] == shown:
+            reports.append(report)
+    return reports
+
+
+def test_tutorial_of_three_sessions_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    session = Session(load_registry())
-    errors = []
-    for language, text in blocks(DOCS / "tutorial.md", "maplab", "python"):
-        if language == "python":
-            exec(compile(text, "tutorial.md", "exec"), {})
-            continue
-        for words in split_commands(text):
-            report = session.execute(session.parse(words))
-            assert report.failure == ""
-            if words[0] == "evaluate_map":
-                errors.append(report)
-    before, after = errors
+    parts = _tutorial("sessions")
+    with Session(load_registry()) as session:
+        before, after = _run(
+            session, [text for kind, text in parts if kind == "maplab"], "evaluate_map"
+        )
     assert after.ate_m <= 0.25 * before.ate_each_m
     assert (tmp_path / "merged" / "vi_map").is_dir()
     assert (tmp_path / "trajectory.csv").is_file()
+    ((_, code),) = (block for block in parts if block[0] == "python")
+    exec(compile(code, "tutorial.md", "exec"), {})
+
+
+@pytest.mark.slow
+def test_tutorial_of_a_recording_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Session(load_registry()) as session:
+        odometry, closed = _run(
+            session, [text for _, text in _tutorial("recording")], "evaluate_trajectory"
+        )
+    assert odometry.ape_m.rmse <= 0.02
+    assert closed.ape_m.rmse <= 0.5 * odometry.ape_m.rmse
+    assert (tmp_path / "flight_map" / "vi_map").is_dir()
 
 
 @pytest.mark.slow
