@@ -40,8 +40,8 @@ class RelaxReport(Report):
     def failure(self) -> str:
         """Return why nothing was relaxed."""
         relaxed = self.relaxation.failure
-        search_failure = self.loop_closures.failure
-        return f"{relaxed}; {search_failure}" if relaxed and search_failure else relaxed
+        search = self.loop_closures.reason
+        return f"{relaxed}; {search}" if relaxed and search else relaxed
 
 
 @dataclasses.dataclass(frozen=True)

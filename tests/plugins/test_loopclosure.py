@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
+from maplab_py.console.terminal.render import rendered
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 DRIFT = (0.2, -0.1, 0.05, 0.01)
@@ -59,16 +61,30 @@ def test_relaxing_may_merge_too() -> None:
     assert report.merging.landmarks_merged > 100
 
 
-@pytest.mark.parametrize("command", ["lc", "relax", "srelax"])
-def test_nothing_found_fails_with_an_explanation(command: str) -> None:
+@pytest.mark.parametrize("command", ["relax", "srelax"])
+def test_nothing_to_relax_fails_with_an_explanation(command: str) -> None:
     session = session_of(UNRELATED)
     assert "no loop closures" in session.run(command).failure
+
+
+def test_a_search_without_loops_succeeds_and_says_why() -> None:
+    session = session_of(UNRELATED)
+    report = session.run("lc")
+    assert report.failure == ""
+    assert rendered(report, io.StringIO()).count("no loop closures") == 1
+
+
+def test_relaxing_says_once_why_there_are_no_loops() -> None:
+    session = session_of(UNRELATED)
+    report = session.run("relax")
+    assert "no loop closures" in report.failure
+    assert "no loop closures" not in rendered(report, io.StringIO())
 
 
 def test_seed_and_gates_are_flags() -> None:
     session = session_of(TWICE)
     report = session.run("lc", lc_seed=7, lc_min_inlier_count=1000)
-    assert "needed 1000" in report.failure
+    assert "needed 1000" in report.reason
 
 
 def test_closures_are_listed_removed_and_forgotten(tmp_path: Path) -> None:

@@ -49,12 +49,17 @@ class LoopClosureReport(Report):
     observations_moved: int = 0
     merges_refused: dict[str, int] = dataclasses.field(default_factory=dict)  # by reason
     notes: tuple[str, ...] = ()
-    reason: str = ""  # why there is no result, empty when there is one
+    reason: str = dataclasses.field(default="", metadata={"is_prose": True})
+    """Why nothing was found, merged or added; empty when something was."""
 
     @property
     def failure(self) -> str:
-        """Return why the search has no result."""
-        return self.reason
+        """Return why nothing could be searched, or why accepted closures were not used.
+
+        A search that finds no loop is not a failure: the recording may have none.
+        """
+        could_search = self.database_landmarks > 0
+        return "" if could_search and not self.accepted else self.reason
 
     @property
     def advice(self) -> str:

@@ -93,13 +93,18 @@ class Table:
 Block = Paragraph | Pairs | Table
 
 
-def blocks_of(report: Any, title: str = "") -> list[Block]:
+def blocks_of(report: Any, title: str = "", error: str = "") -> list[Block]:
     """Lay out a report: its single values first, then its lists and nested reports.
+
+    Args:
+        report: The report, or a record of one.
+        title: Title of a nested report.
+        error: Failure of the report around it, which is printed anyway.
 
     The metadata of a field can hold its `title` (empty: no title) and its `unit`; `is_prose` marks
     a text that stands without a title, `are_entries` a list that explains terms.
     """
-    failure = report.failure if isinstance(report, Report) else ""
+    failure = error or (report.failure if isinstance(report, Report) else "")
     for _ in range(2):  # what a report displays can be a sentence
         if isinstance(report, Report):
             text = report.as_text()
@@ -123,7 +128,7 @@ def blocks_of(report: Any, title: str = "") -> list[Block]:
         if field.metadata.get("is_prose"):
             following.append(Paragraph(str(value)))
         elif _is_record(value):
-            following += blocks_of(value, head)
+            following += blocks_of(value, head, failure)
         elif _is_records(value) and any(_has_records(record) for record in value):
             following += [block for record in value for block in blocks_of(record)]
         elif _is_records(value):
