@@ -23,7 +23,7 @@ from maplab_py.frontend.initialization.initializer import Initializer
 from maplab_py.frontend.motion import MotionDetector
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate, WindowSummary
-from maplab_py.frontend.starting import MakeStarter, Starter
+from maplab_py.frontend.starting import MakeStarter, Start, Starter
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.protocol import (
     FrameSet,
@@ -267,19 +267,19 @@ class Odometry:
     def _initialised(self, update: OdometryUpdate) -> OdometryUpdate:
         """Offer the frame to the initialisation; start the smoother when it succeeds."""
         begin = time.perf_counter()
-        frame = _window_frame(update)
-        start = self._starter.push(frame)
+        start = self._starter.push(_window_frame(update))
         update.stage_ms["initialise"] = 1e3 * (time.perf_counter() - begin)
         if start is None:
             return dataclasses.replace(update, note=update.note or self._starter.reason)
-        self._smoother = self._new_smoother()
-        self._smoother.start(frame, start)
-        self._health = HealthMonitor(self.options.health)
+        begin = time.perf_counter()
+        try:
+            state = self._started(start)
+        except EstimationError as error:
+            return dataclasses.replace(update, note=self._start_again(str(error)))
+        update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
         self.counts.starts += 1
-        state = BodyStates.single(
-            update.time_ns, start.T_M_I, start.v_M, start.gyro_bias, start.accel_bias
-        )
-        self._gyro_bias, self._speed_mps = start.gyro_bias, float(np.linalg.norm(start.v_M))
+        self._gyro_bias = state.gyro_bias[0]
+        self._speed_mps = float(np.linalg.norm(state.v_M_I[0]))
         return dataclasses.replace(
             update,
             status=OdometryStatus.TRACKING,
@@ -287,6 +287,21 @@ class Odometry:
             interval=None,
             state=state,
         )
+
+    def _started(self, start: Start) -> BodyStates:
+        """Start the smoother, and add the frames that have come since; return the newest state."""
+        first, state = start.frame, start.state
+        smoother = self._new_smoother()
+        smoother.start(first, state)
+        newest = BodyStates.single(
+            first.time_ns, state.T_M_I, state.v_M, state.gyro_bias, state.accel_bias
+        )
+        for frame in start.later:
+            # without biases and speed, turning and resting could not be told apart
+            newest = _state(smoother.add(dataclasses.replace(frame, motion=Motion.MOVING)))
+        self._smoother = smoother
+        self._health = HealthMonitor(self.options.health)
+        return newest
 
     def _new_smoother(self) -> FixedLagSmoother:
         device, window = self._device, self.options.window
@@ -299,9 +314,7 @@ class Odometry:
         begin = time.perf_counter()
         try:
             result = smoother.add(_window_frame(update))
-            state = BodyStates.single(
-                result.time_ns, result.T_M_I, result.v_M, result.gyro_bias, result.accel_bias
-            )
+            state = _state(result)
             tracked = sum(int((c.num_frames > 1).sum()) for c in update.tracked.cameras)
             problem = self._health.problem(state, result.covariance, tracked)
         except EstimationError as error:
@@ -350,6 +363,12 @@ def _window_frame(update: OdometryUpdate) -> WindowFrame:
         uv_px=np.concatenate([c.uv_px for c in cameras]),
         sigma_px=np.concatenate([c.sigma_px for c in cameras]),
         motion=update.motion,
+    )
+
+
+def _state(result: WindowUpdate) -> BodyStates:
+    return BodyStates.single(
+        result.time_ns, result.T_M_I, result.v_M, result.gyro_bias, result.accel_bias
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Protocol
 
@@ -9,15 +10,24 @@ from maplab_py.estimation.window.frame import StartState, WindowFrame
 from maplab_py.interop.recordings.protocol import RecordedSensors
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Start:
+    """The state of a frame, and the frames that have come since."""
+
+    frame: WindowFrame
+    state: StartState
+    later: tuple[WindowFrame, ...] = ()  # in the order of time
+
+
 class Starter(Protocol):
-    """Takes frames until it knows the state of the newest."""
+    """Takes frames until it knows the state of the newest, or of one shortly before."""
 
     @property
     def reason(self) -> str:
         """Why there is no state so far, in plain words."""
 
-    def push(self, frame: WindowFrame) -> StartState | None:
-        """Take the next frame; return its state, None while it is not known."""
+    def push(self, frame: WindowFrame) -> Start | None:
+        """Take the next frame; return a start whose last frame it is, None while there is none."""
 
 
 MakeStarter = Callable[[RecordedSensors], Starter]

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.estimation.window.frame import StartState, WindowFrame
+from maplab_py.frontend.starting import Start
 from maplab_py.geometry.association import nearest_rows
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.recordings.protocol import RecordedSensors
@@ -27,7 +28,7 @@ class KnownStart:
     def __call__(self, device: RecordedSensors) -> KnownStart:
         return self
 
-    def push(self, frame: WindowFrame) -> StartState | None:
+    def push(self, frame: WindowFrame) -> Start | None:
         time_ns = np.array([frame.time_ns])
         T_M_I, is_known = interpolate_poses(
             self.truth.times_ns, self.truth.T_R_B, time_ns, max_gap_ns=10**9
@@ -41,4 +42,5 @@ class KnownStart:
             assert self.truth.gyro_bias is not None
             assert self.truth.accel_bias is not None
             gyro_bias, accel_bias = self.truth.gyro_bias[row], self.truth.accel_bias[row]
-        return StartState(T_M_I[0], self.truth.v_R[row], gyro_bias, accel_bias, SIGMA)
+        state = StartState(T_M_I[0], self.truth.v_R[row], gyro_bias, accel_bias, SIGMA)
+        return Start(frame, state)

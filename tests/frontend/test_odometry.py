@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.estimation.window.frame import Motion
+from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_options import HealthOptions, OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.starting import Start
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.protocol import (
@@ -73,6 +75,53 @@ def test_noisy_measurements(cameras: int) -> None:
     track_id, p_M = odometry.landmarks()
     assert len(track_id) == len(p_M) > 20
     assert {u.mission for u in updates} == {0}
+
+
+@dataclasses.dataclass
+class LateStart:
+    """Starts some frames after that whose state it knows, as an attempt that takes several frames."""
+
+    known: KnownStart
+    frames: int
+    reason: str = ""
+    waiting: list[WindowFrame] = dataclasses.field(default_factory=list)
+
+    def __call__(self, device: RecordedSensors) -> LateStart:
+        return self
+
+    def push(self, frame: WindowFrame) -> Start | None:
+        # as the detector would say without biases and speed
+        self.waiting.append(dataclasses.replace(frame, motion=Motion.RESTING))
+        if len(self.waiting) <= self.frames:
+            return None
+        first, *later = self.waiting
+        start = self.known.push(first)
+        assert start is not None
+        return Start(first, start.state, tuple(later))
+
+
+def test_frames_that_came_during_a_start_are_used() -> None:
+    device, events, known = events_of(cameras=1)
+    starter = LateStart(known, 4)
+    odometry = Odometry(device, make_starter=starter)
+    updates = pushed(odometry, events)
+    assert [update.status for update in updates[:5]] == [OdometryStatus.INITIALISING] * 4 + [
+        OdometryStatus.TRACKING
+    ]
+    assert updates[4].interval is None
+    assert odometry.counts.starts == 1
+    assert device.imu is not None
+    smoother = FixedLagSmoother(device.cameras, device.T_I_C, device.imu, OdometryOptions().window)
+    first, *later = starter.waiting
+    start = known.push(first)
+    assert start is not None
+    smoother.start(first, start.state)
+    for frame in later:
+        expected = smoother.add(dataclasses.replace(frame, motion=Motion.MOVING))
+    states = states_of(updates)
+    np.testing.assert_array_equal(states.T_M_I[0], expected.T_M_I)
+    np.testing.assert_array_equal(states.v_M_I[0], expected.v_M)
+    assert position_errors(known.truth, states.times_ns, states.T_M_I).max() < 0.1
 
 
 def test_batches_of_samples_do_not_change_results() -> None:

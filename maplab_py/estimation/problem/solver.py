@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Generic
 
 import numpy as np
@@ -159,28 +159,49 @@ def optimize_states(
     Raises:
         EstimationError: The cost is not finite at the beginning.
     """
-    began = time.perf_counter()
+    iterations = optimizing_states(problem, states, options, progress, after_step)
     with single_blas_thread():
-        run = _Run(problem, states, options)
-        initial = dict(run.costs)
-        if not np.isfinite(run.cost):
-            raise EstimationError(f"the cost is not finite before the first iteration: {initial}")
-        termination, iterations = "iteration limit", 0
-        for iteration in range(1, options.num_iterations + 1):
-            progress.check()
-            limit = options.num_iterations
-            progress.step(iteration - 1, limit, f"iteration {iteration} of at most {limit}")
-            if time.perf_counter() - began > options.max_time_seconds:
-                termination = "time limit"
-                break
-            if run.is_stationary():
-                termination = "gradient is zero"
-                break
-            iterations = iteration
-            if reason := _iterate(run, iteration, progress, after_step):
-                termination = reason
-                break
-        run.return_to_best()
+        while True:
+            try:
+                next(iterations)
+            except StopIteration as end:
+                states, summary = end.value
+                return states, summary
+
+
+def optimizing_states(
+    problem: LeastSquares[S, L],
+    states: S,
+    options: SolverOptions,
+    progress: Progress,
+    after_step: Callable[[int, S], bool] | None = None,
+) -> Generator[None, None, tuple[S, SolverSummary]]:
+    """Minimise as `optimize_states` does, and pause after every iteration that does not end it.
+
+    The caller limits the threads of BLAS. Time during pauses counts as that of the optimisation.
+    """
+    began = time.perf_counter()
+    run = _Run(problem, states, options)
+    initial = dict(run.costs)
+    if not np.isfinite(run.cost):
+        raise EstimationError(f"the cost is not finite before the first iteration: {initial}")
+    termination, iterations = "iteration limit", 0
+    for iteration in range(1, options.num_iterations + 1):
+        progress.check()
+        limit = options.num_iterations
+        progress.step(iteration - 1, limit, f"iteration {iteration} of at most {limit}")
+        if time.perf_counter() - began > options.max_time_seconds:
+            termination = "time limit"
+            break
+        if run.is_stationary():
+            termination = "gradient is zero"
+            break
+        iterations = iteration
+        if reason := _iterate(run, iteration, progress, after_step):
+            termination = reason
+            break
+        yield
+    run.return_to_best()
     summary = SolverSummary(
         initial, dict(run.costs), iterations, run.rejected, termination,
         time.perf_counter() - began, tuple(dict.fromkeys(run.singular)),

@@ -7,11 +7,14 @@ import dataclasses
 import numpy as np
 
 from maplab_py.errors import UserError
-from maplab_py.estimation.window.frame import StartState, WindowFrame
+from maplab_py.estimation.linear.threads import single_thread
+from maplab_py.estimation.window.frame import WindowFrame
 from maplab_py.frontend.initialization.motion import Attempt, Limits, MotionStart, accel_bias_sigma
 from maplab_py.frontend.initialization.options import InitializationOptions
+from maplab_py.frontend.initialization.paced_work import PacedWork
 from maplab_py.frontend.initialization.segment import History
 from maplab_py.frontend.initialization.standstill import motionlessness, start_at_rest
+from maplab_py.frontend.starting import Start
 from maplab_py.interop.recordings.protocol import RecordedSensors
 
 _MOST_LENIENT = 3.0
@@ -22,14 +25,30 @@ _LONGEST_WAIT_S = (1.0, 5.0)
 """Largest time between attempts while the scale improves, and after a minute without success."""
 _WAIT_SHARE = 0.1
 """Time between attempts as a share of the time that has passed since the patience ended."""
+_UNITS_PER_S, _MOST_UNITS = 900.0, 60.0
+"""Units of work of an attempt for each second between frames, and the most that a frame does."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pending:
+    """An attempt in motion under way."""
+
+    frame: WindowFrame  # whose state it looks for
+    work: PacedWork[Attempt]
+    limits: Limits
+    waited_s: float  # when it began
+    early_s: float  # until larger deviations are allowed
+    duration_s: float  # of the frames that it may use
+    later: list[WindowFrame] = dataclasses.field(default_factory=list)
 
 
 class Initializer:
     """Takes frames until the state of the newest is known well enough.
 
     A device at rest starts by the mean of its samples; one in motion by a closed form and least squares over
-    the latest seconds. `reason` says why it has not started yet, `attempt` what the last attempt in
-    motion has found.
+    the latest seconds. Such an attempt is spread over some frames, and gives the state of the frame with
+    which it began (see decision 42). `reason` says why it has not started yet, `attempt` what the last
+    attempt in motion has found.
     """
 
     def __init__(
@@ -50,18 +69,19 @@ class Initializer:
         self._motion = MotionStart(device.cameras, device.T_I_C, device.imu, self._options)
         self._first_ns: int | None = None
         self._next_ns = -1  # time before which there is no further attempt
+        self._pending: _Pending | None = None
         self.reason = "no images yet"
         self.attempt: Attempt | None = None
 
-    def push(self, frame: WindowFrame) -> StartState | None:
-        """Take the next frame; return its state when the estimator may start with it.
+    def push(self, frame: WindowFrame) -> Start | None:
+        """Take the next frame; return a start when the estimator may start.
 
         M has its origin at the IMU and gravity along -z.
         """
         options, history = self._options, self._history
         history.push(frame)
         if len(history) == 1:
-            self._first_ns, self._next_ns = frame.time_ns, -1
+            self._first_ns, self._next_ns, self._pending = frame.time_ns, -1, None
         frames = history.latest(options.rest_s + 1e-3)
         duration_s = (frames[-1].time_ns - frames[0].time_ns) * 1e-9
         if duration_s >= options.rest_s - 0.5 * duration_s / max(len(frames) - 1, 1):
@@ -69,45 +89,67 @@ class Initializer:
             if motionlessness(frames, accel_gyro).is_rest(options):
                 self.reason = ""
                 sigma = accel_bias_sigma(self._imu, options)
-                return start_at_rest(self._imu, times_ns, accel_gyro, sigma)
-        return self._start_in_motion(frame)
+                return Start(frame, start_at_rest(self._imu, times_ns, accel_gyro, sigma))
+        if self._pending is None:
+            self._pending = self._begin(frame)
+        else:
+            self._pending.later.append(frame)
+        return None if self._pending is None else self._advance(self._pending)
 
-    def _start_in_motion(self, frame: WindowFrame) -> StartState | None:
+    def _begin(self, frame: WindowFrame) -> _Pending | None:
+        """Begin an attempt in motion if it is time to."""
         options, history = self._options, self._history
-        least_s = options.min_rig_s if _sees_points_twice(frame) else options.min_mono_s
+        has_rig = _sees_points_twice(frame)
+        least_s = options.min_rig_s if has_rig else options.min_mono_s
         if history.duration_s < least_s - 5e-3:
             self.reason = f"{history.duration_s:.1f} of {least_s:g} s of images"
             return None
         if frame.time_ns < self._next_ns:
             return None
-        has_rig = _sees_points_twice(frame)
         most = options.most_keyframes if has_rig else options.most_mono_keyframes
         interval_s = max(options.keyframe_interval_s, history.duration_s / (most - 1))
         waited_s = (frame.time_ns - (self._first_ns or 0)) * 1e-9
         leniency = min(max(waited_s / options.patience_s, 1.0), _MOST_LENIENT)
         limits = Limits(leniency * options.max_scale_sigma, leniency * options.max_tilt_sigma_deg)
-        is_early = not has_rig and waited_s < options.early_s - 5e-3
-        if is_early:
+        early_s = np.inf
+        if not has_rig and waited_s < options.early_s - 5e-3:
+            early_s = options.early_s - waited_s
+            if early_s < options.retry_s - 5e-3:
+                return None  # it would still be under way when larger deviations are allowed
             limits = dataclasses.replace(
                 limits, scale_sigma=min(limits.scale_sigma, options.early_scale_sigma)
             )
-        attempt = self._motion.solve(history.segment(self._motion.imu, interval_s), limits)
-        wait_s = self._wait_s(attempt, limits, waited_s)
-        if is_early:
-            wait_s = min(wait_s, options.early_s - waited_s)
-        self._next_ns = frame.time_ns + round((wait_s - 5e-3) * 1e9)
-        self.attempt, self.reason = attempt, attempt.reason
-        return attempt.state
+        work = PacedWork(
+            self._motion.solving(history.segment(self._motion.imu, interval_s), limits)
+        )
+        return _Pending(frame, work, limits, waited_s, early_s, history.duration_s)
 
-    def _wait_s(self, attempt: Attempt, limits: Limits, waited_s: float) -> float:
+    def _advance(self, pending: _Pending) -> Start | None:
+        """Do a frame's share of an attempt; return a start if it ends with one."""
+        newest = pending.later[-1] if pending.later else pending.frame
+        since_ns = newest.imu_times_ns[-1] - newest.imu_times_ns[0]
+        units = min(_UNITS_PER_S * since_ns * 1e-9, _MOST_UNITS)
+        with single_thread():
+            attempt = pending.work.advance(units)
+        if attempt is None:
+            return None
+        self._pending = None
+        wait_s = min(self._wait_s(attempt, pending), pending.early_s)
+        self._next_ns = pending.frame.time_ns + round((wait_s - 5e-3) * 1e9)
+        self.attempt, self.reason = attempt, attempt.reason
+        if attempt.state is None:
+            return None
+        return Start(pending.frame, attempt.state, tuple(pending.later))
+
+    def _wait_s(self, attempt: Attempt, pending: _Pending) -> float:
         """Return the time until the next attempt: those that reach the refinement take long."""
-        options, refined = self._options, attempt.refined
+        options, refined, limits = self._options, attempt.refined, pending.limits
         if refined is None:
             return options.retry_s
         # when the scale will be known well enough
         missing = float(max(refined.scale_sigma / limits.scale_sigma, 1.0))
-        later_s = self._history.duration_s * (missing ** (1.0 / _SCALE_EXPONENT) - 1.0)
-        since_s = waited_s - options.patience_s
+        later_s = pending.duration_s * (missing ** (1.0 / _SCALE_EXPONENT) - 1.0)
+        since_s = pending.waited_s - options.patience_s
         wait_s = max(options.retry_s, min(0.75 * later_s, _LONGEST_WAIT_S[0]))
         return float(max(wait_s, min(_WAIT_SHARE * since_s, _LONGEST_WAIT_S[1])))
 

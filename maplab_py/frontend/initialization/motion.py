@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64
+from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.gyro_bias import (
@@ -18,6 +19,7 @@ from maplab_py.frontend.initialization.gyro_bias import (
 from maplab_py.frontend.initialization.imu_noise import with_least_noise
 from maplab_py.frontend.initialization.linear import LinearMotion, solve_motion
 from maplab_py.frontend.initialization.options import InitializationOptions
+from maplab_py.frontend.initialization.paced_work import Work, finished
 from maplab_py.frontend.initialization.rays import RayMaker, SegmentRays
 from maplab_py.frontend.initialization.refinement import (
     BiasSigmas,
@@ -34,6 +36,8 @@ _MIN_SHARE_IN_FRONT = 0.7
 _POSITION_SIGMA_M = 1e-4
 _BIAS_WALK_S = 3600.0
 _MAX_BIAS_SIGMAS = 4.0
+_GYRO_BIAS_UNITS, _MOTION_UNITS = 22.0, 22.0
+"""Units of work of the closed forms, rays included."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +75,12 @@ class MotionStart:
         self._refinement = Refinement(cameras, T_I_C, self.imu, biases, imu)
 
     def solve(self, segment: Segment, limits: Limits | None = None) -> Attempt:
-        """Estimate the state of the last frame of a segment.
+        """Estimate the state of the last frame of a segment; see `solving`."""
+        with single_thread():
+            return finished(self.solving(segment, limits))
+
+    def solving(self, segment: Segment, limits: Limits | None = None) -> Work[Attempt]:
+        """Estimate the state of the last frame of a segment in parts.
 
         Args:
             segment: Frames.
@@ -88,6 +97,7 @@ class MotionStart:
                 "at things with texture",
             )
         gyro_bias = estimate_gyro_bias(segment.inertial, pairs)
+        yield _GYRO_BIAS_UNITS
         turns = integrate_turns(segment.inertial, gyro_bias)
         sigma = self._accel_bias_sigma
         motion = solve_motion(segment.inertial, turns, gyro_bias, rays, sigma)
@@ -102,10 +112,11 @@ class MotionStart:
                 f"{100 * (1 - motion.share_in_front):.0f} % of the points would lie behind the "
                 "cameras: move the camera sideways, and faster",
             )
+        yield _MOTION_UNITS
         # cameras that share points know the scale without the IMU
         wanted = 0.0 if shares_points(rays) else limits.scale_sigma
         states = _states(turns, gyro_bias, motion)
-        refined = self._refinement.refine(segment, states, wanted_scale_sigma=wanted)
+        refined = yield from self._refinement.refine(segment, states, wanted_scale_sigma=wanted)
         reason = self._objection(refined, rays, limits)
         if refined is None or reason:
             return Attempt(None, reason, refined)

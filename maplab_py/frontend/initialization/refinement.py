@@ -9,9 +9,8 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
+from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.cameras import BackProjection, camera_table
 from maplab_py.estimation.window.factors import FrameFactors
@@ -24,6 +23,7 @@ from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
 from maplab_py.frontend.initialization.imu_noise import noise_factor, with_least_noise
+from maplab_py.frontend.initialization.paced_work import Work, each_step
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import so3
 from maplab_py.progress import SILENT
@@ -38,6 +38,8 @@ _TOLERANCE = 1e-5
 _MIN_SHARE_IN_FRONT = 0.9
 _NEAR_SCALE_FACTOR = 2.0
 """The scale is not known more than so much better with less noise of the IMU."""
+_UNITS_PER_FRAME, _TRIANGULATION_UNITS, _COVARIANCE_UNITS = 0.17, 4.0, 5.0
+"""Units of work of an iteration for each frame, and of other parts."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,8 +135,8 @@ class Refinement:
 
     def refine(
         self, segment: Segment, states: WindowStates, *, wanted_scale_sigma: float = 0.0
-    ) -> Refined | None:
-        """Refine the states (F) of a segment; None when they are not determined.
+    ) -> Work[Refined | None]:
+        """Refine the states (F) of a segment; the result is None when they are not determined.
 
         Args:
             segment: Frames.
@@ -142,28 +144,25 @@ class Refinement:
             wanted_scale_sigma: Estimate the noise of the IMU, too, where the deviation of the scale comes
                 near to this; 0 = never.
         """
-        with single_thread():
-            round_ = _Round(
-                segment, self._observations(segment), self._imu, _WIDE_GATE_CHI2, Loss.CAUCHY,
-                _ITERATIONS[0],
-            )  # fmt: skip
-            solved = self._solved(round_, states)
-            if solved is None:
-                return None
-            round_ = dataclasses.replace(
-                round_,
-                gate_chi2=self._options.gate_chi2,
-                loss=Loss.HUBER,
-                iterations=_ITERATIONS[1],
-            )
-            solved = self._solved(round_, solved.states)
-            refined = self._judged(segment, solved)
-            if refined is None or refined.scale_sigma > _NEAR_SCALE_FACTOR * wanted_scale_sigma:
-                return refined
-            assert solved is not None
-            imu = self._with_estimated_noise(solved)
-            again = self._solved(dataclasses.replace(round_, imu=imu), solved.states)
-            return self._judged(segment, again)
+        round_ = _Round(
+            segment, self._observations(segment), self._imu, _WIDE_GATE_CHI2, Loss.CAUCHY,
+            _ITERATIONS[0],
+        )  # fmt: skip
+        solved = yield from self._solved(round_, states)
+        if solved is None:
+            return None
+        round_ = dataclasses.replace(
+            round_, gate_chi2=self._options.gate_chi2, loss=Loss.HUBER, iterations=_ITERATIONS[1]
+        )
+        solved = yield from self._solved(round_, solved.states)
+        refined = self._judged(segment, solved)
+        if refined is None or refined.scale_sigma > _NEAR_SCALE_FACTOR * wanted_scale_sigma:
+            return refined
+        assert solved is not None
+        imu = self._with_estimated_noise(solved)
+        yield _COVARIANCE_UNITS
+        again = yield from self._solved(dataclasses.replace(round_, imu=imu), solved.states)
+        return self._judged(segment, again)
 
     def _with_estimated_noise(self, solved: _Solved) -> Imu:
         """Return the IMU with the noise that the residuals show; as assumed when they cannot tell."""
@@ -179,8 +178,8 @@ class Refinement:
             factor * self._imu.acc_noise_density,
         )
 
-    def _solved(self, round_: _Round, states: WindowStates) -> _Solved | None:
-        """Triangulate landmarks from states and solve; None without landmarks."""
+    def _solved(self, round_: _Round, states: WindowStates) -> Work[_Solved | None]:
+        """Triangulate landmarks from states and solve; the result is None without landmarks."""
         segment = round_.segment
         tracks, candidates = self._tracks(segment, round_.observed, states, round_.gate_chi2)
         rows = tracks.landmark_rows
@@ -198,7 +197,9 @@ class Refinement:
         )
         start = WindowStates(states.T_M_I, states.motion, tracks.h[rows])
         solver = SolverOptions(num_iterations=round_.iterations, function_tolerance=_TOLERANCE)
-        states, summary = optimize_states(problem, start, solver, SILENT)
+        yield _TRIANGULATION_UNITS
+        steps = optimizing_states(problem, start, solver, SILENT)
+        states, summary = yield from each_step(steps, _UNITS_PER_FRAME * len(segment))
         has_converged = summary.iterations < round_.iterations and len(order) > 0
         return _Solved(
             problem, chain, states, round_.imu, len(rows), candidates - len(rows), has_converged

@@ -2,10 +2,10 @@
 
 The initialisation is started every few seconds of flights along the ground truth of EuRoC's V1_01, V1_02
 and MH_04, with both cameras and with the first alone. Tracks are simulated (0.8 px); IMU samples are
-simulated or those recorded. Of every start: time since its first frame, error of the direction of
-gravity, scale of the flight from which the state was taken (by a similarity to the truth), and of its
-last velocity, that is the component along the true one as a share of it. A velocity below 0.3 m/s has no
-scale; its error counts as a share of 0.3 m/s. A start at rest has neither.
+simulated or those recorded. Of every start: time from its first frame until the state is known, error of
+the direction of gravity, scale of the flight from which the state was taken (by a similarity to the
+truth), and of its last velocity, that is the component along the true one as a share of it. A velocity
+below 0.3 m/s has no scale; its error counts as a share of 0.3 m/s. A start at rest has neither.
 """
 
 from __future__ import annotations
@@ -87,9 +87,12 @@ def start(tracks: SimulatedTracks, name: str, begin_s: float) -> Start:
     times_s = np.array([frame.time_ns - tracks.frames[0].time_ns for frame in tracks.frames]) * 1e-9
     reason = ""
     for row in np.flatnonzero((times_s >= begin_s) & (times_s <= begin_s + _PATIENCE_S)).tolist():
-        state = initializer.push(tracks.frames[row])
-        if state is not None:
-            tilt, speed, *of_velocity = _errors(state, tracks.T_M_I[row], tracks.v_M[row])
+        found = initializer.push(tracks.frames[row])
+        if found is not None:
+            of_state = row - len(found.later)
+            tilt, speed, *of_velocity = _errors(
+                found.state, tracks.T_M_I[of_state], tracks.v_M[of_state]
+            )
             scale = _scale(initializer, tracks)
             seconds = float(times_s[row]) - begin_s
             return Start(name, count, begin_s, seconds, tilt, speed, scale, *of_velocity, reason)

@@ -69,7 +69,7 @@ def window_frame(images: TrackedImages, interval: tuple[I64, F64]) -> WindowFram
 
 
 def start_images(cameras: str, begin_s: float) -> tuple[StartState, int, float]:
-    """Return state, time and duration of a start at some time of MH_01; biases are unknown."""
+    """Return state, its time and the duration of a start at some time of MH_01; biases are unknown."""
     recording = open_recording(
         shared_data(FOLDER), SourceOptions(rovio_active_camera_indices=cameras)
     )
@@ -88,10 +88,10 @@ def start_images(cameras: str, begin_s: float) -> tuple[StartState, int, float]:
         interval = cut(samples, previous_ns if known else event.time_ns - 1, event.time_ns)
         R_I0_I1 = turn(device.imu, interval) if known else None
         images = tracker.track(event.time_ns, tuple(i.grey() for i in event.images), R_I0_I1)
-        state = initializer.push(window_frame(images, interval))
+        start = initializer.push(window_frame(images, interval))
         previous_ns = event.time_ns
-        if state is not None:
-            return state, event.time_ns, (event.time_ns - first_ns) * 1e-9
+        if start is not None:
+            return start.state, start.frame.time_ns, (event.time_ns - first_ns) * 1e-9
     raise AssertionError(initializer.reason)
 
 
@@ -117,15 +117,16 @@ def test_tango() -> None:
     vi_map = load_map(shared_data("maplab_maps/tango_handheld"))[0]
     recording = MapRecording(vi_map, 0)
     device, samples = recording.device, all_samples(recording)
-    initializer, previous, state, row = Initializer(device), None, None, 60
+    initializer, previous, start, row = Initializer(device), None, None, 60
     items = [item for item in recording.items() if isinstance(item, TrackedFrameSet)]
-    while state is None and row < 120:
+    while start is None and row < 120:
         images = tracked_images_of(items[row], previous, device.cameras, device.T_I_C)
         begin_ns = images.time_ns - 1 if previous is None else previous.time_ns
-        state = initializer.push(window_frame(images, cut(samples, begin_ns, images.time_ns)))
+        start = initializer.push(window_frame(images, cut(samples, begin_ns, images.time_ns)))
         previous, row = images, row + 1
-    assert state is not None
-    assert tilt_error_deg(state.T_M_I, vi_map.vertices.T_M_I[row - 1]) < 1.5
-    bias = vi_map.vertices.accel_bias[row - 1]
+    assert start is not None
+    state, row = start.state, row - 1 - len(start.later)
+    assert tilt_error_deg(state.T_M_I, vi_map.vertices.T_M_I[row]) < 1.5
+    bias = vi_map.vertices.accel_bias[row]
     assert np.linalg.norm(bias) > 0.7
     assert np.linalg.norm(state.accel_bias - bias) < 0.25
