@@ -20,6 +20,7 @@ from maplab_py.frontend.run_options import OutputOptions
 from maplab_py.interop.trajectories import write_euroc
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
+from maplab_py.storage.mission_names import with_folder_names
 from maplab_py.storage.native import DiskCopy, save_map
 from maplab_py.vimap import LandmarkQuality, VIMap
 
@@ -83,6 +84,7 @@ def finish(
             )
         if vi_map is not None and output.save_map_folder is not None:
             disk_copy = _saved(vi_map, output.save_map_folder, output)
+            vi_map = with_folder_names(vi_map, output.save_map_folder)  # as when it is loaded
     except Cancelled:
         raise
     except MaplabError as error:

@@ -46,6 +46,7 @@ def test_the_map_is_saved_and_selected(walk: Path, tmp_path: Path) -> None:
         vi_map, _ = load_map(target)
         assert check_consistency(vi_map).failure == ""
         assert len(vi_map.vertices) == len(session.vi_map.vertices) == report.vertices > 50
+        assert list(session.vi_map.missions.name) == ["map"]
         assert len(report.starts) == 1
         assert 0.4 < report.starts[0].time_s < 2.0
 
