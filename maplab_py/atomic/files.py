@@ -120,10 +120,13 @@ def write_file(path: Path, chunks: Iterable[bytes], *, durable: bool = True) -> 
         stream.writelines(chunks)
 
 
-def link_or_copy(source: str | Path, target: str | Path) -> None:
+def link_or_copy(source: str | Path, target: str | Path) -> bool:
     """Give a file a second name; copy it where the file system refuses links.
 
     For files that are only ever replaced: a write into one would show under both names.
+
+    Returns:
+        Whether it is a link.
 
     Raises:
         OSError: It cannot be copied either.
@@ -132,6 +135,8 @@ def link_or_copy(source: str | Path, target: str | Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -28,12 +28,17 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def replaced_folder(path: Path) -> Iterator[Path]:
+def replaced_folder(path: Path, on_disk: Collection[Path] = ()) -> Iterator[Path]:
     """Yield a temporary folder to fill; it replaces `path` at the end of the block.
 
     Parent folders are created. A symbolic link is kept and its target is replaced. After an exception,
     or if the running command has been cancelled, the temporary folder is deleted and nothing has
     changed.
+
+    Args:
+        path: The folder.
+        on_disk: Files in the temporary folder whose content need not be flushed, such as links to files
+            that were published before; the block may still add to it.
 
     Raises:
         UserError: Another program is saving to the same folder, the folder cannot be replaced, or
@@ -54,7 +59,7 @@ def replaced_folder(path: Path) -> Iterator[Path]:
                 temporary.mkdir()
                 with provisional_effects():
                     yield temporary
-                flush_tree(temporary)
+                flush_tree(temporary, on_disk)
                 with lasting_effect():
                     _swap(temporary, folder, made)
                     is_published = True

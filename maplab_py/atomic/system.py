@@ -7,6 +7,7 @@ import errno
 import logging
 import os
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from maplab_py.cancellation import check_cancelled
@@ -38,15 +39,20 @@ def flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def flush_tree(folder: Path) -> None:
-    """Flush all files and folders below a folder, and the folder itself, to disk."""
+def flush_tree(folder: Path, on_disk: Collection[Path] = ()) -> None:
+    """Flush all files and folders below a folder, and the folder itself, to disk.
+
+    Args:
+        folder: The folder.
+        on_disk: Files that are left out, as their content is on disk.
+    """
     for path in sorted(folder.rglob("*")):
         check_cancelled()
         if path.is_symlink():
             continue
         if path.is_dir():
             flush_folder(path)
-        elif path.is_file():
+        elif path.is_file() and path not in on_disk:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
                 os.fsync(descriptor)

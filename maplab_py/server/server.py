@@ -222,7 +222,9 @@ class MapServer:
                 self._wake.wait(_SECONDS_BETWEEN_LOOKS)
                 self._wake.clear()
         self._answer_requests()
+        self._retry_s = 0.0
         if self.journal.since_joint:
+            self._publish_if_needed(force=True)
             self._optimize_jointly(self._progress)
         self._retry_s = 0.0
         self._publish_if_needed(force=True)
@@ -248,6 +250,7 @@ class MapServer:
             self._merge(item)
             nth = self.incremental.full_optimization_every_nth
             if nth and self.journal.since_joint >= nth:
+                self._publish_if_needed(force=True)  # a joint optimisation may take minutes
                 self._optimize_jointly(self._progress)
             self._publish_if_needed(force=False)
             return True

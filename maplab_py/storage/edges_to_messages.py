@@ -24,6 +24,8 @@ _LOOP_CLOSURES = (
     "switch_variable_variance",
     "unknown",
 )
+SAMPLES = ("sample.timestamp_ns", "sample.accel_gyro")
+"""Columns that are parts of the map's own."""
 
 
 def edge_counts(vi_map: VIMap) -> tuple[int, int, int]:

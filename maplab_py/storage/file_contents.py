@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import I64, U64
+from maplab_py.storage.column_digests import DIGEST_BYTES, ColumnDigests, digest_of
 from maplab_py.vimap.table import starts_of_counts
 
 Columns = Mapping[str, NDArray[Any]]
 """All that a file says, by name. Other entities are named by their ids, never by their rows."""
 Words = list[list[int]]
-_DIGEST_BYTES = 16
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,27 +28,32 @@ class FileContent:
         name: Name of the file.
         columns: All that it says.
         to_bytes: Makes the bytes of the file of nothing but the columns.
+        measurements: Names of the columns that are contiguous parts of the map's own and seldom change.
     """
 
     kind: int
     name: str
     columns: Columns
     to_bytes: Callable[[Columns], bytes]
+    measurements: tuple[str, ...] = ()
 
     def data(self) -> bytes:
         """Return the bytes of the file, not compressed."""
         return self.to_bytes(self.columns)
 
-    def digest(self) -> bytes:
-        """Return a hash of the columns: files of equal digests have equal bytes."""
-        result = hashlib.blake2b(str(self.kind).encode(), digest_size=_DIGEST_BYTES)
-        for name, values in self.columns.items():
-            result.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
-            if values.dtype == object:
-                result.update(repr(values.tolist()).encode())
-            else:
-                result.update(np.ascontiguousarray(values).data)
-        return result.digest()
+    def digest(self, measurements: ColumnDigests) -> bytes:
+        """Return a hash of the columns: files of equal digests have equal bytes.
+
+        Args:
+            measurements: Knows the digests of measurements that are as they were at the last save.
+        """
+        others = [values for name, values in self.columns.items() if name not in self.measurements]
+        key = str(self.kind).encode()
+        if self.measurements:
+            ids = next(iter(self.columns.values()))
+            first = key + ids[:1].tobytes()
+            key += measurements.of(first, [self.columns[name] for name in self.measurements])
+        return hashlib.blake2b(key + digest_of(others), digest_size=DIGEST_BYTES).digest()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

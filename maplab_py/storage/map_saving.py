@@ -95,12 +95,14 @@ def save_map(
     folder = Path(folder).absolute()
     recover(folder)
     check_target(folder, overwrite=overwrite, known=known, force=force)
-    with copied_files(resources.to_external), replaced_folder(folder) as temporary:
+    on_disk: set[Path] = set()
+    with copied_files(resources.to_external), replaced_folder(folder, on_disk) as temporary:
         check_target(folder, overwrite=overwrite, known=known, force=force)
         taken = TakenOver(written, temporary, compress=compress) if written else None
         files, listed = _write(resources.vi_map, temporary, compress, taken, progress)
         size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
-        _keep(folder, temporary)
+        on_disk |= taken.linked if taken else set()
+        _keep(folder, temporary, on_disk)
         _add_resources((*resource_files, *resources.into_map), temporary)
     if taken is not None:
         taken.finish(folder, listed)
@@ -194,17 +196,17 @@ def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _keep(old: Path, new: Path) -> None:
-    """Link the files of the old folder that do not belong to its map into the new one."""
+def _keep(old: Path, new: Path, linked: set[Path]) -> None:
+    """Link the files of the old folder that do not belong to its map into the new one, and note the links."""
     if not old.is_dir():
         return
     for entry in os.scandir(old):
         belongs = entry.name in (checksums.FILE_NAME, mission_names.FILE_NAME)
         if not belongs and not (new / entry.name).exists():
-            _bring(entry, new / entry.name)
+            _bring(entry, new / entry.name, linked)
 
 
-def _bring(entry: os.DirEntry[str], target: Path) -> None:
+def _bring(entry: os.DirEntry[str], target: Path, linked: set[Path]) -> None:
     """Link a file or folder (copy it where links do not work); symbolic links stay what they are."""
     if entry.is_symlink():
         target.symlink_to(os.readlink(entry.path))
@@ -212,9 +214,9 @@ def _bring(entry: os.DirEntry[str], target: Path) -> None:
         target.mkdir()
         shutil.copystat(entry.path, target)
         for inner in os.scandir(entry.path):
-            _bring(inner, target / inner.name)
-    else:
-        link_or_copy(entry.path, target)
+            _bring(inner, target / inner.name, linked)
+    elif link_or_copy(entry.path, target):
+        linked.add(target)
 
 
 def _add_resources(files: Sequence[tuple[Path, Path]], new: Path) -> None:

@@ -8,12 +8,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.edges_to_messages import edge_columns, edge_counts, edges_to_bytes
+from maplab_py.storage.edges_to_messages import (
+    SAMPLES,
+    edge_columns,
+    edge_counts,
+    edges_to_bytes,
+)
 from maplab_py.storage.file_contents import FileContent, extend_finite, merge_unknown, words
 from maplab_py.storage.landmark_index import index_to_bytes
 from maplab_py.storage.map_files import FileKind
 from maplab_py.storage.tables_from_messages import SENSOR_FIELDS
-from maplab_py.storage.vertex_columns import VertexColumns
+from maplab_py.storage.vertex_columns import MEASUREMENTS, VertexColumns
 from maplab_py.storage.vertices_to_messages import vertices_to_bytes
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import is_valid
@@ -59,11 +64,11 @@ def contents(vi_map: VIMap, partition: Partition) -> Iterator[FileContent]:
     """Yield the files of a map; that of the missions is written apart (`missions`)."""
     vertices = VertexColumns(vi_map)
     for index, rows in enumerate(partition.vertex_rows(vi_map)):
-        columns = vertices.of(rows)
-        yield FileContent(FileKind.VERTICES, f"vertices{index}", columns, vertices_to_bytes)
+        name, columns = f"vertices{index}", vertices.of(rows)
+        yield FileContent(FileKind.VERTICES, name, columns, vertices_to_bytes, MEASUREMENTS)
     for index, rows in enumerate(partition.edge_rows(vi_map)):
-        columns = edge_columns(vi_map, rows)
-        yield FileContent(FileKind.EDGES, f"edges{index}", columns, edges_to_bytes)
+        name, columns = f"edges{index}", edge_columns(vi_map, rows)
+        yield FileContent(FileKind.EDGES, name, columns, edges_to_bytes, SAMPLES)
     landmarks = vi_map.landmarks
     columns = {"landmark_id": landmarks.id, "vertex_id": vi_map.vertices.id[landmarks.vertex]}
     yield FileContent(FileKind.LANDMARK_INDEX, "landmark_index", columns, index_to_bytes)

@@ -31,6 +31,8 @@ _KEYPOINTS = (
     "time_offset_ns",
     "descriptor",
 )
+MEASUREMENTS = tuple(f"keypoint.{name}" for name in _KEYPOINTS)
+"""Columns that are parts of the map's own."""
 _LANDMARKS = ("id", "p_I", "covariance", "quality", "feature_type", "unknown")
 _ABSOLUTE_POSES = ("timestamp_ns", "sensor_id", "T_G_S", "covariance", "unknown")
 
@@ -100,8 +102,7 @@ class VertexColumns:
 
 
 def _part(prefix: str, table: Table, names: tuple[str, ...], rows: Any) -> dict[str, NDArray[Any]]:
-    columns = table.columns()
-    return {f"{prefix}.{name}": columns[name][rows] for name in names}
+    return {f"{prefix}.{name}": getattr(table, name)[rows] for name in names}
 
 
 def _ids_or_zero(ids: NDArray[np.uint64], rows: NDArray[Any]) -> NDArray[np.uint64]:

@@ -7,6 +7,7 @@ from typing import Any
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.descriptor_layout import pack
 from maplab_py.storage.file_contents import Columns, extend_finite, merge_unknown, starts, words
+from maplab_py.storage.id_messages import id_fields, tag_of
 from maplab_py.vimap.tables import DescriptorLayout, FrameField
 
 _COUNTS = {
@@ -27,12 +28,15 @@ _IDS = (
     "incoming.id",
     "outgoing.id",
     "frame.id",
-    "keypoint.landmark_id",
     "resource.id",
     "landmark.id",
-    "observation.vertex_id",
     "absolute.sensor_id",
 )
+_ID_FIELDS = {
+    "keypoint.landmark_id": tag_of(pb.VisualFrame, "landmark_ids"),
+    "observation.vertex_id": tag_of(pb.Landmark, "observer_vertex_ids"),
+}
+"""Columns with ids that are too many for an object each, and the tags of their fields."""
 _NUMBERS = (
     "vertex.T_M_I",
     "vertex.v_M",
@@ -66,6 +70,7 @@ class _VertexFile:
         self._columns = columns
         self._start = {name: starts(columns[count]) for name, count in _COUNTS.items()}
         self._words = {name: words(columns[name]) for name in _IDS}
+        self._fields = {n: id_fields(columns[n], tag) for n, tag in _ID_FIELDS.items()}
         self._numbers = {name: columns[name].tolist() for name in _NUMBERS}
         observed = starts(columns["keypoint.is_observation"])
         bounds = self._start["keypoint"]
@@ -129,8 +134,7 @@ class _VertexFile:
             offsets = columns["keypoint.time_offset_ns"][rows]
             frame.time_offsets_ns.extend(offsets.reshape(-1).tolist())
         if present & FrameField.LANDMARK_ID or self._observed[row + 1] > self._observed[row]:
-            for landmark_words in self._words["keypoint.landmark_id"][rows]:
-                frame.landmark_ids.add().words.extend(landmark_words)
+            frame.MergeFromString(self._fields["keypoint.landmark_id"].of(rows))
         if (blocks := columns["frame.descriptor_blocks"][row]) is not None:
             layout = numbers["frame.descriptor_layout"][row]
             frame.descriptors = pack(layout, blocks, columns["keypoint.descriptor"][rows])
@@ -153,8 +157,7 @@ class _VertexFile:
         extend_finite(landmark.covariance, self._columns["landmark.covariance"][row])
         members = self._members("observation", row)
         observations = slice(members.start, members.stop)
-        for vertex_words in self._words["observation.vertex_id"][observations]:
-            landmark.observer_vertex_ids.add().words.extend(vertex_words)
+        landmark.MergeFromString(self._fields["observation.vertex_id"].of(observations))
         landmark.keypoint_indices.extend(numbers["observation.keypoint_index"][observations])
         landmark.frame_indices.extend(numbers["observation.frame_index"][observations])
         landmark.quality = numbers["landmark.quality"][row]

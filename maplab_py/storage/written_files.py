@@ -13,10 +13,11 @@ from pathlib import Path
 
 from maplab_py.atomic import link_or_copy
 from maplab_py.storage import checksums
+from maplab_py.storage.column_digests import ColumnDigests
 from maplab_py.storage.file_contents import FileContent
 from maplab_py.storage.tables_to_messages import Partition
 
-STABLE = Partition(vertices=50, edges=500, is_stable=True)
+STABLE = Partition(vertices=50, edges=200, is_stable=True)
 """Few files change when a mission grows or a part of a map is optimised."""
 
 
@@ -33,12 +34,14 @@ class WrittenFiles:
     Attributes:
         partition: Which entities come into one file.
         reused: How many files the last save took over.
+        measurements: Digests of the measurements in them.
     """
 
     def __init__(self, partition: Partition = STABLE) -> None:
         """Start without files: the first save writes all."""
         self.partition = partition
         self.reused = 0
+        self.measurements = ColumnDigests()
         self._files: dict[bytes, _File] = {}
 
     def find(self, key: bytes) -> _File | None:
@@ -46,9 +49,9 @@ class WrittenFiles:
         file = self._files.get(key)
         return file if file is not None and _state(file.path) == file.state else None
 
-    def replace(self, files: dict[bytes, _File], reused: int) -> None:
+    def replace(self, files: dict[bytes, _File], reused: int, measurements: ColumnDigests) -> None:
         """Remember the files of a new folder instead."""
-        self._files, self.reused = files, reused
+        self._files, self.reused, self.measurements = files, reused, measurements
 
 
 class TakenOver:
@@ -57,25 +60,29 @@ class TakenOver:
     Attributes:
         partition: Which entities come into one file.
         checksums: SHA-256 of the files (paths in the folder) that were taken over.
+        linked: Those that are links, so that their content is on disk.
     """
 
     def __init__(self, before: WrittenFiles, folder: Path, *, compress: bool) -> None:
         """Write to a folder what `before` does not have."""
         self.partition = before.partition
         self.checksums: dict[str, str] = {}
+        self.linked: set[Path] = set()
+        self._measurements = ColumnDigests(before.measurements)
         self._before, self._folder = before, folder
         self._suffix = b"gzip" if compress else b"plain"
         self._names: dict[bytes, str] = {}
 
     def take_over(self, content: FileContent, name: str) -> bool:
         """Bring an equal file to a path in the folder; False where there is none."""
-        key = content.digest() + self._suffix
+        key = content.digest(self._measurements) + self._suffix
         self._names[key] = name
         file = self._before.find(key)
         if file is None:
             return False
         with contextlib.suppress(FileNotFoundError):  # deleted just now
-            link_or_copy(file.path, self._folder / name)
+            if link_or_copy(file.path, self._folder / name):
+                self.linked.add(self._folder / name)
             self.checksums[name] = file.sha256
             return True
         return False
@@ -93,7 +100,7 @@ class TakenOver:
             state = _state(target / name)
             if state is not None:
                 files[key] = _File(target / name, digests[name], state)
-        self._before.replace(files, len(self.checksums))
+        self._before.replace(files, len(self.checksums), self._measurements)
 
 
 def _state(path: Path) -> tuple[int, int, int] | None:

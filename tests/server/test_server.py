@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
+from maplab_py.progress import SILENT, Progress
 from maplab_py.server.client import NotRunning, ask, order
+from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, ServiceOptions
 from maplab_py.server.server import MapServer
 from maplab_py.server.status import status_without_server
@@ -88,6 +90,26 @@ def test_the_map_is_optimised_jointly_after_every_nth_and_at_the_end(servers: Se
     assert report.joint_optimizations == 2
     assert server.journal.since_joint == 0
     assert server.journal.radius > 0.0
+
+
+def test_merged_submaps_are_published_before_a_joint_optimisation(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    servers.incremental = IncrementalOptions(full_optimization_every_nth=2)
+    published: list[int] = []
+    optimize_jointly = Merger.optimize_jointly
+
+    def noted(merger: Merger, *, progress: Progress = SILENT) -> float:
+        published.append(len(servers.published().vertices))
+        return optimize_jointly(merger, progress=progress)
+
+    monkeypatch.setattr(Merger, "optimize_jointly", noted)
+    for number in range(3):
+        servers.put("ant", number)
+    servers.run()
+    times_ns = session("ant").vertices.timestamp_ns
+    of_two = np.count_nonzero(times_ns <= submaps("ant")[1].vertices.timestamp_ns[-1])
+    assert published == [of_two, len(times_ns)]
 
 
 def test_the_watcher_sees_every_published_map(servers: Servers) -> None:

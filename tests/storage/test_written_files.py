@@ -13,9 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.array_types import U64
 from maplab_py.errors import UserError
 from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.column_digests import ColumnDigests, digest_of
 from maplab_py.storage.file_contents import FileContent
+from maplab_py.storage.id_messages import id_fields, tag_of
 from maplab_py.storage.landmark_index import index_to_bytes
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.tables_to_messages import Partition, contents
@@ -86,6 +89,64 @@ def test_what_is_taken_over_equals_what_would_be_written(tmp_path: Path) -> None
     fresh = save_map(edited, tmp_path / "b", written=WrittenFiles())
     assert written.reused
     assert taken.fingerprint == fresh.fingerprint
+
+
+def test_measurements_that_change_in_any_column_are_written(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    for name in ("uv_px", "descriptor"):
+        before = inodes(target)
+        values = getattr(vi_map.keypoints, name).copy()
+        values[-1] += 1
+        vi_map = vi_map.replace(keypoints=vi_map.keypoints.replace(**{name: values}))
+        save_map(vi_map, target, force=True, written=written)
+        assert changed(before, inodes(target)) == ALWAYS | {"vertices2"}
+        assert holds(target, vi_map)
+    before = inodes(target)
+    samples = vi_map.imu_samples.accel_gyro.copy()
+    samples[0, 0] = -0.0 if samples[0, 0] == 0.0 else -samples[0, 0]
+    edited = vi_map.replace(imu_samples=vi_map.imu_samples.replace(accel_gyro=samples))
+    save_map(edited, target, force=True, written=written)
+    assert changed(before, inodes(target)) == ALWAYS | {"edges0"}
+    assert holds(target, edited)
+
+
+def test_equal_measurements_are_hashed_once() -> None:
+    columns = [np.arange(12.0).reshape(6, 2), np.zeros((6, 0)), np.arange(6, dtype=np.int8)]
+    before = ColumnDigests()
+    digest = before.of(b"a", columns)
+    assert digest == digest_of(columns)
+    assert digest != before.of(b"b", [columns[0].astype(np.float32), *columns[1:]])
+    assert digest != before.of(b"c", [columns[0].reshape(4, 3), *columns[1:]])
+    assert digest != before.of(b"d", columns[1:])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("maplab_py.storage.column_digests.digest_of", lambda _: b"hashed")
+        after = ColumnDigests(before)
+        assert after.of(b"a", [values.copy() for values in columns]) == digest
+        assert after.of(b"a", [columns[0] + 1.0, *columns[1:]]) == b"hashed"
+        assert after.of(b"z", columns) == b"hashed"
+        nan = [np.array([0.0, np.nan])]
+        after.of(b"n", nan)
+        assert ColumnDigests(after).of(b"n", [-nan[0]]) == b"hashed"  # equal values, other bytes
+
+
+def test_files_that_are_taken_over_are_not_flushed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, written=written)
+    flushed: list[int] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        flushed.append(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    save_map(moved(vi_map, 0), target, force=True, written=written)
+    files = inodes(target)
+    assert files["vertices0"] in flushed
+    assert not {files["vertices1"], files["vertices2"], files["edges0"]} & set(flushed)
 
 
 def test_a_mission_that_grows_leaves_the_files_of_others(tmp_path: Path) -> None:
@@ -166,13 +227,29 @@ def test_the_partition_of_saves_is_that_of_maplab() -> None:
     )
 
 
-def test_the_landmark_index_has_the_bytes_of_its_messages() -> None:
+def ids_of_all_sizes() -> U64:
+    """Return ids (400, 2, 2) whose words take 1 to 10 bytes."""
     rng = np.random.default_rng(0)
-    ids = rng.integers(0, 2**64, (400, 2, 2), dtype=np.uint64) >> rng.integers(
-        0, 64, (400, 2, 2), dtype=np.uint64
-    )
+    shifts = rng.integers(0, 64, (400, 2, 2), dtype=np.uint64)
+    ids = rng.integers(0, 2**64, (400, 2, 2), dtype=np.uint64) >> shifts
     ids[0] = 0
     ids[1] = 2**64 - 1
+    return ids
+
+
+def test_fields_of_ids_have_the_bytes_of_their_messages() -> None:
+    ids = ids_of_all_sizes()[:, 0]
+    fields = id_fields(ids, tag_of(pb.VisualFrame, "landmark_ids"))
+    for rows in (slice(0, 400), slice(0, 1), slice(7, 90), slice(400, 400)):
+        message = pb.VisualFrame()
+        for id_words in ids[rows].byteswap().tolist():
+            message.landmark_ids.add().words.extend(id_words)
+        assert fields.of(rows) == message.SerializeToString()
+    assert id_fields(ids[:0], tag_of(pb.Landmark, "id")).start == [0]
+
+
+def test_the_landmark_index_has_the_bytes_of_its_messages() -> None:
+    ids = ids_of_all_sizes()
     message = pb.VIMap()
     for vertex, landmark in ids.byteswap().tolist():
         entry = message.landmark_index.add()
