@@ -87,9 +87,12 @@ def busy_worker(driver: int) -> int:
         return 0
 
 
-def started(folder: Path, pause_s: str, *flags: str) -> subprocess.Popen[str]:
+def started(
+    folder: Path, pause_s: str, *, interrupts_ignored: bool = False
+) -> subprocess.Popen[str]:
+    in_background = ["/bin/sh", "-c", "trap '' INT; exec \"$@\"", "sh"] * interrupts_ignored
     return subprocess.Popen(
-        [*PROGRAM, "batch", "p.yaml", "--scheduler=local:2", *flags],
+        [*in_background, *PROGRAM, "batch", "p.yaml", "--scheduler=local:2"],
         cwd=folder,
         env=environment(folder, PAUSE_S=pause_s),
         stderr=subprocess.PIPE,
@@ -150,9 +153,10 @@ def test_a_killed_driver_leaves_nobody_and_resuming_does_the_rest(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_interrupt_stops_all_workers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_ignored", [False, True], ids=["foreground", "background"])
+def test_interrupt_stops_all_workers(tmp_path: Path, is_ignored: bool) -> None:
     make_file(tmp_path, 3)
-    child = started(tmp_path, "60")
+    child = started(tmp_path, "60", interrupts_ignored=is_ignored)
     assert wait_until(lambda: busy_worker(child.pid), 60.0)
     workers = child_processes(child.pid)
     tasks = [task_of(worker) for worker in workers if task_of(worker)]

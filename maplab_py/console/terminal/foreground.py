@@ -234,7 +234,8 @@ def terminal_lent() -> Iterator[None]:
 def cancelling_interrupts() -> Iterator[None]:
     """Let Ctrl-C raise KeyboardInterrupt, and `check_cancelled` raise from then on.
 
-    Python discards exceptions inside finalisers and some callbacks: there an interrupt would be lost.
+    Shells start background jobs of scripts with the signal ignored, and Python then sets no handler: an
+    interrupt would be lost. So it would be inside finalisers, where Python discards exceptions.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -321,3 +321,13 @@ def test_an_interrupt_that_python_discards_still_cancels() -> None:
             press_ctrl_c()
     check_cancelled()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_that_the_shell_has_let_be_ignored_cancels() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with cancelling_interrupts(), pytest.raises(KeyboardInterrupt):
+            press_ctrl_c()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
