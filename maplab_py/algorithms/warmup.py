@@ -16,6 +16,7 @@ from multiprocessing.process import BaseProcess
 from typing import IO
 
 from maplab_py.algorithms.dense.warmup import compile_dense
+from maplab_py.algorithms.localization.guided_kernels import compile_kernels as compile_guided
 from maplab_py.algorithms.relaxation.warmup import compile_relaxation
 from maplab_py.cancellation import cleaned_up
 from maplab_py.compilation import is_missing_on_disk
@@ -48,6 +49,7 @@ def _jobs() -> dict[str, Callable[[], None]]:
         RELAXATION: compile_relaxation,
         "message scan": compile_scan,
         "dense maps": compile_dense,
+        "guided matching": compile_guided,
         "COLMAP points": compile_colmap_points,
     }
     return {**optimizer_jobs(), **window_jobs(), **vision_jobs(), **others}

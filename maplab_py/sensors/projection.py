@@ -59,9 +59,14 @@ def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F6
     return focal * x_d + centre, duv_dx @ dx_dp, np.concatenate(columns, axis=-1), visible
 
 
-def is_visible(camera: Camera, p_C: ArrayLike) -> Mask:
-    """Tell which points (..., 3) are visible, as `project` does, without projecting them."""
-    return _normalised(camera, np.asarray(p_C, dtype=np.float64))[3]
+def visibility_limits(camera: Camera) -> F64:
+    """Return what tells visible points p_C, as `project` does: xi, least depth, cone, and radius (4,).
+
+    Visible are points with z + xi |p| > least depth, z > -cone |p|, and |(x, y)| < radius (z + xi |p|).
+    """
+    xi = _intrinsics(camera)[0]
+    radius = distortion.largest_radius(camera.distortion, camera.distortion_parameters)
+    return np.array([xi, _MIN_DENOMINATOR, _cone(xi), radius])
 
 
 def back_project(camera: Camera, uv: ArrayLike) -> tuple[F64, Mask]:

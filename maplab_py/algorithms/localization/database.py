@@ -87,11 +87,6 @@ class LocalizationMap:
         )
 
     @cached_property
-    def coordinates(self) -> tuple[F64, F64]:
-        """Positions of the landmarks, and the directions of their sights, by coordinate (3, L)."""
-        return np.ascontiguousarray(self.p_G.T), np.ascontiguousarray(self.sights.direction.T)
-
-    @cached_property
     def landmarks_of(self) -> tuple[I64, I64]:
         """Offsets (K + 1) and landmarks, by observer."""
         return _grouped(self.observer, self.descriptors.label, len(self.p_G_observer))

@@ -11,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.localization import guided_kernels as kernels
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.array_types import F64, I8, I64, U64
-from maplab_py.geometry import se3
+from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
 
 _RANGE_FACTOR = 2.0
@@ -45,85 +46,86 @@ def guided_matches(
         radius_rad: Angle (N,) around each ray in which landmarks are searched.
         max_distance: Largest difference of descriptors, or squared distance of projected ones.
     """
-    landmarks = np.flatnonzero(_in_range(database, T_G_I[4:]))
-    p_I = se3.transform(se3.inverse(T_G_I), database.p_G[landmarks])
-    keypoint, near = _near_rays(origin_I, ray_I, radius_rad, p_I)
-    landmark = landmarks[near]
+    keypoint, landmark = _near_rays(database, T_G_I, origin_I, ray_I, radius_rad)
     if len(keypoint) == 0:
         return keypoint, landmark
     start, rows = database.rows_of
-    count = np.diff(start)[landmark]
-    row = rows[ragged_rows(start, landmark)]
-    owner = np.repeat(keypoint, count)
     if database.has_descriptors:
-        from maplab_py.vision.search_kernels import differences_between
-
-        distance = np.empty(len(row))
-        differences_between(words, owner, database.descriptors.words, row, distance)
+        nearest = _least_differences(database, words, keypoint, landmark)
     else:
-        offset = projected[owner] - database.descriptors.projected[row]
-        distance = np.einsum("nd,nd->n", offset, offset).astype(np.float64)
-    nearest = np.minimum.reduceat(distance, np.cumsum(count) - count)
+        nearest = np.empty(len(keypoint))
+        table = database.descriptors.projected
+        kernels.least_distances(projected, keypoint, table, start, rows, landmark, nearest)
     similar = nearest <= max_distance
     return keypoint[similar], landmark[similar]
 
 
-def _in_range(database: LocalizationMap, p_G_I: F64) -> NDArray[np.bool_]:
-    """Return which landmarks (L,) may be visible from a position, given where they were observed."""
-    s, (p_G, direction) = database.sights, database.coordinates
-    x, y, z = p_G_I[0] - p_G[0], p_G_I[1] - p_G[1], p_G_I[2] - p_G[2]
-    distance = np.sqrt(x * x + y * y + z * z)
-    inside = (distance < _RANGE_FACTOR * s.farthest_m) & (distance * _RANGE_FACTOR > s.nearest_m)
-    along = direction[0] * x + direction[1] * y + direction[2] * z
-    return np.asarray(inside & (along > s.least_cosine * np.maximum(distance, 1e-9)))
+def _least_differences(
+    database: LocalizationMap, words: U64 | I8, keypoint: I64, landmark: I64
+) -> F64:
+    """Return the least difference (N,) of a keypoint to the descriptors of a landmark."""
+    from maplab_py.vision.search_kernels import differences_between
+
+    start, rows = database.rows_of
+    count = np.diff(start)[landmark]
+    row = rows[ragged_rows(start, landmark)]
+    distance = np.empty(len(row))
+    differences_between(
+        words, np.repeat(keypoint, count), database.descriptors.words, row, distance
+    )
+    return np.asarray(np.minimum.reduceat(distance, np.cumsum(count) - count))
 
 
-def _near_rays(origin_I: F64, ray_I: F64, radius_rad: F64, p_I: F64) -> tuple[I64, I64]:
-    """Return the pairs of rays and points within the radius, sorted by ray."""
-    keypoints, points = [], []
+def _near_rays(
+    database: LocalizationMap, T_G_I: F64, origin_I: F64, ray_I: F64, radius_rad: F64
+) -> tuple[I64, I64]:
+    """Return the pairs of keypoints and visible landmarks within the radius, sorted by keypoint."""
+    keypoints: list[I64] = []
+    landmarks: list[I64] = []
+    pose = np.concatenate([so3.to_matrix(T_G_I[:4]), T_G_I[4:, None]], axis=1)
     centres, camera = np.unique(origin_I, axis=0, return_inverse=True)
     camera = camera.reshape(-1)
     for number, centre in enumerate(centres):
         mine = np.flatnonzero(camera == number)
-        toward = p_I - centre
-        toward /= np.maximum(np.linalg.norm(toward, axis=1), 1e-9)[:, None]
-        in_view = np.flatnonzero(_in_cone(ray_I[mine], float(radius_rad[mine].max()), toward))
-        ray, point = _candidates(ray_I[mine], radius_rad[mine], toward[in_view])
-        # written out: BLAS threads do not pay off for an inner dimension of 3
-        (a, b, c), (x, y, z) = ray_I[mine[ray]].T, toward[in_view[point]].T
-        near = a * x + b * y + c * z > np.cos(radius_rad[mine])[ray]
-        ray, point = ray[near], point[near]
-        order = np.lexsort((point, ray))
-        ray, point = ray[order], point[order]
-        keypoints.append(mine[ray])
-        points.append(in_view[point])
-    keypoint, point = np.concatenate(keypoints), np.concatenate(points)
-    order = np.argsort(keypoint, kind="stable")
-    return keypoint[order], point[order]
+        ray, radius = ray_I[mine], radius_rad[mine]
+        rows, toward = _in_view(database, _view(pose, centre, ray, float(radius.max())))
+        key, point = _near(ray, radius, toward)
+        keypoints.append(mine[key])
+        landmarks.append(rows[point])
+    keypoint, landmark = np.concatenate(keypoints), np.concatenate(landmarks)
+    order = np.lexsort((landmark, keypoint))
+    return keypoint[order], landmark[order]
 
 
-def _candidates(ray: F64, radius_rad: F64, toward: F64) -> tuple[I64, I64]:
-    """Return the pairs of rays (R, 3) and directions (N, 3) that are near in two coordinates.
+def _in_view(database: LocalizationMap, view: kernels.View) -> tuple[I64, F64]:
+    """Return the landmarks (N,) that may be visible, and unit vectors (N, 3) toward them."""
+    s = database.sights
+    visible = kernels.Landmarks(
+        database.p_G, s.direction, s.least_cosine, s.nearest_m / _RANGE_FACTOR,
+        s.farthest_m * _RANGE_FACTOR,
+    )  # fmt: skip
+    rows, toward = np.empty(len(database.p_G), dtype=np.int64), np.empty((len(database.p_G), 3))
+    count = kernels.landmarks_in_view(visible, view, rows, toward)
+    return rows[:count], toward[:count]
+
+
+def _near(ray: F64, radius_rad: F64, toward: F64) -> tuple[I64, I64]:
+    """Return the pairs of rays (R, 3) and directions (N, 3) within the radius (R,).
 
     Unit vectors no more than an angle apart differ by no more than that angle along any axis.
     """
-    first_axis, second_axis = np.argsort(-np.ptp(ray, axis=0), kind="stable")[:2]
-    order = np.argsort(toward[:, first_axis], kind="stable")
-    along, across = toward[order, first_axis], toward[order, second_axis]
-    reach, place = radius_rad + _ROUNDING, ray[:, first_axis]
-    first = np.searchsorted(along, place - reach, side="left")
-    count = np.searchsorted(along, place + reach, side="right") - first
-    end = np.cumsum(count)
-    row = np.arange(end[-1]) - np.repeat(end - count - first, count)
-    of_ray = np.repeat(np.arange(len(ray)), count)
-    offset = across[row] - np.repeat(ray[:, second_axis], count)
-    near = np.flatnonzero(np.abs(offset) <= np.repeat(reach, count))
-    return of_ray[near], order[row[near]]
+    axis = int(np.argmax(np.ptp(ray, axis=0)))
+    order = np.argsort(toward[:, axis])
+    along, reach = toward[order, axis], radius_rad + _ROUNDING
+    first = np.searchsorted(along, ray[:, axis] - reach, side="left")
+    last = np.searchsorted(along, ray[:, axis] + reach, side="right")
+    key, point = kernels.near_pairs(ray, np.cos(radius_rad), first, last, toward[order])
+    return key, order[point]
 
 
-def _in_cone(ray: F64, radius_rad: float, toward: F64) -> NDArray[np.bool_]:
-    """Return which directions (N, 3) lie inside or near the cone around all rays (R, 3)."""
+def _view(pose: F64, centre: F64, ray: F64, radius_rad: float) -> kernels.View:
+    """Return the cone around all rays (R, 3)."""
     axis = ray.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-9)
     widest = float(np.arccos(np.clip((ray @ axis).min(), -1.0, 1.0)))
-    return np.asarray(toward @ axis > np.cos(min(widest + radius_rad, np.pi)))
+    return kernels.View(pose, centre, axis, float(np.cos(min(widest + radius_rad, np.pi))))

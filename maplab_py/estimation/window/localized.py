@@ -14,6 +14,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.window.map_gate import contradicted_unless_most
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
@@ -117,6 +118,17 @@ class LocalizedSmoother(FixedLagSmoother):
         return added
 
     # -- what the smoother asks for ---------------------------------------------------------------
+
+    def _gate_new(self) -> None:
+        """Give back, too, tracks whose newest observation is far from their landmark of the map."""
+        super()._gate_new()
+        if not self.is_localized:
+            return
+        newest = len(self._states) - 1
+        seen, used = self.map_tracks.observations(self.tracks, self.rule.sigma_px, newest)
+        terms = MapTerms(seen, self._rig, self._T_I_C, huber_sigmas=self.options.huber_sigmas)
+        error_px = terms.errors_px(dataclasses.replace(self._states, p_G=self.map_tracks.p_G[used]))
+        self.map_tracks.refuse(used[contradicted_unless_most(error_px, seen, self.options)])
 
     def _may_be_landmark(self) -> Mask:
         return ~self.map_tracks.includes(self.tracks.id)

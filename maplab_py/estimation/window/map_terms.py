@@ -14,14 +14,14 @@ from types import ModuleType
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.estimation.kernels import map_observations as kernels
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import is_visible
+from maplab_py.sensors.projection import visibility_limits
 
 _BEHIND = 1e4
 """Squared whitened residual of a landmark that the camera cannot see: an outlier of a fixed size."""
@@ -53,6 +53,7 @@ class MapResiduals:
     """Whitened residuals with exact Jacobians; zero where the camera cannot see the landmark."""
 
     residual: F64  # (O, 2)
+    jacobian: F64  # (O, 2, 15), whose parts follow
     of_frame: F64  # (O, 2, 6) by [p, theta] of T_M_I
     of_base: F64  # (O, 2, 6) by [p, theta] of T_G_M
     of_landmark: F64  # (O, 2, 3) by p_G
@@ -79,31 +80,43 @@ class MapElimination:
 class _View:
     """The observations of a camera, and what the kernel needs of them that no state changes."""
 
-    camera: Camera
-    T_I_C: F64  # (7,)
-    R_I_C: F64  # (3, 3)
-    rows: I64  # (N,) of the observations
-    frame: I32  # (N,)
-    landmark: I64  # (N,)
+    rows: I64 | slice  # (N,) of the observations
+    seen: kernels.MapView
     weight: F64  # (N, 2, 2)
     arguments: (
         F64  # (N, 26 + parameters) T_M_I, T_G_M, T_I_C, parameters, p_G, uv; states are filled in
     )
+    visible: Mask  # (N,)
     kernel: ModuleType
 
     @classmethod
     def of(cls, seen: MapObservations, row: int, camera: Camera, T_I_C: F64) -> _View:
         """Return the view of the camera in a row of the rig."""
-        rows = np.flatnonzero(seen.camera == row)
+        of_camera = np.flatnonzero(seen.camera == row)
+        rows = slice(None) if len(of_camera) == len(seen) else of_camera
         parameters = np.concatenate([camera.intrinsics, camera.distortion_parameters])
-        arguments = np.empty((len(rows), 26 + len(parameters)))
+        arguments = np.empty((len(of_camera), 26 + len(parameters)))
         arguments[:, 14:21], arguments[:, 21:-5] = T_I_C, parameters
         arguments[:, -2:] = seen.uv_px[rows]
+        view = kernels.MapView(
+            seen.frame[rows], seen.landmark[rows], so3.to_matrix(T_I_C[:4]),
+            np.ascontiguousarray(T_I_C[4:]), visibility_limits(camera),
+        )  # fmt: skip
         return cls(
-            camera, T_I_C, so3.to_matrix(T_I_C[:4]), rows, seen.frame[rows], seen.landmark[rows],
-            np.eye(2) / seen.sigma_px[rows, None, None], arguments,
+            rows, view, np.eye(2) / seen.sigma_px[rows, None, None], arguments,
+            np.empty(len(of_camera), dtype=np.bool_),
             map_reprojection_kernel(camera.projection, camera.distortion),
         )  # fmt: skip
+
+    def evaluated(self, T_M_I: F64, R_M_I: F64, T_G_M: F64, p_G: F64, p_M: F64) -> tuple[F64, F64]:
+        """Return residuals (N, 2) and Jacobians (N, 2, 15); fill in what is visible."""
+        kernels.fill_arguments(
+            self.seen, T_M_I, R_M_I, T_G_M, p_G, p_M, self.arguments, self.visible
+        )
+        residual, jacobian = self.kernel.evaluated(self.arguments, self.weight)
+        if not self.visible.all():
+            residual[~self.visible], jacobian[~self.visible] = 0.0, 0.0
+        return residual, jacobian
 
 
 class MapTerms:
@@ -149,15 +162,10 @@ class MapTerms:
         p_M = (p_G - T_G_M[4:]) @ so3.to_matrix(T_G_M[:4])
         R_M_I = so3.to_matrix(T_M_I[:, :4])
         for view in self._views:
-            rows, frame, arguments = view.rows, view.frame, view.arguments
-            p_I = ((p_M[view.landmark] - T_M_I[frame, 4:])[:, None] @ R_M_I[frame])[:, 0]
-            visible[rows] = is_visible(view.camera, (p_I - view.T_I_C[4:]) @ view.R_I_C)
-            arguments[:, :7], arguments[:, 7:14] = T_M_I[frame], T_G_M
-            arguments[:, -5:-2] = p_G[view.landmark]
-            residual[rows], jacobian[rows] = view.kernel.evaluated(arguments, view.weight)
-        residual[~visible], jacobian[~visible] = 0.0, 0.0
-        of_frame, of_base, of_landmark = np.split(jacobian, [6, 12], axis=2)
-        return MapResiduals(residual, of_frame, of_base, of_landmark, visible)
+            residual[view.rows], jacobian[view.rows] = view.evaluated(T_M_I, R_M_I, T_G_M, p_G, p_M)
+            visible[view.rows] = view.visible
+        of_frame, of_base, of_landmark = jacobian[..., :6], jacobian[..., 6:12], jacobian[..., 12:]
+        return MapResiduals(residual, jacobian, of_frame, of_base, of_landmark, visible)
 
     def errors_px(self, states: WindowStates) -> F64:
         """Return the reprojection error (O,) of every observation; infinite where it is not visible."""
@@ -185,9 +193,7 @@ class MapTerms:
             where = self.evaluate(at.T_M_I, at.T_G_M[0], self._landmarks(states))
         rho, root = self._weighed(now)
         root = np.where(where.is_visible, root, 0.0)
-        r = now.residual * root[:, None]
-        J = np.concatenate([where.of_frame, where.of_base], axis=2) * root[:, None, None]
-        square, gradient = self._summed(J, r, len(states))
+        square, gradient = self._summed(where, now.residual, root, len(states))
         tilt, of_tilt = self._tilt(at.T_G_M[0])
         if at is not states:
             tilt, _ = self._tilt(states.T_G_M[0])
@@ -198,12 +204,11 @@ class MapTerms:
         system.diagonal[columns] += np.diagonal(square)
         kept = None
         if self.estimates_landmarks:
-            Q = where.of_landmark * root[:, None, None]
-            kept = self._eliminated(J, Q, r, states)
+            kept = self._eliminated(where, now.residual, root, states)
             Y, z = _half_solved(kept)
             square -= Y.T @ Y
             system.reduced_gradient[columns] -= Y.T @ z
-        system.matrix[np.ix_(columns, columns)] += square
+        kernels.add_square(square, columns, system.matrix)
         return kept, self._costs(rho, tilt, states)
 
     def of_base_frame(self, states: WindowStates) -> tuple[F64, F64, dict[str, float]]:
@@ -224,23 +229,12 @@ class MapTerms:
             self._latest = states, self.evaluate(states.T_M_I, states.T_G_M[0], p_G)
         return self._latest[1]
 
-    def _summed(self, J: F64, r: F64, frames: int) -> tuple[F64, F64]:
-        """Return the normal equations (N, N), (N,) of Jacobians (O, 2, 12) by frame and base frame."""
-        is_of_frame = (np.arange(frames)[:, None] == self.observations.frame).astype(np.float64)
-        turned = J.transpose(0, 2, 1)
-        squares = (is_of_frame @ (turned @ J).reshape(-1, 144)).reshape(frames, 12, 12)
-        gradients = is_of_frame @ (turned @ r[:, :, None])[:, :, 0]
-        size, rows = 6 * frames, np.arange(frames)
-        square, gradient = np.zeros((size + 6, size + 6)), np.empty(size + 6)
-        blocks = square[:size, :size].reshape(frames, 6, frames, 6)
-        blocks[rows, :, rows] = squares[:, :6, :6]
-        square[size:, :size] = squares[:, 6:, :6].transpose(1, 0, 2).reshape(6, size)
-        square[:size, size:] = square[size:, :size].T
-        square[size:, size:] = squares[:, 6:, 6:].sum(axis=0)
-        gradient[:size], gradient[size:] = (
-            gradients[:, :6].reshape(-1),
-            gradients[:, 6:].sum(axis=0),
-        )
+    def _summed(self, at: MapResiduals, residual: F64, root: F64, frames: int) -> tuple[F64, F64]:
+        """Return the lower triangle of the normal equations (N, N), and their gradient (N,)."""
+        size = 6 * frames + 6
+        square, gradient = np.zeros((size, size)), np.zeros(size)
+        frame = self.observations.frame
+        kernels.sum_observations(frame, residual, at.jacobian, root, square, gradient)
         return square, gradient
 
     def _landmarks(self, states: WindowStates) -> F64:
@@ -248,9 +242,9 @@ class MapTerms:
 
     def _weighed(self, at: MapResiduals) -> tuple[F64, F64]:
         """Return rho (O,) and the square root of the robust weight (O,), zero where not visible."""
-        square = np.where(at.is_visible, np.sum(at.residual**2, axis=1), _BEHIND)
-        rho, weight = loss_and_weight(Loss.HUBER, self._huber2, square)
-        return rho, np.where(at.is_visible, np.sqrt(weight), 0.0)
+        rho, root = np.empty(len(at.residual)), np.empty(len(at.residual))
+        kernels.weigh(int(Loss.HUBER), at.residual, at.is_visible, self._huber2, _BEHIND, rho, root)
+        return rho, root
 
     def _tilt(self, T_G_M: F64) -> tuple[F64, F64]:
         """Return the whitened tilt of M against G (2,), and its Jacobian (2, 3) by the orientation.
@@ -273,8 +267,12 @@ class MapTerms:
             )
         return costs
 
-    def _eliminated(self, J: F64, Q: F64, r: F64, states: WindowStates) -> MapElimination:
+    def _eliminated(
+        self, at: MapResiduals, residual: F64, root: F64, states: WindowStates
+    ) -> MapElimination:
         """Return the normal equations of the landmarks, at least one."""
+        J, r = at.jacobian[..., :12] * root[:, None, None], residual * root[:, None]
+        Q = at.of_landmark * root[:, None, None]
         seen, frames = self.observations, len(states)
         assert seen.information_G is not None
         first, turned = seen.start[:-1], Q.transpose(0, 2, 1)

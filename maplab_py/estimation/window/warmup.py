@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from functools import partial
@@ -22,6 +23,7 @@ from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection, camera_table
 from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
+from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
@@ -73,6 +75,22 @@ def _run_landmarks(projection: Projection, distortion: Distortion) -> None:
     map_reprojection_kernel(projection, distortion).compile_kernel()
 
 
+def _run_map() -> None:
+    """Compile what all observations of a map need, whatever the camera."""
+    states, system = _states(), DenseSystem.zeros(2 * FRAME_SIZE + 6)
+    nothing = np.zeros(0, dtype=np.int32)
+    camera = Camera(
+        "0" * 32, Projection.PINHOLE, Distortion.NONE, np.full(4, 50.0), np.zeros(0), 100, 100
+    )
+    observations = MapObservations(
+        np.zeros(1, dtype=np.int64), nothing, nothing, np.zeros((0, 2)), np.zeros(0),
+        np.zeros((0, 3)), None,
+    )  # fmt: skip
+    localized = dataclasses.replace(states, T_G_M=se3.identity(1))
+    terms = MapTerms(observations, (camera,), se3.identity(1), huber_sigmas=1.0)
+    terms.add_to(system, localized, localized)
+
+
 def _run_frames() -> None:
     states, system = _states(), DenseSystem.zeros(2 * FRAME_SIZE)
     first_row = np.zeros(1, dtype=np.int64)
@@ -83,3 +101,4 @@ def _run_frames() -> None:
     origin, start = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0, 2], dtype=np.int64)
     ray = np.array([[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]])
     kernels.triangulate(origin, ray, start, np.empty((1, 3)), np.empty(1, dtype=np.bool_))
+    _run_map()

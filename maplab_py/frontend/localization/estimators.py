@@ -10,10 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.alignment import aligned
 from maplab_py.estimation.window.localized import LocalizedSmoother, composition_jacobian
+from maplab_py.estimation.window.map_gate import contradicted_unless_most
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
@@ -130,7 +131,8 @@ class SlidingWindowEstimator(_LooseEstimator):
     def __init__(self, device: RecordedSensors, rule: MapRule, options: WindowOptions) -> None:
         """Take the cameras, and the weights of the tight estimator."""
         super().__init__()
-        self._device, self._rule, self._options = device, rule, options
+        self._cameras, self._T_I_C = device.cameras, device.T_I_C
+        self._rule, self._options = rule, options
         self._tracks = MapTracks(estimates_landmarks=False)
 
     @property
@@ -150,24 +152,34 @@ class SlidingWindowEstimator(_LooseEstimator):
         exact = dataclasses.replace(matches, covariance_G=None)
         self._tracks.forget(smoother.tracks)
         self._tracks.add(exact, smoother.tracks)
-        rule = self._rule
-        observations, used = self._tracks.observations(smoother.tracks, rule.sigma_px)
+        states = dataclasses.replace(smoother.states, T_G_M=self.T_G_M[None])
+        terms, used = self._terms(smoother)
+        far = contradicted_unless_most(terms.errors_px(states), terms.observations, self._options)
+        if far.any():
+            self._tracks.refuse(used[far])
+            terms, used = self._terms(smoother)
         if not len(used):
             return
-        terms = MapTerms(
-            observations, self._device.cameras, self._device.T_I_C,
-            huber_sigmas=self._options.huber_sigmas, tilt_sigma_rad=rule.tilt_sigma_rad,
-        )  # fmt: skip
-        states = dataclasses.replace(smoother.states, T_G_M=self.T_G_M[None])
+        rule = self._rule
         sigma = np.repeat([rule.base_sigma_m, rule.base_sigma_rad], 3)
         try:
             self.T_G_M, self.covariance = aligned(terms, states, sigma)
         except EstimationError:
             return
         states = dataclasses.replace(states, T_G_M=self.T_G_M[None])
-        mean2 = np.add.reduceat(terms.errors_px(states) ** 2, observations.start[:-1])
-        mean2 /= np.diff(observations.start)
+        start = terms.observations.start
+        mean2 = np.add.reduceat(terms.errors_px(states) ** 2, start[:-1]) / np.diff(start)
         self._tracks.refuse(used[~(mean2 <= self._options.gate_chi2 * rule.sigma_px**2)])
+
+    def _terms(self, smoother: FixedLagSmoother) -> tuple[MapTerms, I64]:
+        """Return the observations of the map in the window, and their associations (rows)."""
+        rule = self._rule
+        observations, used = self._tracks.observations(smoother.tracks, rule.sigma_px)
+        terms = MapTerms(
+            observations, self._cameras, self._T_I_C,
+            huber_sigmas=self._options.huber_sigmas, tilt_sigma_rad=rule.tilt_sigma_rad,
+        )  # fmt: skip
+        return terms, used
 
     def stop(self, smoother: FixedLagSmoother | None) -> None:
         """See `MapEstimator`."""

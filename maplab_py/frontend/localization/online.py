@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 
 from maplab_py.algorithms.localization.localizer import Outcome
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.window.map_tracks import MapMatches
 from maplab_py.estimation.window.options import WindowOptions
@@ -21,6 +21,7 @@ from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keyp
 from maplab_py.frontend.localization.map_source import SearchedMap, calibration_notes
 from maplab_py.frontend.localization.matcher import Answer, MapMatcher
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.localization.track_check import observed_throughout
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.protocol import RecordedSensors
@@ -101,7 +102,7 @@ class OnlineLocalization:
         self.problem = ""
         self.options, self.map_name = options, searched.name
         self.map_landmarks = len(searched.database.p_G)
-        self._map, self._device = searched, device
+        self._map, self._device, self._T_I_C = searched, device, device.T_I_C
         self._matcher = MapMatcher(searched, options)
         self.estimator: MapEstimator = make_estimator(
             options.mode, device, options.rule, window or WindowOptions()
@@ -133,7 +134,9 @@ class OnlineLocalization:
             answer = self._asked(update, pose)
         spent_ms = {"match": 1e3 * (time.perf_counter() - began)}
         if answer is not None:
+            began = time.perf_counter()
             self.take(answer, smoother)
+            spent_ms["use"] = 1e3 * (time.perf_counter() - began)
             pose = self.estimator.pose(smoother) or pose
         state = LocalizationState.SEARCHING
         if pose is not None:
@@ -176,10 +179,7 @@ class OnlineLocalization:
         """Tell an estimator of an event, be it this one's or another one's that is compared with it."""
         if event.start is not None:
             assert event.start.T_G_I is not None  # only poses agree
-            T_M_I = _pose_at(smoother, event.time_ns)
-            if T_M_I is None:
-                T_M_I, _ = self._poses[event.time_ns]
-            estimator.start(se3.compose(event.start.T_G_I, se3.inverse(T_M_I)), smoother)
+            estimator.start(self._base_frame(event.start, event.start.T_G_I, smoother), smoother)
             self.counts.starts += estimator is self.estimator
         for answer in event.answers:
             matches = self._chosen(answer, estimator, smoother)
@@ -235,6 +235,7 @@ class OnlineLocalization:
             rows = rows[~associated.includes(answer.track_id[rows])]
             rows = rows[~np.isin(answer.landmark[rows], associated.matches.landmark)]
             present = int(np.count_nonzero(associated.includes(tracks.id[tracks.is_active])))
+            rows = rows[self._observed_throughout(answer, rows, estimator, smoother)]
         counts = tracks.counts()[np.searchsorted(tracks.id, answer.track_id[rows])]
         rows = rows[np.argsort(-counts, kind="stable")]
         if most:
@@ -247,6 +248,31 @@ class OnlineLocalization:
             assert self._map.covariance_G is not None  # the map was opened with them
             covariance = self._map.covariance_G[landmark]
         return MapMatches(answer.track_id[rows], landmark, self._matcher.p_G[landmark], covariance)
+
+    def _observed_throughout(
+        self, answer: Answer, rows: I64, estimator: MapEstimator, smoother: FixedLagSmoother
+    ) -> Mask:
+        """Tell which matches (rows) agree with all that their tracks observe in the window."""
+        pose, bases = estimator.pose(smoother), []
+        if pose is not None:
+            bases.append(pose.T_G_M)
+        if answer.T_G_I is not None:
+            bases.append(self._base_frame(answer, answer.T_G_I, smoother))
+        if not bases:
+            return np.ones(len(rows), dtype=np.bool_)
+        landmark = answer.landmark[rows]
+        matches = MapMatches(answer.track_id[rows], landmark, self._matcher.p_G[landmark])
+        return observed_throughout(
+            matches, bases, smoother, self._device.cameras, self._T_I_C,
+            sigma_px=self.options.keypoint_sigma_px,
+        )  # fmt: skip
+
+    def _base_frame(self, answer: Answer, T_G_I: F64, smoother: FixedLagSmoother) -> F64:
+        """Return T_G_M (7,) by the pose (7,) of an answer's frame."""
+        T_M_I = _pose_at(smoother, answer.time_ns)
+        if T_M_I is None:
+            T_M_I, _ = self._poses[answer.time_ns]
+        return se3.compose(T_G_I, se3.inverse(T_M_I))
 
     def _remember(self, time_ns: int, T_M_I: F64, pose: MapPose | None) -> None:
         self._poses[time_ns] = T_M_I, None if pose is None else pose.T_G_I

@@ -37,7 +37,8 @@ from tests.support.machine import slowness
 
 _FILLING_FRAMES = 15
 """Localised frames that are not counted: the window fills up."""
-STAGES = ("rays", "matching", "ransac", "tracking", "odo", "vil", "swl")
+STAGES = ("rays", "matching", "ransac", "tracking", "odo", "vil", "use", "swl")
+"""Of VIL the window, and the use of an answer; SWL uses an answer and estimates."""
 
 
 class Stopwatch:
@@ -101,6 +102,8 @@ def measure(searched: SearchedMap, session: VIMap, options: OnlineLocalizationOp
             if localized > _FILLING_FRAMES:
                 watch.add("odo", first.stage_ms["window"])
                 watch.add("vil", second.stage_ms["window"])
+                if "use" in frame.stage_ms:
+                    watch.add("use", frame.stage_ms["use"])
                 watch.start()
                 seen = frame_keypoints(second, device)
                 watch.stop("rays")
@@ -129,7 +132,7 @@ def main() -> None:
             ms = measure(searched, session, options).medians()
         factor = 0.5 * (factor + slowness())
         matching = ms["matching"] + ms["ransac"]
-        ratio = (matching + ms["vil"]) / (matching + ms["odo"] + ms["swl"])
+        ratio = (matching + ms["vil"] + ms["use"]) / (matching + ms["odo"] + ms["swl"])
         for what, by in (("here", 1.0), (f"ordinary machine ({factor:.2f} times faster)", factor)):
             times = ", ".join(f"{stage} {spent / by:.1f}" for stage, spent in ms.items())
             print(f"{len(searched.database.p_G)} landmarks, {uncertainty}, {what}: {times} ms")

@@ -165,6 +165,31 @@ def test_wrong_matches_are_given_back(noisy: SimulatedTracks) -> None:
     assert np.linalg.norm(se3.local(estimate.T_G_I, truth)[:3]) < 0.03
 
 
+def test_tracks_that_leave_their_landmark_are_given_back_at_once(noisy: SimulatedTracks) -> None:
+    """A frame in which they observe something else does not enter the estimate as one of the map."""
+    smoother = smoother_of(noisy)
+    smoother.start(noisy.frames[0], noisy.start_state(SIGMA))
+    for frame in noisy.frames[1:13]:
+        smoother.add(frame)
+        if frame is noisy.frames[10]:
+            smoother.start_base_frame(T_G_M)
+            smoother.associate(matches_of(noisy, 10))
+    frame = noisy.frames[13]
+    before = smoother.map_tracks.matches.track_id
+    leaving = np.intersect1d(frame.track_id, before)[::4]
+    uv_px = frame.uv_px.copy()
+    uv_px[np.isin(frame.track_id, leaving)] += 40.0
+    smoother.add(dataclasses.replace(frame, uv_px=uv_px))
+    kept = smoother.map_tracks.matches.track_id
+    assert len(leaving) > 2
+    assert not np.isin(leaving, kept).any()
+    estimate = smoother.map_estimate
+    assert estimate is not None
+    assert estimate.num_tracks == len(before) - len(leaving)
+    truth = se3.compose(T_G_M, noisy.T_M_I[13])
+    assert np.linalg.norm(se3.local(estimate.T_G_I, truth)[:3]) < 0.015
+
+
 def test_uncertain_landmarks_give_wider_covariances(noisy: SimulatedTracks) -> None:
     sigmas = []
     for estimates in (False, True):
@@ -212,7 +237,8 @@ def test_alignment_is_the_window_with_all_but_the_base_frame_fixed(noisy: Simula
         system = DenseSystem.zeros(15 * len(now) + 6)
         terms.add_to(system, now, now)
         prior = se3.local(states.T_G_M[0], now.T_G_M[0]) / sigma**2
-        fixed = system.matrix[-6:, -6:] + np.diag(1.0 / sigma**2)
+        lower = np.tril(system.matrix[-6:, -6:])
+        fixed = lower + np.tril(lower, -1).T + np.diag(1.0 / sigma**2)
         step = np.zeros(15 * len(now) + 6)
         step[-6:] = -np.linalg.solve(fixed, system.gradient[-6:] + prior)
         now = now.moved(step, now.h)

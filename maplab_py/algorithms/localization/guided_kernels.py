@@ -1,0 +1,126 @@
+"""Compiled parts of guided matching: landmarks in view of a camera, and those near its rays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+from maplab_py.compilation import compiled
+
+
+class Landmarks(NamedTuple):
+    """L landmarks, and from where each may be visible."""
+
+    p_G: F64  # (L, 3)
+    direction: F64  # (L, 3) unit, in G, toward those who observed it
+    least_cosine: F64  # (L,) of the angle to that direction
+    nearest_m: F64  # (L,) distance
+    farthest_m: F64  # (L,)
+
+
+class View(NamedTuple):
+    """A cone around all rays of a camera."""
+
+    T_G_I: F64  # (3, 4) [R_G_I p_G_I]
+    centre_I: F64  # (3,)
+    axis_I: F64  # (3,) unit
+    cosine: float  # of half its opening
+
+
+@compiled()
+def landmarks_in_view(landmarks, view, rows, toward):  # type: ignore[no-untyped-def]
+    """Find landmarks that may be visible and lie in the cone; return how many.
+
+    Args:
+        landmarks: All landmarks.
+        view: Pose of the body and cone.
+        rows: Output (L,): rows of these landmarks, ascending.
+        toward: Output (L, 3): unit vectors toward them, in the body frame.
+    """
+    T, centre, axis = view.T_G_I, view.centre_I, view.axis_I
+    count = 0
+    for k in range(len(landmarks.p_G)):
+        x = T[0, 3] - landmarks.p_G[k, 0]
+        y = T[1, 3] - landmarks.p_G[k, 1]
+        z = T[2, 3] - landmarks.p_G[k, 2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance >= landmarks.farthest_m[k] or distance <= landmarks.nearest_m[k]:
+            continue
+        d = landmarks.direction[k]
+        if d[0] * x + d[1] * y + d[2] * z <= landmarks.least_cosine[k] * max(distance, 1e-9):
+            continue
+        a = -(T[0, 0] * x + T[1, 0] * y + T[2, 0] * z) - centre[0]
+        b = -(T[0, 1] * x + T[1, 1] * y + T[2, 1] * z) - centre[1]
+        c = -(T[0, 2] * x + T[1, 2] * y + T[2, 2] * z) - centre[2]
+        length = max(np.sqrt(a * a + b * b + c * c), 1e-9)
+        a, b, c = a / length, b / length, c / length
+        if axis[0] * a + axis[1] * b + axis[2] * c <= view.cosine:
+            continue
+        toward[count, 0], toward[count, 1], toward[count, 2] = a, b, c
+        rows[count] = k
+        count += 1
+    return count
+
+
+@compiled()
+def points_near(ray, cosine, first, last, toward, pairs):  # type: ignore[no-untyped-def]
+    """Count pairs of rays and directions that are near each other; fill in as many as fit.
+
+    Args:
+        ray: Unit rays (R, 3).
+        cosine: Cosine (R,) of the largest angle.
+        first: First direction (R,) that may be near.
+        last: One after the last of them (R,).
+        toward: Unit vectors (N, 3).
+        pairs: Output (P, 2): ray and direction, sorted by ray.
+    """
+    count = 0
+    for r in range(len(ray)):
+        a, b, c, limit = ray[r, 0], ray[r, 1], ray[r, 2], cosine[r]
+        for k in range(first[r], last[r]):
+            if a * toward[k, 0] + b * toward[k, 1] + c * toward[k, 2] > limit:
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = r, k
+                count += 1
+    return count
+
+
+def near_pairs(ray: F64, cosine: F64, first: I64, last: I64, toward: F64) -> tuple[I64, I64]:
+    """Return the pairs of `points_near`, all of them."""
+    pairs = np.empty((4 * len(ray) + 64, 2), dtype=np.int64)
+    count = points_near(ray, cosine, first, last, toward, pairs)
+    if count > len(pairs):
+        pairs = np.empty((count, 2), dtype=np.int64)
+        points_near(ray, cosine, first, last, toward, pairs)
+    return pairs[:count, 0], pairs[:count, 1]
+
+
+@compiled()
+def least_distances(projected, keypoint, table, start, rows, landmark, distance):  # type: ignore[no-untyped-def]
+    """Fill in the least squared distance (N,) of a keypoint to a landmark's projected descriptors."""
+    for n in range(len(keypoint)):
+        nearest = np.float32(np.inf)
+        for k in range(start[landmark[n]], start[landmark[n] + 1]):
+            total = np.float32(0.0)
+            for d in range(table.shape[1]):
+                step = projected[keypoint[n], d] - table[rows[k], d]
+                total += step * step
+            nearest = min(nearest, total)
+        distance[n] = nearest
+
+
+def compile_kernels() -> None:
+    """Compile the search on one ray."""
+    one, origin = np.ones(1), np.zeros((1, 3))
+    landmarks = Landmarks(
+        np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, -1.0]]), 0.0 * one, one, 3.0 * one
+    )
+    forward = np.array([0.0, 0.0, 1.0])
+    view = View(np.eye(3, 4), origin[0], forward, 0.5)
+    rows, toward = np.zeros(1, dtype=np.int64), np.zeros((1, 3))
+    landmarks_in_view(landmarks, view, rows, toward)
+    near_pairs(toward, 0.5 * one, rows, rows + 1, toward)
+    table = np.zeros((1, 10), dtype=np.float32)
+    least_distances(table, rows, table, np.array([0, 1]), rows, rows, one)

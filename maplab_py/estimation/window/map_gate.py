@@ -1,0 +1,37 @@
+"""Which associations with a map are contradicted by observations of their tracks.
+
+A track may leave its point for another one, before or after it was matched with a landmark of the map:
+then a single observation can be off by hundreds of pixels. The Huber loss bounds the residual of such an
+observation, but not its Jacobian, which grows without bound near the plane of the camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.array_types import F64, Mask
+from maplab_py.estimation.window.map_terms import MapObservations
+from maplab_py.estimation.window.options import WindowOptions
+
+
+def contradicted(error_px: F64, seen: MapObservations, options: WindowOptions) -> Mask:
+    """Tell which landmarks (A,) have an observation far from where it is expected.
+
+    Args:
+        error_px: Reprojection errors (O,) at predicted poses; infinite where a landmark is not visible.
+        seen: The observations.
+        options: Gate, and uncertainty of a predicted place, as for landmarks of the odometry.
+    """
+    if not len(seen):
+        return np.zeros(len(seen.start) - 1, dtype=np.bool_)
+    sigma2 = seen.sigma_px**2 + options.prediction_sigma_px**2
+    far = ~(error_px**2 <= options.gate_chi2 * sigma2)
+    return np.asarray(np.logical_or.reduceat(far, seen.start[:-1]))
+
+
+def contradicted_unless_most(error_px: F64, seen: MapObservations, options: WindowOptions) -> Mask:
+    """Tell what `contradicted` does; when most landmarks are, the prediction is wrong and none is."""
+    result = contradicted(error_px, seen, options)
+    if 2 * np.count_nonzero(result) < len(result):
+        return result
+    return np.zeros_like(result)
