@@ -113,14 +113,14 @@ def least_distances(projected, keypoint, table, start, rows, landmark, distance)
 
 def compile_kernels() -> None:
     """Compile the search on one ray."""
-    one, origin = np.ones(1), np.zeros((1, 3))
+    unit, origin = np.ones(1), np.zeros((1, 3))
     landmarks = Landmarks(
-        np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, -1.0]]), 0.0 * one, one, 3.0 * one
+        np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, -1.0]]), 0.0 * unit, unit, 3.0 * unit
     )
     forward = np.array([0.0, 0.0, 1.0])
     view = View(np.eye(3, 4), origin[0], forward, 0.5)
     rows, toward = np.zeros(1, dtype=np.int64), np.zeros((1, 3))
     landmarks_in_view(landmarks, view, rows, toward)
-    near_pairs(toward, 0.5 * one, rows, rows + 1, toward)
+    near_pairs(toward, 0.5 * unit, rows, rows + 1, toward)
     table = np.zeros((1, 10), dtype=np.float32)
-    least_distances(table, rows, table, np.array([0, 1]), rows, rows, one)
+    least_distances(table, rows, table, np.array([0, 1]), rows, rows, unit)

@@ -62,6 +62,7 @@ class LocalizedSmoother(FixedLagSmoother):
         self._used: I64 = np.zeros(0, dtype=np.int64)  # associations of the latest terms
         self._map_rows = self._used  # of these, whose landmarks are states
         self._latest_terms: MapTerms | None = None
+        self._checked_terms: MapTerms | None = None  # of the update that has begun
         self._estimate: MapEstimate | None = None
 
     @property
@@ -124,11 +125,14 @@ class LocalizedSmoother(FixedLagSmoother):
         super()._gate_new()
         if not self.is_localized:
             return
+        self.map_tracks.forget(self.tracks)
+        terms = self._terms(None, self.rule.tilt_sigma_rad)
         newest = len(self._states) - 1
-        seen, used = self.map_tracks.observations(self.tracks, self.rule.sigma_px, newest)
-        terms = MapTerms(seen, self._rig, self._T_I_C, huber_sigmas=self.options.huber_sigmas)
-        error_px = terms.errors_px(dataclasses.replace(self._states, p_G=self.map_tracks.p_G[used]))
-        self.map_tracks.refuse(used[contradicted_unless_most(error_px, seen, self.options)])
+        far = contradicted_unless_most(
+            terms.errors_px(self._states), terms.observations, self.options, frame=newest
+        )
+        self.map_tracks.refuse(self._used[far])
+        self._checked_terms = None if far.any() else terms
 
     def _may_be_landmark(self) -> Mask:
         return ~self.map_tracks.includes(self.tracks.id)
@@ -136,6 +140,9 @@ class LocalizedSmoother(FixedLagSmoother):
     def _map_terms(self) -> MapTerms | None:
         if not self.is_localized:
             return None
+        terms, self._checked_terms = self._checked_terms, None
+        if terms is not None:
+            return terms
         self.map_tracks.forget(self.tracks)
         return self._terms(None, self.rule.tilt_sigma_rad)
 

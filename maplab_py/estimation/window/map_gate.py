@@ -29,9 +29,19 @@ def contradicted(error_px: F64, seen: MapObservations, options: WindowOptions) -
     return np.asarray(np.logical_or.reduceat(far, seen.start[:-1]))
 
 
-def contradicted_unless_most(error_px: F64, seen: MapObservations, options: WindowOptions) -> Mask:
-    """Tell what `contradicted` does; when most landmarks are, the prediction is wrong and none is."""
-    result = contradicted(error_px, seen, options)
-    if 2 * np.count_nonzero(result) < len(result):
+def contradicted_unless_most(
+    error_px: F64, seen: MapObservations, options: WindowOptions, *, frame: int | None = None
+) -> Mask:
+    """Tell what `contradicted` does; when most landmarks are, the prediction is wrong and none is.
+
+    Args:
+        error_px: Reprojection errors (O,), see `contradicted`.
+        seen: The observations.
+        options: The gate.
+        frame: The only frame whose observations count; None = all count.
+    """
+    counts: Mask = np.ones(len(seen), dtype=np.bool_) if frame is None else seen.frame == frame
+    result = contradicted(np.where(counts, error_px, 0.0), seen, options)
+    if 2 * np.count_nonzero(result) < len(np.unique(seen.landmark[counts])):
         return result
     return np.zeros_like(result)

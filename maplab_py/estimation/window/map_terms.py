@@ -223,11 +223,16 @@ class MapTerms:
         return square, gradient, self._costs(rho, tilt, states)
 
     def _evaluated(self, states: WindowStates) -> MapResiduals:
-        """Evaluate all observations, unless these states (values) were the last ones evaluated."""
-        if self._latest is None or self._latest[0] is not states:
-            p_G = self._landmarks(states)
-            self._latest = states, self.evaluate(states.T_M_I, states.T_G_M[0], p_G)
-        return self._latest[1]
+        """Evaluate all observations, unless that was done last at the same poses (arrays)."""
+        p_G = self._landmarks(states)
+        if self._latest is not None:
+            before, at = self._latest
+            same = before.T_M_I is states.T_M_I and before.T_G_M is states.T_G_M
+            if same and self._landmarks(before) is p_G:
+                return at
+        at = self.evaluate(states.T_M_I, states.T_G_M[0], p_G)
+        self._latest = states, at
+        return at
 
     def _summed(self, at: MapResiduals, residual: F64, root: F64, frames: int) -> tuple[F64, F64]:
         """Return the lower triangle of the normal equations (N, N), and their gradient (N,)."""

@@ -60,6 +60,14 @@ class MapTracks:
         self.p_G = np.zeros((0, 3))
         self._refused: I64 = np.zeros(0, dtype=np.int64)
 
+    @classmethod
+    def of(cls, matches: MapMatches) -> MapTracks:
+        """Return associations with landmarks that are taken as exact."""
+        result = cls(estimates_landmarks=False)
+        result.matches = dataclasses.replace(matches, covariance_G=None)
+        result.p_G = matches.p_G
+        return result
+
     def __len__(self) -> int:
         return len(self.matches)
 

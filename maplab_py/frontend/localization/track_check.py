@@ -35,9 +35,7 @@ def observed_throughout(
         T_I_C: Their poses (C, 7).
         sigma_px: Standard deviation of a keypoint.
     """
-    tracks = MapTracks(estimates_landmarks=False)
-    tracks.add(dataclasses.replace(matches, covariance_G=None), smoother.tracks)
-    seen, used = tracks.observations(smoother.tracks, sigma_px)
+    seen, used = MapTracks.of(matches).observations(smoother.tracks, sigma_px)
     options = smoother.options
     terms = MapTerms(seen, cameras, T_I_C, huber_sigmas=options.huber_sigmas)
     far: list[Mask] = []

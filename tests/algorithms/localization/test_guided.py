@@ -13,7 +13,13 @@ from maplab_py.algorithms.localization.database import (
     database_of_summary,
 )
 from maplab_py.algorithms.localization.guided import guided_matches
-from maplab_py.algorithms.localization.guided_kernels import near_pairs
+from maplab_py.algorithms.localization.guided_kernels import (
+    compile_kernels,
+    landmarks_in_view,
+    least_distances,
+    near_pairs,
+    points_near,
+)
 from maplab_py.algorithms.localization.localizer import Localizer
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.array_types import F64, I64
@@ -106,3 +112,19 @@ def test_pairs_are_all_returned_however_many_they_are() -> None:
     key, point = near_pairs(ray, np.full(3, 0.9), first, first + 200, toward)
     np.testing.assert_array_equal(key, np.repeat(np.arange(3), 200))
     np.testing.assert_array_equal(point, np.tile(np.arange(200), 3))
+
+
+def test_nothing_is_compiled_after_the_warmup() -> None:
+    compile_kernels()
+    kernels = (landmarks_in_view, points_near, least_distances)
+    before = [list(kernel.signatures) for kernel in kernels]
+    assert all(before)
+    localizer = Localizer(database_of_summary(summary()), LocalizationOptions())
+    seen, T_G_I = frames()[0]
+    described = localizer.described(seen.descriptors)
+    guided_matches(
+        database_of_summary(summary()), T_G_I, projected=described.projected,
+        words=described.words, origin_I=seen.origin_I, ray_I=seen.ray_I,
+        radius_rad=RADIUS_PX * seen.rad_per_px, max_distance=1.0,
+    )  # fmt: skip
+    assert [list(kernel.signatures) for kernel in kernels] == before
