@@ -32,6 +32,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server.open_alignments import OpenAlignments
 from maplab_py.server.options import IncrementalOptions, MergingOptions
+from maplab_py.server.resource_folders import with_resources_taken_in
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import excerpt
 from maplab_py.vimap.ids import from_hex, to_hex, to_hex_list
@@ -215,9 +216,10 @@ class Merger:
                 baseframes=submap.baseframes.replace(is_known=is_known | _placed(submap))
             )
         if (base.mission_index.rows(submap.missions.id) >= 0).any():
-            return append_submap(base, submap)[0]
+            return with_resources_taken_in(append_submap(base, submap)[0], submap)
         frames = submap.baseframes.replace(is_known=_placed(submap))
-        return merge_maps(base, submap.replace(baseframes=frames))[0]
+        whole, _ = merge_maps(base, submap.replace(baseframes=frames))
+        return with_resources_taken_in(whole, submap)
 
     def _similar(self, submap: VIMap) -> list[int]:
         """Return the numbers of the submaps that look most like one."""

@@ -46,11 +46,17 @@ def digest_of(columns: Iterable[NDArray[Any]]) -> bytes:
     parts = list(columns)
     types = [(values.dtype.char, values.shape) for values in parts]
     contents = [
-        repr(values.tolist()).encode() if values.dtype == object else values.tobytes()
-        for values in parts
+        _of_objects(values) if values.dtype == object else values.tobytes() for values in parts
     ]
     whole = b"".join((repr((types, [*map(len, contents)])).encode(), *contents))
     return hashlib.blake2b(whole, digest_size=DIGEST_BYTES).digest()
+
+
+def _of_objects(values: NDArray[Any]) -> bytes:
+    """Return bytes that tell a column of objects: the distinct ones, and which of them each row has."""
+    place = {value: at for at, value in enumerate(dict.fromkeys(values.tolist()))}
+    index = [place[value] for value in values] if len(place) > 1 else []
+    return repr((list(place), index)).encode()
 
 
 def _are_same(a: NDArray[Any], b: NDArray[Any]) -> bool:

@@ -81,6 +81,11 @@ def _shift_resources(resources: Resources, frames: int, missions: int) -> Resour
     return resources.replace(owner=np.where(owned, resources.owner + offset, resources.owner))
 
 
+def resource_folder_name(metadata: MapMetadata) -> str:
+    """Return the name under which another map lists a map's own resource folder."""
+    return f"{metadata.map_folder.rstrip('/')}/{metadata.map_resource_folder.removeprefix('./')}"
+
+
 def _joined_metadata(base: MapMetadata, other: VIMap) -> tuple[MapMetadata, I32]:
     """Add the other map's resource folders to the base's; return them and the new folder column.
 
@@ -92,8 +97,7 @@ def _joined_metadata(base: MapMetadata, other: VIMap) -> tuple[MapMetadata, I32]
     known = list(base.external_resource_folders)
     names = dict(enumerate(other.metadata.external_resource_folders))
     if np.any(folder == -1):
-        other_folder = other.metadata.map_folder.rstrip("/")
-        names[-1] = f"{other_folder}/{other.metadata.map_resource_folder.removeprefix('./')}"
+        names[-1] = resource_folder_name(other.metadata)
     for index, name in names.items():
         if name not in known:
             known.append(name)

@@ -18,7 +18,7 @@ from maplab_py.server.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from maplab_py.server.reports import (
         DeletedMissions,
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         ServeReport,
         ServerStatus,
     )
+    from maplab_py.server.simulated_robots import RecordedSession
     from maplab_py.vimap import VIMap
 
 _SERVER = MapServerOptions()
@@ -331,17 +332,18 @@ def simulate_robots(
         scenario: Name of a scenario (see list_scenarios), or a YAML file; each session is a robot.
         seed: Seed of all random numbers; empty = the seed of the scenario.
         maps_folder: Play the maps below this folder instead, as rovioli makes them of recordings; each
-            mission is a robot.
+            mission is a robot, named after it or after the folder of its map.
     """
     from maplab_py.server.reports import PlayedRobots
     from maplab_py.server.simulated_robots import play as play_submaps
-    from maplab_py.server.simulated_robots import timed_submaps
+    from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
     from maplab_py.server.spool import Spool
 
     folder = Spool(spool)
     truth = folder.root / "truth.npz" if maps_folder is None else None
+    sessions: Mapping[str, VIMap | RecordedSession]
     if maps_folder is not None:
-        sessions = _recorded_sessions(maps_folder)
+        sessions = recorded_sessions(maps_folder)
     else:
         sessions = _simulated_sessions(context, scenario, seed, folder.root / "truth.npz")
     submaps = timed_submaps(sessions, play.submap_s)
@@ -409,14 +411,3 @@ def _simulated_sessions(
     truth.parent.mkdir(parents=True, exist_ok=True)
     data.truth.save(truth)
     return {f"robot_{number + 1}": vi_map for number, vi_map in enumerate(data.maps)}
-
-
-def _recorded_sessions(maps_folder: Path) -> dict[str, VIMap]:
-    from maplab_py.storage.native import find_maps, load_map
-    from maplab_py.vimap.excerpts import mission_maps
-
-    folders = find_maps(maps_folder)
-    if not folders:
-        raise UserError(f"--maps_folder={maps_folder}: there is no map in it or below it")
-    missions = [part for folder in folders for part in mission_maps(load_map(folder)[0])]
-    return {f"robot_{number + 1}": vi_map for number, vi_map in enumerate(missions)}

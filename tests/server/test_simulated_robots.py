@@ -1,0 +1,103 @@
+"""Recorded sessions that are played into the spool of a server."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maplab_py.console.session.session import Session
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.ply import PlyCloud, write_ply
+from maplab_py.server.lookup import dense_points_in_range
+from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
+from maplab_py.storage.mission_names import named
+from maplab_py.storage.native import find_maps, save_map
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources import existing_files
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.merge import merge_maps
+from tests.server.support import ROBOTS, Servers, session
+
+_POINT_CLOUD = 16
+
+
+def recordings(folder: Path) -> Path:
+    """Save the sessions of two robots, each in a map of its own."""
+    for robot in ROBOTS:
+        save_map(session(robot), folder / robot)
+    return folder
+
+
+def played(spool: Path, maps: Path) -> list[str]:
+    """Play maps, and return the folders of all submaps in the spool."""
+    with Session() as console:
+        report = console.run(
+            "simulate_robots", spool=spool, maps_folder=maps, robots_submap_s=3.0, robots_rate=0.0
+        )
+    folders = find_maps(spool / "incoming")
+    assert report.submaps == len(folders)
+    return [path.relative_to(spool / "incoming").as_posix() for path in folders]
+
+
+def test_a_server_merges_recordings_under_the_names_of_their_maps(servers: Servers) -> None:
+    maps = recordings(servers.scratch / "maps")
+    submaps = played(servers.spool.root, maps)
+    assert submaps == [f"{robot}/submap_00{number}" for robot in ROBOTS for number in range(3)]
+    servers.run()
+    servers.check_whole(*ROBOTS)
+    vi_map = servers.published()
+    assert sorted(vi_map.missions.name) == list(ROBOTS)
+    assert check_consistency(vi_map).errors == ()
+
+
+def test_robots_are_named_after_their_missions_and_no_name_comes_twice(tmp_path: Path) -> None:
+    both, _ = merge_maps(*(session(robot) for robot in ROBOTS))
+    save_map(named(both, ["a/b", "..ant"]), tmp_path / "ant")
+    save_map(session("bee"), tmp_path / "below" / "ant")
+    names = [*recorded_sessions(tmp_path)]
+    assert names == ["a_b", "ant", "ant_2"]
+
+
+def test_a_folder_without_maps_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="there is no map in it or below it"):
+        recorded_sessions(tmp_path)
+
+
+def with_a_cloud(vi_map: VIMap, scratch: Path) -> VIMap:
+    """Return a session with a cloud of three points, which a frame in its second submap owns."""
+    file = scratch / "cloud.ply"
+    write_ply(PlyCloud(np.array([[0.0, 0.0, 0.1], [0.1, 0.0, 0.1], [0.0, 0.0, 50.0]])), file)
+    new = NewResources(scratch, seed=vi_map.missions.id.tobytes())
+    row = new.add(_POINT_CLOUD, file.read_bytes())
+    file.unlink()
+    return new.attached(vi_map, [row], [len(vi_map.frames) // 2])
+
+
+def test_resources_of_recordings_come_along_and_the_server_finds_them(servers: Servers) -> None:
+    maps = servers.scratch / "maps"
+    for robot in ROBOTS:
+        save_map(with_a_cloud(session(robot), servers.scratch), maps / robot)
+    played(servers.spool.root, maps)
+    servers.options = dataclasses.replace(servers.options, dense_map_resource_type=_POINT_CLOUD)
+    servers.run()
+    published = servers.published()
+    assert published.metadata.external_resource_folders == ()
+    assert len(existing_files(published, servers.map_folder)) == 2
+    mission = published.vertices.mission[published.frames.vertex[published.resources.owner]]
+    assert sorted(published.missions.name[mission]) == list(ROBOTS)
+    known = int(
+        np.flatnonzero(published.baseframes.is_known[published.missions.baseframe[mission]])[0]
+    )
+    center_G = published.T_G_I[published.frames.vertex[published.resources.owner[known]], 4:]
+    points, clouds = dense_points_in_range(
+        published, servers.map_folder, _POINT_CLOUD, center_G, 2.0
+    )
+    assert (len(points), clouds) == (2, 1)
+    shutil.rmtree(maps / "ant" / "resources")
+    with pytest.raises(MapError, match="the resource's file is missing"):
+        timed_submaps(recorded_sessions(maps), 3.0)
