@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 SECONDS_BEFORE_BAR = 1.0
 SECONDS_BETWEEN_UPDATES = 0.1
+_COLUMNS_OF_BAR = 38
+"""Width of the bar with its times where it is shortest."""
 
 
 class TerminalProgress:
@@ -102,8 +104,15 @@ class TerminalProgress:
             if self._bar is None:
                 self._bar = _make_bar(self._stream)
                 self._bar.start()
-                self._task = self._bar.add_task(what, total=total)
-            self._bar.update(self._task, completed=done, total=total, description=what)
+                self._task = self._bar.add_task(self._cut(self._bar, what), total=total)
+            text = self._cut(self._bar, what)
+            self._bar.update(self._task, completed=done, total=total, description=text)
+
+    @staticmethod
+    def _cut(bar: RichProgress, what: str) -> str:
+        """Return the name of a step as long as the line has room for."""
+        width = max(bar.console.width - _COLUMNS_OF_BAR, 1)
+        return what if len(what) <= width else f"{what[: width - 1]}…"
 
 
 def _make_bar(stream: TextIO) -> RichProgress:
@@ -117,6 +126,7 @@ def _make_bar(stream: TextIO) -> RichProgress:
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.table import Column
     from rich.text import Text
 
     class RemainingColumn(TimeRemainingColumn):
@@ -130,9 +140,9 @@ def _make_bar(stream: TextIO) -> RichProgress:
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        TaskProgressColumn(),
-        RemainingColumn(),
-        TimeElapsedColumn(),
+        TaskProgressColumn(table_column=Column(no_wrap=True)),
+        RemainingColumn(table_column=Column(no_wrap=True)),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("elapsed", style="dim"),
         console=Console(file=stream),
         transient=True,
