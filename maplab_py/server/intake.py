@@ -147,7 +147,7 @@ class Intake:
         if _DISK_FULL in outcome.error:
             item.attempts -= 1
             item.not_before_s = time.monotonic() + _SECONDS_BETWEEN_RETRIES
-            return f"{item.entry.title}: {outcome.error}"
+            return f"{item.entry.title}: cannot be prepared ({_DISK_FULL})"
         if outcome.ending is Ending.REFUSED:
             return self.reject(item, outcome.error)
         if item.attempts < _ATTEMPTS:

@@ -24,7 +24,7 @@ from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_cl
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
-from maplab_py.algorithms.vi_optimization.local import optimize_around
+from maplab_py.algorithms.vi_optimization.local import LocalReport, optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
@@ -34,7 +34,7 @@ from maplab_py.server.open_alignments import OpenAlignments
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.resource_folders import with_resources_taken_in
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.excerpts import excerpt
+from maplab_py.vimap.excerpts import Excerpt, excerpt
 from maplab_py.vimap.ids import from_hex, to_hex, to_hex_list
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.submaps import append_submap
@@ -82,6 +82,38 @@ class MergeSteps:
     fixed_vertices: int
     joint_is_due: bool  # a loop or a mission needs a joint optimisation
     seconds: dict[str, float]
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _NewPart:
+    """What a submap has brought, and where its loops are looked for.
+
+    Attributes:
+        stretches: Of its missions.
+        rows: Its vertices in the map.
+        part: They and their surroundings.
+        searched: Numbers of the submaps in the part, the new ones last.
+    """
+
+    stretches: list[Stretch]
+    rows: I64
+    part: Excerpt
+    searched: list[int]
+
+
+@dataclasses.dataclass(frozen=True)
+class _ClosedLoops:
+    """What became of the loops of a submap.
+
+    Attributes:
+        landmarks_merged: Landmarks that became one.
+        has_large_gap: Some do not meet: a joint optimisation is needed.
+        note: Why no loops could be looked for.
+    """
+
+    landmarks_merged: int = 0
+    has_large_gap: bool = False
     note: str = ""
 
 
@@ -133,51 +165,32 @@ class Merger:
         clock = _Clock()
         whole = self._appended(submap)
         clock.lap("append")
-        stretches = stretches_of(submap)
-        rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
-        similar, known_stretches = self._similar(submap), [*self._stretches, *stretches]
-        part = excerpt(whole, self._surroundings(whole, rows, similar))
-        searched = [*similar, *range(len(self._stretches), len(known_stretches))]
+        new = self._surroundings(whole, submap)
         pairs = self._open_alignments.copy()
-        edited, anchored, joint_is_due = self._anchored(part.vi_map, progress, pairs, searched)
+        edited, anchored, joint_is_due = self._anchored(
+            new.part.vi_map, progress, pairs, new.searched
+        )
         clock.lap("anchor")
-        merged, closures_note = 0, ""
-        if self._merging.enable_visual_loop_closure and len(part.vertices) > len(rows):
-            try:
-                edited, report = close_loops(edited, self._loops, progress=progress)
-                merged = report.landmarks_merged
-                joint_is_due |= _has_large_gap(report.merges_refused)
-            except EstimationError as error:
-                closures_note = str(error)
-        whole = part.written_back(edited)
+        edited, loops = self._with_loops(edited, new, progress)
+        whole = new.part.written_back(edited)
         clock.lap("close loops")
         waiting = pairs.take(anchored, self._incremental.similar_stretches)
+        known_stretches = [*self._stretches, *new.stretches]
         whole, others = self._anchored_through(whole, waiting, known_stretches, progress)
-        joint_is_due |= bool(others)
         clock.lap("anchor others")
-        options = dataclasses.replace(self._optimization, num_iterations=_LOCAL_ITERATIONS)
-        whole, local = optimize_around(
-            whole,
-            rows,
-            options,
-            max_free=self._incremental.local_free_vertices,
-            max_fixed=self._incremental.local_fixed_vertices,
-            progress=progress,
-        )
+        whole, local = self._optimized_around(whole, new.rows, progress)
         clock.lap("optimise")
-        if self._merging.spatially_distribute_missions:
-            whole, _ = distribute_missions(whole, LayoutOptions())
-        self.vi_map, self._open_alignments = whole, pairs
-        for stretch in stretches:
+        self.vi_map, self._open_alignments = self._laid_out(whole), pairs
+        for stretch in new.stretches:
             self._remember(stretch, submap)
         return MergeSteps(
             (*anchored, *others),
-            merged,
+            loops.landmarks_merged,
             local.free_vertices,
             local.fixed_vertices,
-            joint_is_due,
+            joint_is_due or loops.has_large_gap or bool(others),
             clock.seconds,
-            closures_note,
+            loops.note,
         )
 
     def optimize_jointly(self, *, progress: Progress = SILENT) -> float:
@@ -229,7 +242,16 @@ class Merger:
         numbers = self._places.similar(frequencies, self._incremental.similar_stretches)
         return numbers.tolist()  # type: ignore[no-any-return]
 
-    def _surroundings(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
+    def _surroundings(self, whole: VIMap, submap: VIMap) -> _NewPart:
+        """Return the new vertices with the part of the map in which their loops are looked for."""
+        stretches = stretches_of(submap)
+        rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
+        similar, known = self._similar(submap), len(self._stretches)
+        part = excerpt(whole, self._searched_vertices(whole, rows, similar))
+        searched = [*similar, *range(known, known + len(stretches))]
+        return _NewPart(stretches, rows, part, searched)
+
+    def _searched_vertices(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
         """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
         result = np.zeros(len(whole.vertices), dtype=np.bool_)
         result[rows] = True
@@ -244,6 +266,39 @@ class Merger:
         if known[mission[rows]].all():
             result |= _nearest(whole.T_G_I[:, 4:], rows, known[mission], self._incremental)
         return result
+
+    def _with_loops(
+        self, edited: VIMap, new: _NewPart, progress: Progress
+    ) -> tuple[VIMap, _ClosedLoops]:
+        """Close the loops of a part; a part of new vertices alone has none."""
+        is_alone = len(new.part.vertices) == len(new.rows)
+        if is_alone or not self._merging.enable_visual_loop_closure:
+            return edited, _ClosedLoops()
+        try:
+            edited, report = close_loops(edited, self._loops, progress=progress)
+        except EstimationError as error:
+            return edited, _ClosedLoops(note=str(error))
+        has_large_gap = _has_large_gap(report.merges_refused)
+        return edited, _ClosedLoops(report.landmarks_merged, has_large_gap)
+
+    def _optimized_around(
+        self, whole: VIMap, rows: I64, progress: Progress
+    ) -> tuple[VIMap, LocalReport]:
+        """Optimise new vertices (rows) and what they touch."""
+        return optimize_around(
+            whole,
+            rows,
+            dataclasses.replace(self._optimization, num_iterations=_LOCAL_ITERATIONS),
+            max_free=self._incremental.local_free_vertices,
+            max_fixed=self._incremental.local_fixed_vertices,
+            progress=progress,
+        )
+
+    def _laid_out(self, whole: VIMap) -> VIMap:
+        """Set missions that are not anchored apart from the others."""
+        if not self._merging.spatially_distribute_missions:
+            return whole
+        return distribute_missions(whole, LayoutOptions())[0]
 
     def _anchored(
         self,

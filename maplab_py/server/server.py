@@ -55,7 +55,7 @@ logger = logging.getLogger(__name__)
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_RETRIES = 5.0
-_SECONDS_UNPUBLISHED = (5.0, 20.0)
+_SECONDS_UNPUBLISHED = (1.0, 20.0)
 _PUBLISHING_SHARE = 0.1
 """While submaps are ready to be merged, the map is published so often that this takes a tenth of the time,
 within limits; else after each. So the size of the map hardly slows the server down."""
@@ -104,7 +104,7 @@ class MapServer:
         self._progress, self._watch = progress, watch
         self._requests: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
         self._is_stopping = False
-        self._problem = ""
+        self._problem, self._logged_problems = "", set[str]()
         self._retry_s = 0.0
         self._merged_count = self._joint_count = 0
         self._url = ""
@@ -403,14 +403,17 @@ class MapServer:
             self._retry_s = time.monotonic() + _SECONDS_BETWEEN_RETRIES
             return False
         self.published, self._problem = vi_map, ""
+        waiting = tuple(f"{item.entry.title}: " for item in self._intake.items.values())
+        self._logged_problems = {p for p in self._logged_problems if p.startswith(waiting)}
         if self._watch is not None and vi_map is not None:
             self._watch(vi_map)
         return True
 
     def _fail(self, problem: str) -> None:
-        """Say a problem with the disk once."""
-        if problem != self._problem:
+        """Say a problem with the disk, each once until it has gone."""
+        if problem not in self._logged_problems:
             self.events.add(problem)
+        self._logged_problems.add(problem)
         self._problem = problem
 
     def _reject(self, item: Item, reason: str) -> None:

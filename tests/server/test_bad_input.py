@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from maplab_py.server.spool import Arrival, Entry, Spool, push
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_new_ids
-from tests.server.support import Servers, copying, submaps
+from tests.server.support import ROBOTS, Servers, copying, submaps
 
 
 def refused(servers: Servers, robot: str, submap: VIMap) -> str:
@@ -162,6 +163,32 @@ def test_a_full_disk_delays_what_comes(servers: Servers, monkeypatch: pytest.Mon
     assert server.status().problem == ""
     assert servers.reasons() == []
     assert servers.spool.log.read_text().count("cannot be taken") == 1
+
+
+def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
+    attempts: Counter[str] = Counter()
+
+    def full(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+        attempts[order.title] += 1
+        if attempts[order.title] <= 4:
+            error = f".worker.{len(attempts)}: cannot be saved (No space left on device)"
+            return Outcome(order.title, Ending.FAILED, error)
+        return copying(order, is_cancelled)
+
+    servers.work(full)
+    for robot in ROBOTS:
+        servers.put(robot, 0)
+    servers.run()
+    assert attempts == {"ant/submap_0": 5, "bee/submap_0": 5}
+    log = servers.spool.log.read_text()
+    for robot in ROBOTS:
+        line = f"{robot}/submap_0: cannot be prepared (No space left on device)"
+        assert log.count(line) == 1
+    assert log.count("No space left") == 2
+    assert servers.reasons() == []
 
 
 def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
