@@ -76,6 +76,15 @@ class MapEvent:
     start: Answer | None  # T_G_M starts at its pose; None = it goes on
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Remembered:
+    """Where a frame was when it was estimated."""
+
+    T_M_I: F64  # (7,)
+    T_G_I: F64 | None  # (7,)
+    path_m: float  # length of the path up to it
+
+
 class OnlineLocalization:
     """Localises an odometry in a map.
 
@@ -108,9 +117,7 @@ class OnlineLocalization:
             options.mode, device, options.rule, window or WindowOptions()
         )
         self._filter = AgreementFilter(options.min_num_estimates, options.max_mean_error_px)
-        self._poses: collections.OrderedDict[int, tuple[F64, F64 | None]] = (
-            collections.OrderedDict()
-        )
+        self._poses: collections.OrderedDict[int, _Remembered] = collections.OrderedDict()
         self._mission = -1
         self._next_ns = -(1 << 62)
 
@@ -161,8 +168,10 @@ class OnlineLocalization:
         if remembered is None or not np.isin(answer.track_id, smoother.tracks.id).any():
             self.counts.late += 1
             return False
-        T_M_I, T_G_I = remembered
-        verdict = self._filter.judge(answer, T_M_I, T_G_I, self._matcher.p_G)
+        T_G_I = remembered.T_G_I
+        verdict = self._filter.judge(
+            answer, remembered.T_M_I, T_G_I, self._matcher.p_G, path_m=remembered.path_m
+        )
         if verdict is Verdict.WAIT:
             self.counts.disagreeing += T_G_I is not None
             return False
@@ -271,11 +280,16 @@ class OnlineLocalization:
         """Return T_G_M (7,) by the pose (7,) of an answer's frame."""
         T_M_I = _pose_at(smoother, answer.time_ns)
         if T_M_I is None:
-            T_M_I, _ = self._poses[answer.time_ns]
+            T_M_I = self._poses[answer.time_ns].T_M_I
         return se3.compose(T_G_I, se3.inverse(T_M_I))
 
     def _remember(self, time_ns: int, T_M_I: F64, pose: MapPose | None) -> None:
-        self._poses[time_ns] = T_M_I, None if pose is None else pose.T_G_I
+        path_m = 0.0
+        if self._poses:
+            latest = next(reversed(self._poses.values()))
+            path_m = latest.path_m + float(np.linalg.norm(T_M_I[4:] - latest.T_M_I[4:]))
+        T_G_I = None if pose is None else pose.T_G_I
+        self._poses[time_ns] = _Remembered(T_M_I, T_G_I, path_m)
         if len(self._poses) > _HISTORY:
             self._poses.popitem(last=False)
 

@@ -75,7 +75,8 @@ class OnlineLocalizationOptions:
     )
     min_num_estimates: int = option(
         2,
-        help="Answers in a row that must agree before T_G_M is set, or set again",
+        help="Answers in a row that must agree before T_G_M is set, or set again; four times as many "
+        "where they differ by more than the odometry drifts",
         flag="rovioli_min_num_baseframe_estimates_before_init",
     )
     max_mean_error_px: float = option(

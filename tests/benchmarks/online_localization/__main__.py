@@ -1,9 +1,10 @@
-"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc|images|timings`.
+"""Localisation online: `python -m tests.benchmarks.online_localization simulated|euroc|tango|images|timings`.
 
 `simulated` rebuilds table 4.1 of the thesis: share of the map's landmarks, absolute error of VIL, SWL,
 pose and ODO (median and standard deviation), and NEES of T_G_I. `euroc` localises pieces of V1_01 in
-the others; `images` localises a flight in the map of another one, images end to end; `timings` rebuilds
-table 4.2. Without map tracking the matcher is the thesis'.
+the others, `tango` the second half of a walk in the first; `images` localises a flight in the map of
+another one, images end to end; `timings` rebuilds table 4.2. Without map tracking the matcher is the
+thesis'.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from tests.benchmarks.online_localization import euroc, images, timings
+from tests.benchmarks.online_localization import euroc, images, tango, timings
 from tests.benchmarks.online_localization.modes import MODES, compare_all, pose_errors
 from tests.benchmarks.online_localization.simulated import SHARES, Setting, searched, setting
 from tests.frontend.known_start import KnownStart
@@ -154,6 +155,21 @@ def real(arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def exploration(arguments: argparse.Namespace) -> list[Row]:
+    """Localise the second half of the Tango walk in the first; print errors and absences."""
+    rows: list[Row] = []
+    for variant in arguments.variants:
+        folder = shared_data_folder() / "maplab_maps" / "tango_handheld"
+        result = tango.measure(folder, VARIANTS[variant])
+        rows.append({"variant": variant, **dataclasses.asdict(result)})
+        for name, value in rows[-1].items():
+            parts = value if isinstance(value, list) else [value]
+            parts = list(value.items()) if isinstance(value, dict) else parts
+            for part in parts:
+                print(f"{name}: {part}", flush=True)
+    return rows
+
+
 def end_to_end(arguments: argparse.Namespace) -> list[Row]:
     """Localise a flight by its images, with one camera and with both; print errors and times."""
     rows: list[Row] = []
@@ -178,7 +194,7 @@ def _line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Run a study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("study", choices=("simulated", "euroc", "images", "timings"))
+    parser.add_argument("study", choices=("simulated", "euroc", "tango", "images", "timings"))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1, 11)))
     parser.add_argument("--shares", type=float, nargs="+", default=list(SHARES))
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=["none", "map"])
@@ -191,7 +207,9 @@ def main() -> None:
     if arguments.study == "timings":
         timings.main()
         return
-    studies = {"simulated": simulated, "euroc": real, "images": end_to_end}
+    studies = {
+        "simulated": simulated, "euroc": real, "tango": exploration, "images": end_to_end,
+    }  # fmt: skip
     rows = studies[arguments.study](arguments)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

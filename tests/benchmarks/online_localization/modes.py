@@ -41,6 +41,7 @@ class Comparison:
 
     results: dict[str, ModeResult]
     counts: LocalizationCounts
+    answered_ns: I64  # (A,) frames to which the map gave an answer
     frames: int
     estimated: int  # frames with an odometry
     cpu_ms: dict[str, F64]  # processor times of frames: window of odo and vil, matching, swl
@@ -121,6 +122,7 @@ class _Case:
         self._tight, self._localization, self._estimators = tight, localization, estimators
         self._rows: dict[str, list[tuple[int, F64, F64, F64]]] = {mode: [] for mode in MODES}
         self._spent: dict[str, list[float]] = {name: [] for name in ("vil window", "match", "swl")}
+        self._answered_ns: list[int] = []
 
     def push(
         self, event: Event, of_plain: list[OdometryUpdate], smoother: FixedLagSmoother | None
@@ -132,6 +134,7 @@ class _Case:
             began = time.process_time()
             frame = self._localization.after_frame(tight, self._tight.smoother)
             if frame.answer is not None:
+                self._answered_ns.append(tight.time_ns)
                 self._spent["match"].append(1e3 * (time.process_time() - began))
             if plain.state is None or smoother is None:
                 continue
@@ -146,7 +149,7 @@ class _Case:
         times = {name: np.array(values) for name, values in self._spent.items()}
         return Comparison(
             {mode: _result(values) for mode, values in self._rows.items()},
-            self._localization.counts, frames, estimated,
+            self._localization.counts, np.array(self._answered_ns, dtype=np.int64), frames, estimated,
             {"odo window": np.array(odo_ms), **times},
         )  # fmt: skip
 

@@ -19,6 +19,7 @@ from maplab_py.interop.recordings.stream import EventStream
 from tests.frontend.localization.places import place, searched
 
 P_G = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [6.0, -1.0, 1.0]])
+NEAR = se3.make([0.0, 0.0, 0.0, 1.0], [0.0, 0.4, 0.0])
 AWAY = se3.make([0.0, 0.0, 0.0, 1.0], [3.0, 0.0, 0.0])
 HERE = se3.identity()
 
@@ -36,8 +37,8 @@ def answer(time_ns: int, T_G_I: F64) -> Answer:
 
 def test_two_answers_that_agree_start() -> None:
     rule = AgreementFilter(2, 20.0)
-    assert rule.judge(answer(0, HERE), HERE, None, P_G) is Verdict.WAIT
-    assert rule.judge(answer(10**9, HERE), HERE, None, P_G) is Verdict.START
+    assert rule.judge(answer(0, HERE), HERE, None, P_G, path_m=0.0) is Verdict.WAIT
+    assert rule.judge(answer(10**9, HERE), HERE, None, P_G, path_m=0.0) is Verdict.START
     assert [a.time_ns for a in rule.take()] == [0, 10**9]
     assert rule.take() == []
 
@@ -45,26 +46,48 @@ def test_two_answers_that_agree_start() -> None:
 def test_answers_that_contradict_each_other_do_not() -> None:
     rule = AgreementFilter(2, 20.0)
     for time_ns, T_G_I in enumerate([HERE, AWAY, HERE, AWAY]):
-        assert rule.judge(answer(time_ns, T_G_I), HERE, None, P_G) is Verdict.WAIT
+        assert rule.judge(answer(time_ns, T_G_I), HERE, None, P_G, path_m=0.0) is Verdict.WAIT
     late = answer(60 * 10**9, AWAY)
-    assert rule.judge(late, HERE, None, P_G) is Verdict.WAIT  # agrees, but with something old
+    assert (
+        rule.judge(late, HERE, None, P_G, path_m=0.0) is Verdict.WAIT
+    )  # agrees, but with something old
 
 
 def test_a_single_contradiction_never_resets() -> None:
     rule = AgreementFilter(2, 20.0)
-    assert rule.judge(answer(0, HERE), HERE, HERE, P_G) is Verdict.USE
-    assert rule.judge(answer(1, AWAY), HERE, HERE, P_G) is Verdict.WAIT
-    assert rule.judge(answer(2, HERE), HERE, HERE, P_G) is Verdict.USE
-    assert rule.judge(answer(3, AWAY), HERE, HERE, P_G) is Verdict.WAIT
-    assert rule.judge(answer(4, AWAY), HERE, HERE, P_G) is Verdict.START
+    assert rule.judge(answer(0, HERE), HERE, HERE, P_G, path_m=0.0) is Verdict.USE
+    assert rule.judge(answer(1, NEAR), HERE, HERE, P_G, path_m=0.0) is Verdict.WAIT
+    assert rule.judge(answer(2, HERE), HERE, HERE, P_G, path_m=0.0) is Verdict.USE
+    assert rule.judge(answer(3, NEAR), HERE, HERE, P_G, path_m=0.0) is Verdict.WAIT
+    assert rule.judge(answer(4, NEAR), HERE, HERE, P_G, path_m=0.0) is Verdict.START
+
+
+def test_more_than_the_drift_is_believed_after_four_times_as_many_answers() -> None:
+    """A place that looks alike gives answers that agree with each other for a while."""
+    rule = AgreementFilter(2, 20.0)
+    assert rule.judge(answer(0, HERE), HERE, HERE, P_G, path_m=10.0) is Verdict.USE
+    for time_ns in range(1, 8):
+        assert rule.judge(answer(time_ns, AWAY), HERE, HERE, P_G, path_m=10.0) is Verdict.WAIT
+    assert rule.judge(answer(8, AWAY), HERE, HERE, P_G, path_m=10.0) is Verdict.START
+    assert len(rule.take()) == 8
+
+
+def test_the_longer_the_path_the_more_drift_is_believed() -> None:
+    rule = AgreementFilter(2, 20.0)
+    assert rule.judge(answer(0, HERE), HERE, HERE, P_G, path_m=10.0) is Verdict.USE
+    assert rule.judge(answer(1, AWAY), HERE, HERE, P_G, path_m=61.0) is Verdict.WAIT
+    assert rule.judge(answer(2, AWAY), HERE, HERE, P_G, path_m=61.0) is Verdict.START
+    rule.clear()
+    assert rule.judge(answer(3, AWAY), HERE, HERE, P_G, path_m=61.0) is Verdict.WAIT
+    assert rule.judge(answer(4, AWAY), HERE, HERE, P_G, path_m=61.0) is Verdict.START
 
 
 def test_matches_without_a_pose_are_used_but_start_nothing() -> None:
     rule = AgreementFilter(1, 20.0)
     few = dataclasses.replace(answer(0, HERE), T_G_I=None, covariance=None)
-    assert rule.judge(few, HERE, None, P_G) is Verdict.WAIT
-    assert rule.judge(few, HERE, HERE, P_G) is Verdict.USE
-    assert rule.judge(few, HERE, AWAY, P_G) is Verdict.WAIT
+    assert rule.judge(few, HERE, None, P_G, path_m=0.0) is Verdict.WAIT
+    assert rule.judge(few, HERE, HERE, P_G, path_m=0.0) is Verdict.USE
+    assert rule.judge(few, HERE, AWAY, P_G, path_m=0.0) is Verdict.WAIT
 
 
 @pytest.fixture(scope="module")
