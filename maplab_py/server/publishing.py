@@ -19,6 +19,21 @@ from maplab_py.storage.written_files import WrittenFiles
 from maplab_py.vimap import VIMap
 
 _BACKUPS = 5
+_SECONDS_UNPUBLISHED = (1.0, 20.0)
+_PUBLISHING_SHARE = 0.1
+
+
+def pause_s(duration_s: float) -> float:
+    """Return the time between publications [s] while submaps are ready to be merged.
+
+    Publications take a tenth of the time, within limits, so that the size of the map hardly slows the
+    server down.
+
+    Args:
+        duration_s: How long a publication takes.
+    """
+    shortest_s, longest_s = _SECONDS_UNPUBLISHED
+    return min(max(duration_s / _PUBLISHING_SHARE, shortest_s), longest_s)
 
 
 class Publisher:

@@ -40,7 +40,7 @@ from maplab_py.server.options import (
     ServiceOptions,
 )
 from maplab_py.server.preparation import Preparation
-from maplab_py.server.publishing import Publisher
+from maplab_py.server.publishing import Publisher, pause_s
 from maplab_py.server.recovery import recover
 from maplab_py.server.reports import DeletedMissions, ServeReport, ServerStatus
 from maplab_py.server.requests import answers
@@ -55,10 +55,6 @@ logger = logging.getLogger(__name__)
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_RETRIES = 5.0
-_SECONDS_UNPUBLISHED = (1.0, 20.0)
-_PUBLISHING_SHARE = 0.1
-"""While submaps are ready to be merged, the map is published so often that this takes a tenth of the time,
-within limits; else after each. So the size of the map hardly slows the server down."""
 
 
 class MapServer:
@@ -381,8 +377,7 @@ class MapServer:
         if vi_map is None or vi_map is self.published or time.monotonic() < self._retry_s:
             return False
         last_s = self.publisher.published_s
-        pause_s = np.clip(self.publisher.duration_s / _PUBLISHING_SHARE, *_SECONDS_UNPUBLISHED)
-        is_time = last_s is None or time.monotonic() - last_s >= pause_s
+        is_time = last_s is None or time.monotonic() - last_s >= pause_s(self.publisher.duration_s)
         return (force or is_time) and self._publish()
 
     def _publish(self) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MergingOptions, PublishingOptions
-from maplab_py.server.publishing import Publisher
+from maplab_py.server.publishing import Publisher, pause_s
 from maplab_py.simulation.scenario import (
     MeasurementOptions,
     Scenario,
@@ -44,11 +44,13 @@ class GrowthFigures:
     anchored: int
     steps_s: dict[str, float]
     merge_s: float
-    publish_s: float  # after each submap; while submaps are ready the server does it less often
+    publish_s: float  # after each submap
+    served_s: float  # per submap, with publications as often as while submaps are ready
     files: int
     files_written: float  # of a publication
     exponent_merge: float  # of merge_s against the first row
     exponent: float  # of both
+    exponent_served: float  # of served_s
     whole_s: float  # a publication that writes every file, once
 
 
@@ -114,6 +116,7 @@ def _figures(
     mean = {name: float(np.mean([s[name] for s in latest])) for name in latest[0]}
     publish_s, written = mean.pop("publish"), mean.pop("written")
     merge_s, missions = sum(mean.values()), len(vi_map.missions)
+    served_s = merge_s + publish_s / np.ceil(pause_s(publish_s) / merge_s)
     ratio = np.log(missions / first.missions) if first else 1.0
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     return GrowthFigures(
@@ -124,12 +127,14 @@ def _figures(
         {name: round(value, 3) for name, value in mean.items()},
         merge_s,
         publish_s,
+        served_s,
         files,
         written,
         float(np.log(merge_s / first.merge_s) / ratio) if first else 0.0,
         float(np.log((merge_s + publish_s) / (first.merge_s + first.publish_s)) / ratio)
         if first
         else 0.0,
+        float(np.log(served_s / first.served_s) / ratio) if first else 0.0,
         whole_publication_s(vi_map),
     )
 
