@@ -29,7 +29,11 @@ class WindowOptions:
         help="Which tracks are estimated: all with parallax, or as in the thesis terminated and "
         "long ones only, the best of them by score.",
     )
-    max_landmarks: int = option(200, help="Landmarks in the window; the longest tracks are taken.")
+    max_landmarks: int = option(
+        150,
+        help="Landmarks that the newest frame sees; the longest tracks are taken. Landmarks whose tracks "
+        "have ended stay beside them until the frame leaves in which they are anchored.",
+    )
     min_parallax_deg: float = option(
         0.7, unit="deg", help="Smallest angle between the rays of a landmark that is triangulated."
     )

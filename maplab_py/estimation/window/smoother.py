@@ -251,7 +251,9 @@ class FixedLagSmoother:
             is_candidate &= long | ~tracks.is_active
             num_best = options.thesis_landmarks_per_update
         candidates = np.flatnonzero(is_candidate)
-        candidates = candidates[np.argsort(-counts[candidates], kind="stable")]
+        # tracks that go on first: without them the newest frames hang on samples alone
+        order = np.lexsort((-counts[candidates], ~tracks.is_active[candidates]))
+        candidates = candidates[order]
         narrow = self._triangulator.add_landmarks(
             tracks, candidates, self._states.T_M_I,
             only_stereo=motion is not Motion.MOVING, num_best=num_best,
@@ -269,7 +271,7 @@ class FixedLagSmoother:
         if len(known) >= _MIN_KNOWN_DEPTHS:
             self._inverse_depth = float(np.median(tracks.h[known, 2]))
         if motion is Motion.TURNING and self._inverse_depth > 0.0:
-            room = max(options.max_landmarks - len(known), 0)
+            room = max(options.max_landmarks - tracks.num_active_landmarks, 0)
             tracks.expect(rows[:room], self._inverse_depth, options.expected_depth_share)
 
     # -- estimation -------------------------------------------------------------------------------

@@ -112,6 +112,11 @@ class Tracks:
         """Tell which tracks (T,) the newest frame observes."""
         return np.asarray(self.last_seen == self._clock)
 
+    @property
+    def num_active_landmarks(self) -> int:
+        """Number of landmarks that the newest frame observes."""
+        return int(np.count_nonzero(self.is_landmark & self.is_active))
+
     def num_frames(self) -> I64:
         """Return how many frames of the window observe each track (T,)."""
         seen = self.observations

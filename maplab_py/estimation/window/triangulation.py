@@ -44,7 +44,7 @@ class Triangulator:
             Rows of the candidates without enough parallax; none when there is no room for more landmarks.
         """
         options = self._options
-        room = options.max_landmarks - len(tracks.landmark_rows)
+        room = options.max_landmarks - tracks.num_active_landmarks
         if room <= 0 or not len(candidates):
             return candidates[:0]
         poses = CameraPoses.of(T_M_I, self._cameras.T_I_C)

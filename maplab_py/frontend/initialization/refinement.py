@@ -34,6 +34,7 @@ _GAUGE_SIGMA = 1e-4
 _WIDE_GATE_CHI2 = 30.0**2
 """Gate of the first round, in which positions are only as good as the closed form's."""
 _ITERATIONS = (15, 40)
+_MAX_LANDMARKS = 200
 _TOLERANCE = 1e-5
 _MIN_SHARE_IN_FRONT = 0.9
 _NEAR_SCALE_FACTOR = 2.0
@@ -126,7 +127,7 @@ class Refinement:
         self._kernels = window_kernels(models)
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
         self._inertial = residual_kernel("inertial", sources.inertial)
-        options = WindowOptions()
+        options = WindowOptions(max_landmarks=_MAX_LANDMARKS)
         self._standstill = Standstill(
             residual_kernel("relative_pose", sources.relative_pose), options.standstill
         )

@@ -83,8 +83,23 @@ def test_window_stays_within_its_size(noisy: SimulatedTracks) -> None:
             times.remove(time_ns)
         assert smoother.times_ns.tolist() == times
         assert len(times) <= 6
-        assert update.num_landmarks <= options.max_landmarks
+        assert smoother.tracks.num_active_landmarks <= options.max_landmarks
         assert np.all(smoother.tracks.observations.frame < len(times))
+
+
+def test_ended_tracks_leave_room_for_those_that_go_on(noisy: SimulatedTracks) -> None:
+    """Their landmarks stay in the window, but the newest frame has as many as it may see."""
+    options = WindowOptions(num_keyframes=12, max_landmarks=20)
+    smoother = FixedLagSmoother(noisy.cameras, noisy.T_I_C, noisy.imu, options)
+    smoother.start(noisy.frames[0], noisy.start_state(SIGMA))
+    active, ended = [], []
+    for frame in noisy.frames[1:]:
+        update = smoother.add(frame)
+        active.append(smoother.tracks.num_active_landmarks)
+        ended.append(update.num_landmarks - active[-1])
+    assert min(active[5:]) > 10
+    assert max(active) == 20
+    assert max(ended) > 20
 
 
 def test_landmarks_are_anchored_where_they_were_first_seen(noisy: SimulatedTracks) -> None:
