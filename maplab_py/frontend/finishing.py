@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import numpy as np
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
-from maplab_py.errors import Cancelled, MaplabError
+from maplab_py.errors import Cancelled, MaplabError, UserError
 from maplab_py.frontend.localization.record import summarised
 from maplab_py.frontend.localization.reports import LocalizationSummary
 from maplab_py.frontend.mapping import Mapping
@@ -44,8 +46,8 @@ def finish(
 ) -> FinishedRun:
     """Make the map of a run, save what is to be saved, and report.
 
-    A run that ended early is saved, too. What fails here is told in the report; the map stays in
-    memory, so that it can be saved elsewhere.
+    A run that ended early is saved, too. What fails here is told in the report; the map stays in memory,
+    and one that cannot be saved to its folder is saved in that for temporary files.
 
     Args:
         mapping: A run that has ended.
@@ -62,6 +64,7 @@ def finish(
     notes = [*mapping.statistics.notes, *_stream_notes(mapping), *_localization_notes(mapping)]
     vi_map: VIMap | None = None
     disk_copy: DiskCopy | None = None
+    saved_folder: Path | None = None
     try:
         if mapping.builder is not None:
             vi_map, _ = mapping.builder.finish(progress=progress)
@@ -83,8 +86,9 @@ def finish(
                 output.export_localized_poses_to_csv, overwrite=output.overwrite_existing_map
             )
         if vi_map is not None and output.save_map_folder is not None:
-            disk_copy = _saved(vi_map, output.save_map_folder, output)
-            vi_map = with_folder_names(vi_map, output.save_map_folder)  # as when it is loaded
+            saved_folder, disk_copy, problem = _saved(vi_map, output.save_map_folder, output)
+            vi_map = with_folder_names(vi_map, saved_folder)  # as when it is loaded
+            problems += [problem] if problem else []
     except Cancelled:
         raise
     except MaplabError as error:
@@ -92,7 +96,6 @@ def finish(
             raise
         problems.append(f"{error} (the map is in memory as '{map_key}': save it)")
     report = _report(mapping, recording_name, vi_map, notes, "; ".join(problems))
-    saved_folder = output.save_map_folder if disk_copy is not None else None
     report = dataclasses.replace(report, map_key=map_key, map_folder=saved_folder)
     return FinishedRun(report, vi_map, disk_copy)
 
@@ -134,9 +137,26 @@ class _UntilEnd:
             raise _EndRequested("ended")
 
 
-def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> DiskCopy:
-    saved = save_map(vi_map, folder, overwrite=output.overwrite_existing_map)
-    return DiskCopy(folder.resolve(), saved.fingerprint)
+def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> tuple[Path, DiskCopy, str]:
+    """Save a map; return where, its copy there, and the problem if it had to be somewhere else.
+
+    A program that only runs this command ends with it, and the map in memory, too. So a map that cannot be
+    saved where the user wants it (full disk) is saved in the folder for temporary files.
+
+    Raises:
+        UserError: It cannot be saved there, either.
+    """
+    try:
+        saved = save_map(vi_map, folder, overwrite=output.overwrite_existing_map)
+        return folder, DiskCopy(folder.resolve(), saved.fingerprint), ""
+    except UserError as error:
+        rescue = Path(tempfile.gettempdir()) / f"maplab-{uuid.uuid4().hex[:8]}" / folder.name
+        try:
+            saved = save_map(vi_map, rescue)
+        except UserError:
+            raise error from None
+        problem = f"{error}; the map is saved to {rescue} instead"
+        return rescue, DiskCopy(rescue.resolve(), saved.fingerprint), problem
 
 
 def _stream_notes(mapping: Mapping) -> list[str]:
@@ -145,6 +165,9 @@ def _stream_notes(mapping: Mapping) -> list[str]:
     if read.dropped_before_imu or mapping.odometry.counts.frames_before_imu:
         count = read.dropped_before_imu + mapping.odometry.counts.frames_before_imu
         notes.append(f"{counted(count, 'frame')} before the first IMU sample left out")
+    if mapping.odometry.waiting_frames and not mapping.is_ended_early:
+        count = mapping.odometry.waiting_frames
+        notes.append(f"{counted(count, 'frame')} after the last IMU sample left out")
     if any(read.unmatched_images):
         notes.append(
             f"{counted(sum(read.unmatched_images), 'image')} without a partner in the other cameras: "

@@ -248,6 +248,12 @@ class Mapping:
         if not self.statistics.frames:
             if self.stream.statistics.dropped_before_imu:
                 return f"{name}: all frames come before the first IMU sample: check the clocks"
+            if unmatched := sum(self.stream.statistics.unmatched_images):
+                return (
+                    f"{name}: none of {unmatched} images has a partner in the other cameras: check the "
+                    "trigger, raise --vio_nframe_sync_tolerance_ns, or read one camera "
+                    "(--rovio_active_camera_indices=0)"
+                )
             return f"{name}: there are no frames: choose another part or other cameras"
         reason = self.statistics.waiting_for or "the recording is too short"
         return f"{name}: the odometry has not started: {reason}"

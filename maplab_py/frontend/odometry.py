@@ -134,6 +134,11 @@ class Odometry:
         return self._push(frame_set)
 
     @property
+    def waiting_frames(self) -> int:
+        """Number of frames that wait for IMU samples."""
+        return len(self._waiting)
+
+    @property
     def smoother(self) -> FixedLagSmoother | None:
         """The estimator of the window; None while the odometry initialises."""
         return self._smoother

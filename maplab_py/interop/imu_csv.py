@@ -44,7 +44,10 @@ def read_imu_csv(path: Path) -> ImuRecording:
     late = np.flatnonzero(np.diff(table.times_ns) <= 0)
     if len(late):
         line = table.line_numbers[late[0] + 1]
-        raise MapError(f"{path}:{line}: the time stamp does not come after that of the row above")
+        raise MapError(
+            f"{path}:{line}: the time stamp does not come after that of the row above: sort the rows or "
+            "remove this one"
+        )
     return ImuRecording(table.times_ns, table.values[:, order])
 
 

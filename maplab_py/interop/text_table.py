@@ -60,7 +60,7 @@ def parse_text_table(text: str, source: str) -> TextTable:
     """Parse the text of a table; `source` is its name in error messages."""
     lines, numbers, header = _data_lines(text)
     if not lines:
-        raise MapError(f"{source}: there are no rows in the file")
+        raise MapError(f"{source}: there are no rows in the file: write or copy it again")
     has_commas = "," in lines[0]
     rows = [line.replace(",", " ").split() for line in lines]
     widths = np.array([len(row) for row in rows])
@@ -68,7 +68,8 @@ def parse_text_table(text: str, source: str) -> TextTable:
     if len(wrong):
         row = int(wrong[0])
         raise MapError(
-            f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}"
+            f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}: correct or "
+            "remove the row"
         )
     if widths[0] < 2:
         raise MapError(f"{source}:{numbers[0]}: a time stamp and values are expected")
@@ -175,5 +176,7 @@ def _parse_values(rows: list[list[str]], source: str, numbers: list[int]) -> F64
             except ValueError:
                 is_finite = False
             if not is_finite:
-                raise MapError(f"{source}:{number}: '{token}' is not a finite number")
+                raise MapError(
+                    f"{source}:{number}: '{token}' is not a finite number: correct or remove the row"
+                )
     return np.array(rows, dtype=np.float64)

@@ -151,6 +151,21 @@ def check_target(
         raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
 
 
+def check_parent(folder: Path) -> None:
+    """Check that a folder can be made or replaced: the nearest folder above it that exists is writable.
+
+    Raises:
+        UserError: It is not, or it is no folder.
+    """
+    above = folder.absolute().parent
+    while not os.path.lexists(above):
+        above = above.parent
+    if not above.is_dir():
+        raise UserError(f"{folder} cannot be saved: {above} is not a folder; choose another folder")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{folder} cannot be saved: {above} is not writable; choose another folder")
+
+
 def _write(
     vi_map: VIMap, folder: Path, compress: bool, taken: TakenOver | None, progress: Progress
 ) -> tuple[int, str]:

@@ -13,7 +13,7 @@ from maplab_py.storage import checksums, map_loading
 from maplab_py.storage.map_cache import MapCache
 from maplab_py.storage.map_files import is_map_folder
 from maplab_py.storage.map_loading import LoadReport
-from maplab_py.storage.map_saving import SaveReport, check_target, save_map
+from maplab_py.storage.map_saving import SaveReport, check_parent, check_target, save_map
 from maplab_py.vimap import VIMap
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "LoadReport",
     "MapCache",
     "SaveReport",
+    "check_parent",
     "check_target",
     "disk_copy",
     "find_maps",

@@ -79,13 +79,14 @@ def rovioli(
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping
     from maplab_py.server.recorded_submaps import SubmapWriter
-    from maplab_py.storage.native import check_target
+    from maplab_py.storage.native import check_parent, check_target
 
     run.check()
     output = run.output
     folder = output.save_map_folder
     if folder is not None:
         check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
+        check_parent(folder)
     for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
         if file is not None:
             check_writable(file, overwrite=output.overwrite_existing_map)
@@ -116,7 +117,7 @@ def rovioli(
         context.maps.add(
             key,
             finished.vi_map,
-            folder=folder if finished.disk_copy is not None else None,
+            folder=finished.report.map_folder,
             is_saved=finished.disk_copy is not None or is_at_server,
             disk_copy=finished.disk_copy,
         )

@@ -270,6 +270,22 @@ def test_gaps_saturation_and_early_frames_are_reported() -> None:
     assert any("1 IMU samples are saturated" in note for note in notes)
 
 
+def test_frames_after_the_last_sample_are_reported() -> None:
+    recording, start = recording_of(cameras=1)
+    frames_ns = [i.time_ns for i in recording.items_of if isinstance(i, TrackedFrameSet)]
+    items = tuple(
+        item
+        for item in recording.items_of
+        if not isinstance(item, ImuBatch) or item.times_ns[-1] <= frames_ns[-5]
+    )
+    mapping = Mapping(dataclasses.replace(recording, items_of=items), make_starter=start)
+    mapping.run()
+    notes = finish(mapping, recording.name).report.notes
+    left_out = len(frames_ns) - mapping.statistics.frames
+    assert left_out >= 4
+    assert f"{left_out} frames after the last IMU sample left out" in notes
+
+
 def test_without_map_builder_only_poses_are_estimated(tmp_path: Path) -> None:
     recording, start = recording_of(cameras=1)
     poses = tmp_path / "poses.csv"

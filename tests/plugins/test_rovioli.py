@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from maplab_py.cancellation import CancelToken, current_token, obeying
 from maplab_py.console.session.session import Session
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
+from maplab_py.frontend import finishing
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.reports import MappingReport
-from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.native import SaveReport, load_map, save_map
+from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from tests.frontend.simulated import REST_FIRST, replayed
 from tests.interop.recordings.written import make_content, write_folder
@@ -109,6 +112,9 @@ def test_an_existing_target_is_refused_before_any_work(walk: Path, tmp_path: Pat
         (tmp_path / "other" / "notes.txt").write_text("mine")
         with pytest.raises(UserError, match="not empty and not a map"):
             run(session, walk, save_map_folder=tmp_path / "other")
+        with pytest.raises(UserError, match=r"notes.txt is not a folder; choose another") as caught:
+            run(session, walk, save_map_folder=tmp_path / "other" / "notes.txt" / "new" / "map")
+        assert "\n" not in str(caught.value)
         report = run(session, walk, save_map_folder=target, overwrite_existing_map=True)
         assert len(load_map(target)[0].vertices) == report.vertices
 
@@ -132,6 +138,39 @@ def test_an_error_in_the_recording_is_reported_and_the_map_saved(
         assert report.failure.startswith("cam0/60.png: the image is truncated")
         assert len(session.vi_map.vertices) == report.vertices > 20
     assert len(load_map(tmp_path / "map")[0].vertices) == report.vertices
+
+
+def test_a_map_that_cannot_be_saved_where_it_should_is_saved_elsewhere(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, spare = tmp_path / "full" / "map", tmp_path / "spare"
+    spare.mkdir()
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(spare))
+
+    def on_a_full_disk(vi_map: VIMap, folder: Path, **options: bool) -> SaveReport:
+        if folder == target:
+            raise UserError(f"{folder}: cannot be saved (No space left on device)")
+        return save_map(vi_map, folder, **options)
+
+    monkeypatch.setattr(finishing, "save_map", on_a_full_disk)
+    with Session() as session:
+        report = run(session, walk, save_map_folder=target)
+        assert report.map_folder is not None
+        assert report.map_folder.is_relative_to(spare)
+        expected = f"{target}: cannot be saved (No space left on device); the map is saved to "
+        assert report.failure == f"{expected}{report.map_folder} instead"
+        assert len(load_map(report.map_folder)[0].vertices) == len(session.vi_map.vertices)
+        assert not target.exists()
+        # neither place has room
+        monkeypatch.setattr(finishing, "save_map", lambda *_, **__: refuse())
+        report = run(session, walk, save_map_folder=tmp_path / "other", map_key="second")
+        assert report.map_folder is None
+        assert report.failure == "no room (the map is in memory as 'second': save it)"
+        assert len(session.vi_map.vertices) == report.vertices
+
+
+def refuse() -> SaveReport:
+    raise UserError("no room")
 
 
 @pytest.mark.parametrize("is_saved", [False, True])
@@ -224,6 +263,20 @@ def test_a_recording_that_does_not_start_says_why(tmp_path: Path) -> None:
     folder = write_folder(make_content(), tmp_path / "images")
     with Session() as session, pytest.raises(EstimationError, match="has not started: "):
         run(session, folder)
+
+
+def test_cameras_that_are_not_triggered_together_are_named(tmp_path: Path) -> None:
+    folder = write_folder(make_content(), tmp_path / "images")
+    table = folder / "mav0" / "cam1" / "data.csv"
+    head, *rows = table.read_text().splitlines()
+    later = [f"{int(stamp) + 20_000_000},{name}" for stamp, name in (r.split(",") for r in rows)]
+    table.write_text("\n".join([head, *later]) + "\n")
+    with Session() as session:
+        with pytest.raises(EstimationError, match="has a partner in the other cameras") as caught:
+            run(session, folder)
+        assert "raise --vio_nframe_sync_tolerance_ns" in str(caught.value)
+        with pytest.raises(EstimationError, match="has not started"):
+            run(session, folder, rovio_active_camera_indices="1")
 
 
 def test_folders_without_calibration_or_imu(tmp_path: Path) -> None:

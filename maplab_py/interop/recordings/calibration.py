@@ -104,6 +104,10 @@ def _read_sensor_files(folder: Path) -> RecordedSensors:
     T_B_C = np.stack(poses)
     if not (folder / "imu0").is_dir():
         return make_device(cameras, T_B_C, None)
+    if not (folder / "imu0" / "sensor.yaml").exists():
+        raise MapError(
+            f"{folder}: there is no calibration of the IMU (imu0/sensor.yaml): {HOW_TO_CALIBRATE}"
+        )
     entry = read_entry(folder / "imu0" / "sensor.yaml")
     imu = dataclasses.replace(read_imu_noise(entry), description=entry.text("comment"))
     return make_device(cameras, se3.relative(entry.pose("T_BS"), T_B_C), imu)

@@ -153,7 +153,7 @@ def encoded_size(data: bytes, name: str) -> tuple[int, int]:
         return size
     if not data:
         raise MapError(f"{name}: the image is empty; {_REMEDY}")
-    raise MapError(f"{name}: it is neither a PNG nor a JPEG image")
+    raise MapError(f"{name}: it is neither a PNG nor a JPEG image; {_REMEDY}")
 
 
 def _check_png(data: bytes, name: str) -> None:
