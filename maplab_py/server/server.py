@@ -70,6 +70,7 @@ class MapServer:
         service: ServiceOptions | None = None,
         progress: Progress = SILENT,
         watch: Callable[[VIMap], None] | None = None,
+        shown_at: str = "",
     ) -> None:
         """Prepare; nothing is read or written yet.
 
@@ -81,6 +82,7 @@ class MapServer:
             service: Where the service listens, and what is kept.
             progress: Hears of every event; may cancel the server.
             watch: Gets every published map.
+            shown_at: Address of the page that shows it, for the log.
 
         Raises:
             UserError: The folder of the map is missing.
@@ -97,7 +99,7 @@ class MapServer:
         self.steps: list[dict[str, float]] = []
         self._merger = Merger(options, self.incremental)
         self._stationary = stationary or StationaryOptions()
-        self._progress, self._watch = progress, watch
+        self._progress, self._watch, self._shown_at = progress, watch, shown_at
         self._requests: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
         self._is_stopping = False
         self._problem, self._logged_problems = "", set[str]()
@@ -127,7 +129,8 @@ class MapServer:
                 file = self.spool.address
                 with Service(reads, writes, address=address, port=port, file=file) as service:
                     self._url = service.url
-                    self.events.add(f"serving {self.spool.root}: {service.url}")
+                    shown = f"; its map is shown at {self._shown_at}" if self._shown_at else ""
+                    self.events.add(f"serving {self.spool.root}: {service.url}{shown}")
                     self._serve(is_to_end)
             finally:
                 preparation.stop()

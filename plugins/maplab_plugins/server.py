@@ -73,6 +73,7 @@ def serve(
     from maplab_py.server.server import MapServer
     from maplab_py.server.spool import Spool
 
+    watch, shown_at = _shown(context) if serve_visualize_map else (None, "")
     map_server = MapServer(
         Spool(spool),
         server,
@@ -80,7 +81,8 @@ def serve(
         incremental=incremental,
         service=service,
         progress=context.progress,
-        watch=_shown(context) if serve_visualize_map else None,
+        watch=watch,
+        shown_at=shown_at,
     )
     with ending_early() as is_to_end:
         return map_server.run(is_to_end)
@@ -371,8 +373,8 @@ def tie_stationary_missions(
     return Message(f"{counted(len(missions), 'mission stands', 'missions stand')} still{names}")
 
 
-def _shown(context: CommandContext) -> Callable[[VIMap], None]:
-    """Return a function that shows a map in the session's viewer."""
+def _shown(context: CommandContext) -> tuple[Callable[[VIMap], None], str]:
+    """Return a function that shows a map in the session's viewer, and the address of its page."""
     from maplab_plugins.visualization.following import ViewerOptions, ensure_viewer
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.options import VisualizationOptions
@@ -384,7 +386,7 @@ def _shown(context: CommandContext) -> Callable[[VIMap], None]:
         if len(vi_map.vertices) and not viewer.is_stopped:
             viewer.follow(Subject(vi_map, "server", options))
 
-    return watch
+    return watch, viewer.url
 
 
 def _deleted(spool: Path, name: str, **parameters: str) -> DeletedMissions:

@@ -120,9 +120,11 @@ def test_the_watcher_sees_every_published_map(servers: Servers) -> None:
         incremental=servers.incremental,
         service=servers.service,
         watch=lambda vi_map: seen.append(len(vi_map.vertices)),
+        shown_at="http://localhost:8080",
     )
     servers.put("ant", 0)
     server.run()
+    assert "; its map is shown at http://localhost:8080\n" in servers.spool.log.read_text()
     assert seen[-1] == len(submaps("ant")[0].vertices)
 
 
