@@ -271,7 +271,8 @@ class FixedLagSmoother:
         if len(known) >= _MIN_KNOWN_DEPTHS:
             self._inverse_depth = float(np.median(tracks.h[known, 2]))
         if motion is Motion.TURNING and self._inverse_depth > 0.0:
-            room = max(options.max_landmarks - tracks.num_active_landmarks, 0)
+            # not beside many others: noise of tracks at rest looks like a turn
+            room = max(options.max_landmarks - len(known), 0)
             tracks.expect(rows[:room], self._inverse_depth, options.expected_depth_share)
 
     # -- estimation -------------------------------------------------------------------------------
