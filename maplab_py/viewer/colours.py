@@ -42,6 +42,7 @@ QUALITY = from_hex("#8a93a0", "#d2455a", "#3fa372")
 REFERENCE = from_hex("#8a93a0")[0]
 HIDDEN = from_hex("#c3c8d0")[0]
 TRUTH = from_hex("#c9a227")[0]
+MATCHED = from_hex("#e0559a")[0]
 PICKED = from_hex("#ffb000")[0]
 SECOND_PICK = from_hex("#ff5d8f")[0]
 AXES = from_hex("#d2455a", "#3fa372", "#4c8dd6")

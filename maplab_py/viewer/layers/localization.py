@@ -13,7 +13,7 @@ from maplab_py.viewer.scene import WHOLE_MAP, Layer
 from maplab_py.viewer.subsampling import spread_rows
 
 _MAX_LANDMARKS = 60_000
-_POINT_SIZE = 0.003
+_POINT_SIZE = 0.005
 """Of the landmarks, in units of the drawing."""
 
 
@@ -37,7 +37,7 @@ def localized_layers(drawing: Drawing, run: LocalizedRun) -> list[Layer]:
     path, rays = run.p_G_I + shift, run.rays_G + shift
     steps, matches = np.arange(max(len(path) - 1, 0)), np.arange(len(rays))
     line = make_segments(path[:-1], path[1:], colours.TRUTH, steps, 3.0)
-    lines = make_segments(rays[:, 0], rays[:, 1], colours.PICKED, matches, 1.0)
+    lines = make_segments(rays[:, 0], rays[:, 1], colours.MATCHED, matches, 1.0)
     return [
         Layer("map_landmarks", "Map", {WHOLE_MAP: points}, len(run.p_G), notes=notes),
         Layer("localized_path", "Path in the map", {WHOLE_MAP: line}, len(steps)),

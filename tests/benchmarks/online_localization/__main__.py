@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
 from tests.benchmarks.online_localization import euroc, images, tango, timings
 from tests.benchmarks.online_localization.modes import MODES, compare_all, pose_errors
@@ -148,6 +150,9 @@ def real(arguments: argparse.Namespace) -> list[Row]:
             shared / "maplab_maps" / "euroc_v1_01",
             shared / "euroc_imu" / "V101.gt.csv",
             VARIANTS[variant],
+            odometry_options=OdometryOptions(
+                window=WindowOptions(num_keyframes=arguments.keyframes)
+            ),
         )
         for mode, error in errors.items():
             rows.append({"variant": variant, "mode": mode, **dataclasses.asdict(error)})
@@ -200,6 +205,9 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=["none", "map"])
     parser.add_argument("--seconds", type=float, default=30.0, help="of a flight")
     parser.add_argument("--landmarks", type=int, default=12_000, help="of the room")
+    parser.add_argument(
+        "--keyframes", type=int, default=0, help="of the window (euroc); 0 = default"
+    )
     parser.add_argument("--folder", type=Path, help="with a file per seed; seeds in it are not run")
     parser.add_argument("--images", type=Path, help="folder with the rendered flights; else MH_01")
     parser.add_argument("--json", type=Path)

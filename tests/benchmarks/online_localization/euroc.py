@@ -17,6 +17,7 @@ from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localiza
 from maplab_py.array_types import F64
 from maplab_py.frontend.localization.map_source import SearchedMap, of_map
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
@@ -86,6 +87,7 @@ def measure(
     truth_file: Path,
     options: OnlineLocalizationOptions,
     queries: tuple[tuple[int, ...], ...] = ((3, 6), (2, 5)),
+    odometry_options: OdometryOptions | None = None,
 ) -> tuple[dict[str, RealErrors], list[Comparison]]:
     """Localise each piece in a map without it and its companion; return errors by mode."""
     truth = read_trajectory(truth_file)
@@ -101,7 +103,7 @@ def measure(
             query, _ = load_map(folder / f"euroc_v1_01_submap_{number}")
             result = compare(
                 MapRecording(query, 0), searched, options,
-                make_starter=scrambled_start(query, number),
+                make_starter=scrambled_start(query, number), odometry_options=odometry_options,
             )  # fmt: skip
             comparisons.append(result)
             frames += result.frames

@@ -41,7 +41,7 @@ class Comparison:
 
     results: dict[str, ModeResult]
     counts: LocalizationCounts
-    answered_ns: I64  # (A,) frames to which the map gave an answer
+    answered_ns: I64  # (A,) frames with an answer of the map that was used
     frames: int
     estimated: int  # frames with an odometry
     cpu_ms: dict[str, F64]  # processor times of frames: window of odo and vil, matching, swl
@@ -134,7 +134,8 @@ class _Case:
             began = time.process_time()
             frame = self._localization.after_frame(tight, self._tight.smoother)
             if frame.answer is not None:
-                self._answered_ns.append(tight.time_ns)
+                if self._localization.events:
+                    self._answered_ns.append(tight.time_ns)
                 self._spent["match"].append(1e3 * (time.process_time() - began))
             if plain.state is None or smoother is None:
                 continue
