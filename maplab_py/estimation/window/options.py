@@ -30,7 +30,7 @@ class WindowOptions:
         "long ones only, the best of them by score.",
     )
     max_landmarks: int = option(
-        150,
+        300,
         help="Landmarks that the newest frame sees; the longest tracks are taken. Landmarks whose tracks "
         "have ended stay beside them until the frame leaves in which they are anchored.",
     )

@@ -42,6 +42,8 @@ from maplab_py.sensors import Camera, Imu
 
 _MIN_KNOWN_DEPTHS = 10
 """Landmarks of which the median depth is taken."""
+_ENOUGH_LANDMARKS = 150
+"""Landmarks of the window beside which none is expected: noise of tracks at rest looks like a turn."""
 
 
 class FixedLagSmoother:
@@ -271,8 +273,7 @@ class FixedLagSmoother:
         if len(known) >= _MIN_KNOWN_DEPTHS:
             self._inverse_depth = float(np.median(tracks.h[known, 2]))
         if motion is Motion.TURNING and self._inverse_depth > 0.0:
-            # not beside many others: noise of tracks at rest looks like a turn
-            room = max(options.max_landmarks - len(known), 0)
+            room = max(_ENOUGH_LANDMARKS - len(known), 0)
             tracks.expect(rows[:room], self._inverse_depth, options.expected_depth_share)
 
     # -- estimation -------------------------------------------------------------------------------
