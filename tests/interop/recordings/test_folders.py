@@ -36,6 +36,7 @@ from tests.interop.recordings.written import (
 )
 from tests.simulation.small import PERFECT
 from tests.support.data import shared_data
+from tests.support.own_process import in_own_process
 
 
 @pytest.fixture
@@ -340,6 +341,21 @@ def test_real_irregular_keyframes_without_imu() -> None:
     assert report.notes == ("there is no IMU",)
 
 
+def _counts_and_memory(folder: Path) -> tuple[int, int, int, int]:
+    """Read a folder to its end, every 100th image too.
+
+    Returns:
+        Frame sets and IMU samples, memory in use at the end and its peak [bytes].
+    """
+    stream = EventStream(open_recording(folder))
+    tracemalloc.start()
+    for event in stream:
+        if isinstance(event, FrameSet) and stream.statistics.frame_sets.count % 100 == 0:
+            assert event.images[1].grey().shape == (480, 752)
+    now, peak = tracemalloc.get_traced_memory()
+    return stream.statistics.frame_sets.count, stream.statistics.imu.count, now, peak
+
+
 @pytest.mark.slow
 def test_ten_minutes_of_stereo_are_never_held_at_once(tmp_path: Path) -> None:
     frames, content = 12_000, make_content(frames=1)
@@ -359,15 +375,7 @@ def test_ten_minutes_of_stereo_are_never_held_at_once(tmp_path: Path) -> None:
         (home / "data.csv").write_text(rows)
         for row in range(50):
             (home / "data" / f"a{row}.png").symlink_to(tmp_path / "big.png")
-    stream = EventStream(open_recording(folder))
-    tracemalloc.start()
-    try:
-        for event in stream:
-            if isinstance(event, FrameSet) and stream.statistics.frame_sets.count % 100 == 0:
-                assert event.images[1].grey().shape == (480, 752)
-        now, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert (stream.statistics.frame_sets.count, stream.statistics.imu.count) == (frames, 120_000)
+    sets, samples, now, peak = in_own_process(_counts_and_memory, folder)
+    assert (sets, samples) == (frames, 120_000)
     assert peak < size / 30, peak  # while the table of the IMU is read
     assert now < 30e6, now
