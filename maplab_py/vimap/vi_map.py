@@ -182,8 +182,9 @@ class VIMap:
 
     @cached_property
     def p_G(self) -> NDArray[np.float64]:
-        """Position of every landmark in G (L, 3)."""
-        return se3.transform(self.T_G_I[self.landmarks.vertex], self.landmarks.p_I)
+        """Position of every landmark in G (L, 3); not finite where p_I is not."""
+        with np.errstate(invalid="ignore"):  # infinite positions: the sums are not numbers
+            return se3.transform(self.T_G_I[self.landmarks.vertex], self.landmarks.p_I)
 
     # -- ids ------------------------------------------------------------------------------------
 
