@@ -47,8 +47,11 @@ class RayCaster:
         """
         seen = np.isfinite(rays[..., 0])
         x, y = (np.where(seen, rays[..., axis], 0.0).astype(np.float32) for axis in (0, 1))
-        cones = _cones(np.stack([x, y, np.ones_like(x)], axis=2), seen)
-        return cls(painted, PixelRays(x, y, seen.astype(np.float32), cones, np.float32(focal_px)))
+        directions = np.stack([x, y, np.ones_like(x)], axis=2)
+        row_cones = _cones(directions, seen, max(1, x.shape[1]))[:, 0]
+        cones = _cones(directions, seen, TILE)
+        is_seen = seen.astype(np.float32)
+        return cls(painted, PixelRays(x, y, is_seen, row_cones, cones, np.float32(focal_px)))
 
     def render(self, T_G_C: F64) -> tuple[F32, F32]:
         """Return grey values (H, W) in 0 .. 255 and depths along z (H, W) [m]; 0 without a ray.
@@ -67,16 +70,24 @@ class RayCaster:
         cast_rays(self.painted, self.rays, R_G_C, p_G_C, np.float32(weight), grey, depth)
 
 
-def _cones(rays: F32, seen: Mask) -> F32:
-    """Return cones (H, tiles, 5) about rays (H, W, 3): axis, cosine and sine of the half angle."""
+def _cones(rays: F32, seen: Mask, tile: int) -> F32:
+    """Return cones (H, tiles, 5) about rays (H, W, 3): axis, cosine and sine of the half angle.
+
+    Args:
+        rays: Rays of any length.
+        seen: Which of them (H, W) exist; a tile without any gets a cone without an axis.
+        tile: Rays of a row that share a cone.
+    """
     height, width = seen.shape
-    direction = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-    cones = np.empty((height, -(-width // TILE), 5), dtype=np.float32)
-    for tile, first in enumerate(range(0, width, TILE)):
-        part, there = direction[:, first : first + TILE], seen[:, first : first + TILE]
+    # in double precision: the sine of a narrow cone is lost in single precision
+    direction = rays.astype(np.float64)
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    cones = np.empty((height, -(-width // tile), 5), dtype=np.float32)
+    for number, first in enumerate(range(0, width, tile)):
+        part, there = direction[:, first : first + tile], seen[:, first : first + tile]
         axis = np.sum(part * there[..., None], axis=1)
         axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-6)
         cosine = np.where(there, np.einsum("hwi,hi->hw", part, axis), 1.0).min(axis=1)
-        cones[:, tile, :3], cones[:, tile, 3] = axis, cosine
-        cones[:, tile, 4] = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+        cones[:, number, :3], cones[:, number, 3] = axis, cosine
+        cones[:, number, 4] = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
     return cones

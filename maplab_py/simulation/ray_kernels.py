@@ -1,7 +1,9 @@
 """Compiled ray caster: where the rays of an image meet boxes, and what grey value is painted there.
 
 A row of an image is cast in tiles; each step is a loop over the pixels of a tile, see
-`shading_kernels`. Boxes that no ray of a tile can meet are left out.
+`shading_kernels`. A tile tests its rays only against boxes that its cone of rays can meet, and only
+those boxes are candidates for a tile that the cone of the whole row can meet. The cones are slightly
+too wide, so that no rounding excludes a box that a ray meets: the image is that of all boxes.
 
 Source: the slab test is that of Kay and Kajiya (1986).
 """
@@ -34,6 +36,8 @@ from maplab_py.simulation.shading_kernels import (
 
 _TINY = np.float32(1e-9)
 _ROUNDING = np.float32(1e-5)
+_WIDENED = np.float32(1.001)
+"""Factor on the radii of spheres round boxes; covers the rounding of a camera that nearly touches one."""
 
 
 class PixelRays(NamedTuple):
@@ -42,7 +46,8 @@ class PixelRays(NamedTuple):
     x: F32  # (H, W) on the plane z = 1
     y: F32  # (H, W)
     seen: F32  # (H, W) 1 where there is a ray, else 0
-    cones: F32  # (H, tiles, 5) about the rays of a tile: axis, cosine and sine of the half angle
+    row_cones: F32  # (H, 5) about the rays of a row: axis, cosine and sine of the half angle
+    cones: F32  # (H, tiles, 5) about those of a tile
     focal_px: np.float32
 
 
@@ -62,19 +67,21 @@ def cast_rays(scene, rays, R_G_C, p_G_C, weight, grey, depth):  # type: ignore[n
     height, width = rays.x.shape
     real, whole = np.empty(14 * TILE, np.float32), np.empty(5 * TILE, np.int32)
     spheres = np.empty((len(scene.boxes), 5), np.float32)
+    every = np.arange(1, len(scene.boxes))
+    in_row, in_tile = np.empty_like(every), np.empty_like(every)
     for row in range(height):
         pose = row if len(R_G_C) > 1 else 0
         R, eye = R_G_C[pose], p_G_C[pose]
         if pose == row:
             _aim(scene.boxes, R, eye, spheres)
+        boxes_in_row = _select(rays.row_cones[row], spheres, every, len(every), in_row)
         for first in range(0, width, TILE):
             count = min(TILE, width - first)
             cone = rays.cones[row, first // TILE]
+            boxes_in_tile = _select(cone, spheres, in_row, boxes_in_row, in_tile)
             _turn(rays.x[row, first : first + count], rays.y[row, first : first + count], R, real)
             _leave_space(scene.boxes[0], eye, count, real, whole)
-            for box in range(1, len(scene.boxes)):
-                if _is_apart(cone, spheres[box]):
-                    continue
+            for box in in_tile[:boxes_in_tile]:
                 _enter_box(scene.boxes[box], np.int32(6 * box), eye, count, real, whole)
             shade(scene, rays.focal_px, eye, count, real, whole)
             for j in range(count):
@@ -94,7 +101,7 @@ def _aim(boxes, R, eye, spheres):  # type: ignore[no-untyped-def]
         gy = HALF * (boxes[box, 0, 1] + boxes[box, 1, 1]) - eye[1]
         gz = HALF * (boxes[box, 0, 2] + boxes[box, 1, 2]) - eye[2]
         side_x, side_y, side_z = boxes[box, 1] - boxes[box, 0]
-        radius = HALF * np.sqrt(side_x * side_x + side_y * side_y + side_z * side_z)
+        radius = _WIDENED * HALF * np.sqrt(side_x * side_x + side_y * side_y + side_z * side_z)
         distance = np.sqrt(gx * gx + gy * gy + gz * gz)
         if distance <= radius:
             spheres[box, :3], spheres[box, 3], spheres[box, 4] = ZERO, -UNITY, ZERO
@@ -106,12 +113,28 @@ def _aim(boxes, R, eye, spheres):  # type: ignore[no-untyped-def]
         spheres[box, 3], spheres[box, 4] = np.sqrt(UNITY - sine * sine), sine
 
 
-@compiled(forceinline=True, **FAST)
-def _is_apart(cone, sphere):  # type: ignore[no-untyped-def]
-    """Tell whether no ray of a tile can meet a sphere; both as cones with equal apex."""
-    cosine = cone[0] * sphere[0] + cone[1] * sphere[1] + cone[2] * sphere[2]
-    # cosine of the sum of both half angles, less what rounding may amount to
-    return cosine < cone[3] * sphere[3] - cone[4] * sphere[4] - _ROUNDING
+@compiled(**FAST)
+def _select(cone, spheres, candidates, count, selected):  # type: ignore[no-untyped-def]
+    """Fill in which of the first `count` candidates a cone of rays can meet, in their order.
+
+    A cone and a sphere, both as cones with equal apex, are apart if the angle between their axes is
+    larger than the sum of their half angles, and that sum is below pi (its sine is positive).
+
+    Returns:
+        The number of the selected boxes.
+    """
+    axis_x, axis_y, axis_z, cosine, sine = cone[0], cone[1], cone[2], cone[3], cone[4]
+    number = 0
+    for i in range(count):
+        box = candidates[i]
+        sphere_cosine, sphere_sine = spheres[box, 3], spheres[box, 4]
+        between = axis_x * spheres[box, 0] + axis_y * spheres[box, 1] + axis_z * spheres[box, 2]
+        sum_cosine = cosine * sphere_cosine - sine * sphere_sine
+        sum_sine = sine * sphere_cosine + cosine * sphere_sine
+        is_apart = (between < sum_cosine - _ROUNDING) & (sum_sine > ZERO)
+        selected[number] = box
+        number += not is_apart
+    return number
 
 
 @compiled(**FAST)

@@ -52,8 +52,10 @@ class Figures:
         return self.numpy_ms / self.fastest_cast_ms
 
 
-def measure(name: str = "stereo_room", images: int = 20, boxes: int = 0) -> Figures:
-    """Render images of a scenario, with some more boxes in its room."""
+def measure(
+    name: str = "stereo_room", images: int = 20, boxes: int = 0, compared: int = COMPARED
+) -> Figures:
+    """Render images of a scenario, with some more boxes in its room, and `compared` of them slowly."""
     scenario = load_scenario(name)
     short = dataclasses.replace(scenario.sessions[0], phases=(), duration_s=images / 10.0)
     scenario = dataclasses.replace(
@@ -69,10 +71,10 @@ def measure(name: str = "stereo_room", images: int = 20, boxes: int = 0) -> Figu
     added = np.stack([middle - half, middle + half], axis=1)
     every = np.concatenate([data.world.boxes, added])
     scene = make_scene(data.world.bounds, every, scenario.images, rng)
-    return _measured(scenario, data.recordings[0], scene)
+    return _measured(scenario, data.recordings[0], scene, compared)
 
 
-def _measured(scenario: Scenario, session: RecordedSession, scene: Scene) -> Figures:
+def _measured(scenario: Scenario, session: RecordedSession, scene: Scene, compared: int) -> Figures:
     camera = session.device.true_rig.cameras[0]
     rays, focal_px = pixel_rays(camera), float(np.mean(camera.intrinsics[-4:-2]))
     caster = RayCaster.of(painted_boxes(scene), rays, focal_px)
@@ -81,9 +83,10 @@ def _measured(scenario: Scenario, session: RecordedSession, scene: Scene) -> Fig
     caster.render(poses[0])
     fast_s = [_cpu_s(lambda pose=pose: caster.render(pose)) for pose in poses]  # type: ignore[misc]
     slow_s, difference = [], 0.0
-    for pose in poses[:: max(1, len(poses) // COMPARED)]:
-        slow_s.append(_cpu_s(lambda pose=pose: render_slowly(scene, rays, focal_px, pose)))  # type: ignore[misc]
+    for pose in poses[:: max(1, len(poses) // compared)][:compared]:
+        begin = time.process_time()
         expected, _ = render_slowly(scene, rays, focal_px, pose)
+        slow_s.append(time.process_time() - begin)
         difference = max(difference, float(np.abs(caster.render(pose)[0] - expected).max()))
     return Figures(
         len(scene.boxes) - 1,

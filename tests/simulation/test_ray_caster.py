@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
 import numpy as np
@@ -68,6 +69,46 @@ def test_grey_values_and_depth_are_those_of_the_plain_ray_caster(
     grey, depth = _compare(_scene(boxes), _camera(), T_G_C)
     assert grey.std() > 20.0
     assert depth.min() > 0.0
+
+
+def _without_selection(caster: RayCaster) -> RayCaster:
+    """Return a ray caster that tests every ray against every box: its cones contain all directions."""
+    whole = np.array([0.0, 0.0, 0.0, -1.0, 0.0], dtype=np.float32)
+    rays = caster.rays
+    row_cones, cones = np.empty_like(rays.row_cones), np.empty_like(rays.cones)
+    row_cones[:], cones[:] = whole, whole
+    return dataclasses.replace(caster, rays=rays._replace(row_cones=row_cones, cones=cones))
+
+
+def _poses_near_boxes(scene: Scene, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return poses (count, 7) in the room, a third of them on the spheres round boxes, one in a box."""
+    places = rng.uniform(ROOM[0], ROOM[1], (count, 3))
+    boxes = scene.boxes[1 : 1 + count // 3]
+    half = 0.5 * (boxes[:, 1] - boxes[:, 0])
+    away = rng.standard_normal((len(boxes), 3))
+    away *= np.linalg.norm(half, axis=1, keepdims=True) / np.linalg.norm(away, axis=1)[:, None]
+    places[: len(boxes)] = boxes.mean(axis=1) + away
+    places[-1] = scene.boxes[1].mean(axis=0)
+    return np.concatenate([_pose(*rng.uniform(-3.2, 3.2, 3), *place) for place in places])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_selection_of_boxes_changes_no_bit(seed: int) -> None:
+    scene, rng = _scene(150, seed), np.random.default_rng(seed)
+    height, width = 48, 300
+    x, y = np.meshgrid(np.linspace(-5.0, 5.0, width), np.linspace(-3.0, 3.0, height))
+    wide = np.stack([x, y], axis=2)
+    one_sided = np.abs(wide) * [1.0, -1.0]
+    one_sided[10:20, :200] = np.nan
+    narrow = 0.04 * wide[:, :129]  # the last tile has one ray
+    poses = _poses_near_boxes(scene, 12, rng)
+    rolling = _poses_near_boxes(scene, height, rng)
+    for rays in (wide, one_sided, narrow):
+        caster = RayCaster.of(painted_boxes(scene), rays, 40.0)
+        exhaustive = _without_selection(caster)
+        for T_G_C in (*poses[:, None], rolling):
+            images, expected = caster.render(T_G_C), exhaustive.render(T_G_C)
+            np.testing.assert_array_equal(np.array(images), np.array(expected))
 
 
 def test_rays_along_the_axes_and_borders_of_surfaces() -> None:
