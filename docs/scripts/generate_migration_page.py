@@ -3,7 +3,7 @@
 python docs/scripts/generate_migration_page.py
 
 Both pages are checked against the registry: a command or a flag of maplab that is neither there nor
-explained in the tables beside this file is an error.
+explained in a table (commands: beside this file, flags: in the package, which tells users) is an error.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_py.console.commands.flags import COMMON_FLAGS
+from maplab_py.console.commands.maplab_flags import TABLE, Fate, former_flags
 from maplab_py.console.commands.registry import Registry, load_registry
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -18,8 +19,6 @@ PAGE = DOCS / "migration.md"
 FLAGS_PAGE = DOCS / "migration_flags.md"
 COMMANDS = Path(__file__).with_name("maplab_commands.tsv")
 FLAG_NAMES = Path(__file__).with_name("maplab_flag_names.tsv")
-ELSEWHERE = Path(__file__).with_name("maplab_flags_elsewhere.tsv")
-RENAMED, DROPPED = "renamed", "dropped"
 _HEAD = Path(__file__).with_name("migration_head.txt")
 _FLAGS_HEAD = Path(__file__).with_name("migration_flags_head.txt")
 _SHOWN_COMMANDS = 3
@@ -89,17 +88,13 @@ def _explained(registry: Registry) -> dict[str, tuple[str, str]]:
     """Return fate and text of the flags that have no namesake here."""
     known = {name for _, name in flag_names()}
     fates: dict[str, tuple[str, str]] = {}
-    for line in ELSEWHERE.read_text(encoding="utf-8").splitlines():
-        names, fate, text = line.split("\t")
-        if fate == RENAMED:
-            new_name, _, note = text.partition(": ")
-            if not registry.flags_named(new_name.removeprefix("--")):
-                raise ValueError(f"{ELSEWHERE.name}: no command has the flag {new_name}")
-            text = f"`{new_name}`{': ' if note else ''}{note}"
-        for name in names.split(", "):
-            if name in fates or name not in known or fate not in (RENAMED, DROPPED) or not text:
-                raise ValueError(f"{ELSEWHERE.name}: the line of '{name}' is wrong")
-            fates[name] = fate, text
+    for name, flag in former_flags().items():
+        if name not in known:
+            raise ValueError(f"{TABLE}: the line of '{name}' is wrong: maplab has no such flag")
+        if flag.fate is Fate.RENAMED and not registry.flags_named(flag.new_name):
+            raise ValueError(f"{TABLE}: no command has the flag --{flag.new_name}")
+        new_name = f"`--{flag.new_name}`" if flag.new_name else ""
+        fates[name] = flag.fate.value, ": ".join(filter(None, (new_name, flag.note)))
     return fates
 
 
@@ -107,7 +102,7 @@ def _fate(name: str, elsewhere: dict[str, tuple[str, str]], registry: Registry) 
     commands = [command for command, _ in registry.flags_named(name)]
     if (bool(commands) or name in COMMON_FLAGS) == (name in elsewhere):
         reason = "has a namesake here and a line" if name in elsewhere else "has neither"
-        raise ValueError(f"{ELSEWHERE.name}: flag '{name}' {reason}")
+        raise ValueError(f"{TABLE}: flag '{name}' {reason}")
     if name in elsewhere:
         return elsewhere[name]
     if name in COMMON_FLAGS:

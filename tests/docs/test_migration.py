@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from maplab_py.console.commands.flags import COMMON_FLAGS
+from maplab_py.console.commands.maplab_flags import Fate, FormerFlag, former_flags
 from maplab_py.console.commands.registry import Registry, load_registry
 from tests.docs.test_pages import script_module
 
@@ -83,22 +84,24 @@ def test_a_command_that_the_registry_loses_is_noticed(
 
 
 def test_a_flag_with_a_namesake_needs_no_reason(
-    migration: ModuleType, registry: Registry, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+    migration: ModuleType, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    table = tmp_path / "maplab_flags_elsewhere.tsv"
-    table.write_text(migration.ELSEWHERE.read_text() + "ba_loss\tdropped\tnot needed\n")
-    monkeypatch.setattr(migration, "ELSEWHERE", table)
-    with pytest.raises(ValueError, match="the line of 'ba_loss' is wrong"):
-        migration.flags_page(registry)
-    table.write_text(table.read_text().replace("ba_loss", "ba_fix_velocity"))
-    with pytest.raises(ValueError, match="'ba_fix_velocity' has a namesake here and a line"):
-        migration.flags_page(registry)
+    line = FormerFlag(Fate.DROPPED, "", "not needed")
+    for name, message in (
+        ("ba_loss", "the line of 'ba_loss' is wrong"),
+        ("ba_fix_velocity", "'ba_fix_velocity' has a namesake here and a line"),
+    ):
+        table = {**former_flags(), name: line}
+        monkeypatch.setattr(migration, "former_flags", lambda table=table: table)
+        with pytest.raises(ValueError, match=message):
+            migration.flags_page(registry)
 
 
 def test_reasons_name_commands_and_flags_that_exist(
     migration: ModuleType, registry: Registry
 ) -> None:
-    texts = [line.split("\t")[2] for line in migration.ELSEWHERE.read_text().splitlines()]
+    texts = [flag.note for flag in former_flags().values()]
+    texts += [f"`--{flag.new_name}`" for flag in former_flags().values() if flag.new_name]
     texts += [note for _, note in migration.command_table()]
     spans = [
         words

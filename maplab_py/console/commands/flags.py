@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from maplab_py.console.commands.flag_types import BOOL, FlagType, format_value
+from maplab_py.console.commands.maplab_flags import explanation
 from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.errors import FlagError
 
@@ -151,7 +152,7 @@ def resolve_name(typed: str, flags: Mapping[str, Flag], owner: str) -> tuple[str
         positive = name.removeprefix(prefix)
         if positive != name and positive in flags and flags[positive].type.is_bool:
             return positive, "false"
-    proposal = did_you_mean(name, [*flags, *COMMON_FLAGS], "--")
+    proposal = explanation(name) or did_you_mean(name, [*flags, *COMMON_FLAGS], "--")
     if not owner:
         raise FlagError(f"no command has a flag --{name}{proposal}")
     raise FlagError(f"{owner} has no flag --{name}{proposal or f' (see: help {owner})'}")

@@ -11,6 +11,7 @@ from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.flagfile import read_flagfile
 from maplab_py.console.commands.flags import Given, normalise, parse_words
+from maplab_py.console.commands.maplab_flags import explanation
 from maplab_py.console.commands.registry import Registry
 from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.console.session.settings import Settings
@@ -98,7 +99,8 @@ def call_from_keywords(
             continue
         if name not in command.flags:
             known = [*command.flags, *command.defaults]
-            raise FlagError(f"{command.name} has no flag --{name}{did_you_mean(name, known, '--')}")
+            proposal = explanation(name) or did_you_mean(name, known, "--")
+            raise FlagError(f"{command.name} has no flag --{name}{proposal}")
         values[name] = command.flags[name].convert(value)
     placed, rest = _place(list(words), command, {})
     values.update({name: command.flags[name].convert(text) for name, text in placed.items()})
