@@ -80,7 +80,7 @@ def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:
             stdout=reports,
             stderr=log,
             cwd=order.folder,
-            env=_environment(order),
+            env=thread_environment(_threads(order)),
             start_new_session=True,
         )
         try:
@@ -113,11 +113,15 @@ def _watched(
             return ChildEnd(child.wait(), peak / 1e9, is_over, not is_over)
 
 
-def _environment(order: Order) -> dict[str, str]:
-    threads = str(order.threads or max(1, _processors() // max(1, order.tasks_per_host)))
+def _threads(order: Order) -> int:
+    return order.threads or max(1, _processors() // max(1, order.tasks_per_host))
+
+
+def thread_environment(threads: int) -> dict[str, str]:
+    """Return the environment of a child that may use some threads and ends with this process."""
     return {
         **os.environ,
-        **dict.fromkeys(_THREAD_VARIABLES, threads),
+        **dict.fromkeys(_THREAD_VARIABLES, str(threads)),
         PARENT_VARIABLE: str(os.getpid()),
         "PYTHONUNBUFFERED": "1",
     }

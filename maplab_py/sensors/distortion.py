@@ -24,6 +24,8 @@ _SMALL_FOV_RAD = 1e-4
 _MAX_ITERATIONS = 50
 _CONVERGED = 1e-12
 """Largest change of an undistorted point in the last Newton step."""
+_BLOCK = 4096
+"""Points that are undistorted together."""
 
 
 def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
@@ -197,34 +199,69 @@ def _undistort_equidistant(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
 
 
 def _undistort_radtan(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
-    """Newton's method on the plane, kept inside the radius where the model grows."""
+    """Newton's method on the plane, kept inside the radius where the model grows.
+
+    Points are taken in blocks that fit into the processor's cache, which is several times faster.
+    """
+    k = tuple(float(value) for value in parameters)
     limit = largest_radius(Distortion.RADTAN, parameters)
+    columns = np.ascontiguousarray(x_d.reshape(-1, 2).T)
+    x, valid = np.empty_like(columns), np.empty(columns.shape[1], dtype=np.bool_)
+    for begin in range(0, columns.shape[1], _BLOCK):
+        block = slice(begin, begin + _BLOCK)
+        x[:, block], valid[block] = _newton_radtan(k, columns[:, block], limit)
+    return np.ascontiguousarray(x.T).reshape(x_d.shape), valid.reshape(x_d.shape[:-1])
+
+
+def _newton_radtan(k: tuple[float, ...], x_d: F64, limit: float) -> tuple[F64, Mask]:
+    """Return undistorted points (2, N) of x_d (2, N), and which are valid."""
+    k1, k2, p1, p2 = k
     x = _shorten(x_d, 0.9 * limit)
-    change = np.full(x.shape[:-1], np.inf)
     for _ in range(_MAX_ITERATIONS):
-        value, J, _ = _radtan(parameters, x)
-        error = value - x_d
-        determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-        step = np.stack(
-            [
-                J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1],
-                J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0],
-            ],
-            axis=-1,
-        )
-        moved = _shorten(x - step / determinant[..., None], limit)
-        change = np.linalg.norm(moved - x, axis=-1)
+        u, v = x
+        r2 = u * u + v * v
+        s = 1.0 + r2 * (k1 + k2 * r2)
+        slope = 2.0 * k1 + 4.0 * k2 * r2
+        mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
+        of_u = s + slope * u * u + (2.0 * p1 * v + 6.0 * p2 * u)
+        of_v = s + slope * v * v + (6.0 * p1 * v + 2.0 * p2 * u)
+        error_u, error_v = _radtan_values(k, x) - x_d
+        determinant = of_u * of_v - mixed * mixed
+        determinant[np.abs(determinant) < 1e-9] = 1e-9
+        step_u = (of_v * error_u - mixed * error_v) / determinant
+        step_v = (of_u * error_v - mixed * error_u) / determinant
+        moved = _shorten(np.stack([u - step_u, v - step_v]), limit)
+        change = _length(moved - x)
         x = moved
-        if np.all(change <= _CONVERGED * (1.0 + np.linalg.norm(x, axis=-1))):
+        radius = _length(x)
+        if np.all(change <= _CONVERGED * (1.0 + radius)):
             break
-    radius = np.linalg.norm(x, axis=-1)
-    residual = np.linalg.norm(_radtan(parameters, x)[0] - x_d, axis=-1)
+    residual = _length(_radtan_values(k, x) - x_d)
     near = residual <= 100.0 * _CONVERGED * (1.0 + radius)
     return x, near & (change <= _CONVERGED * (1.0 + radius)) & (radius < limit)
 
 
+def _radtan_values(k: tuple[float, ...], x: F64) -> F64:
+    """Return distorted points (2, N) of x (2, N), without derivatives."""
+    k1, k2, p1, p2 = k
+    u, v = x
+    r2, uv = u * u + v * v, u * v
+    s = 1.0 + r2 * (k1 + k2 * r2)
+    return np.stack(
+        [
+            s * u + 2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u),
+            s * v + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv,
+        ]
+    )
+
+
 def _shorten(x: F64, limit: float) -> F64:
-    """Scale points (..., 2) down to at most `limit` in length."""
-    radius = np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.asarray(x * np.minimum(1.0, limit / np.maximum(radius, 1e-300)))
+    """Scale points (2, N) down to at most `limit` in length."""
+    if np.isinf(limit):
+        return x
+    return np.asarray(x * np.minimum(1.0, limit / np.maximum(_length(x), 1e-300)))
+
+
+def _length(x: F64) -> F64:
+    """Return the lengths (N,) of points (2, N); `np.hypot` is slower."""
+    return np.asarray(np.sqrt(x[0] * x[0] + x[1] * x[1]))

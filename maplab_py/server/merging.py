@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.place_index import PlaceIndex
+from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
@@ -35,11 +36,12 @@ from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.resource_folders import with_resources_taken_in
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import Excerpt, excerpt
-from maplab_py.vimap.ids import from_hex, to_hex, to_hex_list
+from maplab_py.vimap.ids import IdArray, from_hex, to_hex, to_hex_list
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.submaps import append_submap
 
-_LOCAL_ITERATIONS = 10
+_LOCAL_ITERATIONS, _LOCAL_TOLERANCE = 10, 1e-3
+"""Limits of a local optimisation: its vertices are optimised again with the next submaps, and jointly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +144,7 @@ class Merger:
             hide_iterations_console_output=True, include_absolute_pose_constraints=True
         )
         self._places = PlaceIndex()
+        self._projections = ProjectionMemory()
         self._stretches: list[Stretch] = []
         self._open_alignments = OpenAlignments()
 
@@ -171,7 +174,7 @@ class Merger:
             new.part.vi_map, progress, pairs, new.searched
         )
         clock.lap("anchor")
-        edited, loops = self._with_loops(edited, new, progress)
+        edited, loops = self._with_loops(edited, new, anchored, progress)
         whole = new.part.written_back(edited)
         clock.lap("close loops")
         waiting = pairs.take(anchored, self._incremental.similar_stretches)
@@ -268,14 +271,21 @@ class Merger:
         return result
 
     def _with_loops(
-        self, edited: VIMap, new: _NewPart, progress: Progress
+        self, edited: VIMap, new: _NewPart, anchored: Sequence[str], progress: Progress
     ) -> tuple[VIMap, _ClosedLoops]:
-        """Close the loops of a part; a part of new vertices alone has none."""
+        """Close the loops of new vertices, and of missions that have just been anchored (ids).
+
+        Loops between older vertices were looked for when the later of them came.
+        """
         is_alone = len(new.part.vertices) == len(new.rows)
         if is_alone or not self._merging.enable_visual_loop_closure:
             return edited, _ClosedLoops()
+        asked = np.isin(new.part.vertices, new.rows)
+        for mission in edited.mission_index.rows(_ids(anchored)):
+            asked |= edited.vertices.mission == mission
+        scope = SearchScope(asked, self._projections)
         try:
-            edited, report = close_loops(edited, self._loops, progress=progress)
+            edited, report = close_loops(edited, self._loops, scope=scope, progress=progress)
         except EstimationError as error:
             return edited, _ClosedLoops(note=str(error))
         has_large_gap = _has_large_gap(report.merges_refused)
@@ -285,10 +295,15 @@ class Merger:
         self, whole: VIMap, rows: I64, progress: Progress
     ) -> tuple[VIMap, LocalReport]:
         """Optimise new vertices (rows) and what they touch."""
+        options = dataclasses.replace(
+            self._optimization,
+            num_iterations=_LOCAL_ITERATIONS,
+            function_tolerance=_LOCAL_TOLERANCE,
+        )
         return optimize_around(
             whole,
             rows,
-            dataclasses.replace(self._optimization, num_iterations=_LOCAL_ITERATIONS),
+            options,
             max_free=self._incremental.local_free_vertices,
             max_fixed=self._incremental.local_fixed_vertices,
             progress=progress,
@@ -349,7 +364,7 @@ class Merger:
             return whole, ()
         searched = sorted(set().union(*waiting.values()))
         rows = [stretches[number].vertices(whole) for number in searched]
-        missions = whole.mission_index.rows(np.stack([from_hex(id_) for id_ in waiting]))
+        missions = whole.mission_index.rows(_ids(waiting))
         inside = np.isin(whole.vertices.mission, missions)
         inside[np.concatenate(rows)] = True
         part = excerpt(whole, inside)
@@ -373,6 +388,12 @@ class Merger:
                 self._places.train(submap)
         self._stretches.append(stretch)
         self._places.add(self._places.frequencies(submap, stretch.vertices(submap)))
+
+
+def _ids(names: Iterable[str]) -> IdArray:
+    """Return the words (N, 2) of ids."""
+    words = [from_hex(name) for name in names]
+    return np.stack(words) if words else np.zeros((0, 2), dtype=np.uint64)
 
 
 def _placed(vi_map: VIMap) -> Mask:

@@ -1,25 +1,24 @@
-"""Preparation of submaps: each is checked and optimised by itself in a fresh process."""
+"""Preparation of submaps: each is checked and optimised by itself in a worker process."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import os
-import shlex
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.atomic import write_file
 from maplab_py.errors import MapError, MaplabError
-from maplab_py.pipeline.execution import execute
 from maplab_py.pipeline.fingerprint import program_version
-from maplab_py.pipeline.orders import Order, Outcome
-from maplab_py.pipeline.plan import RESULT_TEMPLATE
+from maplab_py.pipeline.orders import Outcome
 from maplab_py.server.options import SubmapOptions
 from maplab_py.server.spool import Entry, Spool
+from maplab_py.server.worker import SubmapOrder
+from maplab_py.server.worker_pool import WorkerPool
 from maplab_py.storage.native import is_map_folder
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
@@ -28,21 +27,24 @@ from maplab_py.vimap.queries import has_link
 _MAX_IMU_STEP_NS = 1_000_000_000
 """IMU samples that are farther apart are those of a clock that jumped."""
 _NOTE = "prepared.sha256"
+_GATE_SIGMA = VIOptimizationOptions().absolute_pose_gate_sigma
 
 
 class Preparation:
-    """Runs orders in processes, a few at a time."""
+    """Gives submaps to workers, a few at a time."""
 
     def __init__(self, spool: Spool, options: SubmapOptions, stationary: StationaryOptions) -> None:
-        """Start without orders."""
+        """Start without workers."""
         self._spool, self._options, self._stationary = spool, options, stationary
-        self._workers = options.submap_loading_thread_pool_size
-        self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="prepare")
+        workers = options.submap_loading_thread_pool_size
+        self._workers = WorkerPool(max(1, (os.cpu_count() or 1) // workers))
+        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="prepare")
         self._is_stopping = False
 
     def start(self, entry: Entry) -> Future[Outcome]:
         """Prepare a submap; the result is in `prepared` of its folder, what was wrong in the outcome."""
-        return self._pool.submit(execute, self._order(entry), lambda: self._is_stopping)
+        order = self._order(entry)
+        return self._threads.submit(self._workers.run, order, lambda: self._is_stopping)
 
     def note(self, entry: Entry) -> None:
         """Note how the result of a submap was made, so that a later server can use it."""
@@ -58,49 +60,32 @@ class Preparation:
             return False
         return is_noted and is_map_folder(folder / "prepared")
 
-    def _key(self, entry: Entry) -> str:
-        script = self._script(self._spool.folder(entry) / "submap")
-        return hashlib.sha256(f"{program_version()}\n{script}".encode()).hexdigest()
-
     def stop(self) -> None:
         """Kill what runs, and wait for its end."""
         self._is_stopping = True
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._threads.shutdown(wait=True, cancel_futures=True)
+        self._workers.stop()
 
-    def _order(self, entry: Entry) -> Order:
+    def _key(self, entry: Entry) -> str:
+        return hashlib.sha256(
+            f"{program_version()}\n{self._order(entry).as_line()}".encode(
+                "utf-8", "surrogateescape"
+            )
+        ).hexdigest()
+
+    def _order(self, entry: Entry) -> SubmapOrder:
         folder = self._spool.folder(entry)
-        return Order(
+        is_gated = self._options.remove_outliers_in_absolute_pose_constraints
+        return SubmapOrder(
             title=entry.title,
-            script=self._script(folder / "submap"),
-            flags=(),
-            inputs=(folder / "submap",),
-            folder=folder,
+            submap=folder / "submap",
             result=folder / "prepared",
             log=folder / "worker.log",
-            reports=folder / "worker.jsonl",
-            version=program_version(),
-            memory_gb=0.0,
-            threads=max(1, (os.cpu_count() or 1) // self._workers),
-            tasks_per_host=self._workers,
-            keep_going=False,
-            discard=True,
+            absolute_pose_gate_sigma=_GATE_SIGMA if is_gated else 0.0,
+            ties_stationary=self._options.stationary_submaps_fix_with_lc_edge,
+            max_rotation_rad=self._stationary.max_rotation_rad,
+            max_translation_m=self._stationary.max_translation_m,
         )
-
-    def _script(self, submap: Path) -> str:
-        options, stationary = self._options, self._stationary
-        optimise = "optvi --ba_include_absolute_pose_constraints"
-        if not options.remove_outliers_in_absolute_pose_constraints:
-            optimise += " --ba_absolute_pose_gate_sigma=0"
-        lines = [f"load --map_folder={shlex.quote(str(submap))}", "check_map_consistency", "elq"]
-        if options.stationary_submaps_fix_with_lc_edge:
-            lines.append(
-                "tie_stationary_missions "
-                f"--maplab_stationary_submaps_max_rotation_rad={stationary.max_rotation_rad!r} "
-                f"--maplab_stationary_submaps_max_translation_m={stationary.max_translation_m!r}"
-            )
-            optimise += " --ba_include_loop_closure_edges"
-        lines += [optimise, f"save --map_folder={RESULT_TEMPLATE}"]
-        return "".join(line + "\n" for line in lines)
 
 
 def check_submap(submap: VIMap) -> None:

@@ -45,6 +45,7 @@ class Publisher:
         duration_s: How long that took.
         files: Number of files of the map.
         files_taken_over: How many of them were not written again.
+        is_compressed: All files that were written are compressed.
     """
 
     def __init__(self, options: PublishingOptions) -> None:
@@ -54,6 +55,7 @@ class Publisher:
         self.published_s: float | None = None
         self.duration_s = 0.0
         self.files = self.files_taken_over = 0
+        self.is_compressed = True
         self._options = options
         self._files: list[tuple[Path, Path]] = []
         self._written = WrittenFiles()
@@ -78,8 +80,20 @@ class Publisher:
         self._files += existing_files(submap, folder)
         return in_map_folder(submap)
 
-    def publish(self, vi_map: VIMap, *, progress: Progress = SILENT) -> None:
-        """Replace the published map; raises UserError where the disk refuses."""
+    def publish(
+        self, vi_map: VIMap, *, compress: bool = False, progress: Progress = SILENT
+    ) -> None:
+        """Replace the published map.
+
+        Args:
+            vi_map: The map.
+            compress: Compress its files. That takes most of the time of a publication, so files that the
+                next submap may change are stored as they are.
+            progress: Shown meanwhile.
+
+        Raises:
+            UserError: The disk refuses.
+        """
         began = time.monotonic()
         report = save_map(
             vi_map,
@@ -87,9 +101,11 @@ class Publisher:
             force=True,
             resource_files=self._files,
             written=self._written,
+            compress=compress,
             progress=progress,
         )
         self.files, self.files_taken_over = report.files, self._written.reused
+        self.is_compressed = compress
         self._files.clear()
         self.published_s = time.monotonic()
         self.duration_s = self.published_s - began

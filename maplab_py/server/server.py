@@ -226,7 +226,7 @@ class MapServer:
             self._publish_if_needed(force=True)
             self._optimize_jointly(self._progress)
         self._retry_s = 0.0
-        self._publish_if_needed(force=True)
+        self._publish_if_needed(force=True, compress=True)
 
     def _is_busy(self) -> bool:
         """Tell whether a submap is being prepared, or copied."""
@@ -258,7 +258,7 @@ class MapServer:
         if self._joint_is_due():
             pause = _Pause(self._progress, lambda: is_to_end() or self._has_work())
             if self._optimize_jointly(pause):
-                self._publish_if_needed(force=True)
+                self._publish_if_needed(force=True, compress=True)
                 return True
         self._back_up()
         return False
@@ -374,23 +374,27 @@ class MapServer:
     def _has_work(self) -> bool:
         return self._intake.has_work() or not self._requests.empty()
 
-    def _publish_if_needed(self, *, force: bool) -> bool:
+    def _publish_if_needed(self, *, force: bool, compress: bool = False) -> bool:
         """Publish the map where it has changed; True where it was published."""
         vi_map = self._merger.vi_map
-        if vi_map is None or vi_map is self.published or time.monotonic() < self._retry_s:
+        is_published = vi_map is self.published and not (compress and self._must_be_compressed())
+        if vi_map is None or is_published or time.monotonic() < self._retry_s:
             return False
         last_s = self.publisher.published_s
         is_time = last_s is None or time.monotonic() - last_s >= pause_s(self.publisher.duration_s)
-        return (force or is_time) and self._publish()
+        return (force or is_time) and self._publish(compress=compress)
 
-    def _publish(self) -> bool:
+    def _must_be_compressed(self) -> bool:
+        return not self.publisher.is_compressed and self.publisher.published_s is not None
+
+    def _publish(self, *, compress: bool = False) -> bool:
         """Publish map and journal; submaps that they have now are finished."""
         vi_map = self._merger.vi_map
         try:
             if vi_map is None:
                 self.publisher.remove()
             else:
-                self.publisher.publish(vi_map)
+                self.publisher.publish(vi_map, compress=compress)
             write_journal(self.journal, self.spool.journal)
             for number, item in list(self._intake.items.items()):
                 if item.merged is not None:

@@ -6,7 +6,7 @@
                    /submap/         the submap as it came
                    /prepared/       the same after its own optimisation
                    /prepared.sha256 of how it was made: a later server uses it if it would do the same
-                   /worker.log, worker.jsonl
+                   /worker.log
     merged/000012/                  the same folder, once the published map has the submap
     rejected/000012/                the same folder, with reason.txt
     journal.json, server.json, server.log, .server.lock

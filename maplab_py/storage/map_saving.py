@@ -78,7 +78,8 @@ def save_map(
             `checksums.fingerprint`): that one is replaced without `overwrite`, and another one
             only by `force`.
         force: Replace any existing map.
-        compress: Write gzip files, as maplab does.
+        compress: Compress the gzip files, as maplab does; else their content is stored in them as it is,
+            which takes a tenth of the time and about twice the room. maplab reads both.
         descriptor_layout: Layout of the descriptors; "as_loaded" writes every frame in the layout
             that it was loaded with and new frames in that of maplab 2.2.
         resource_files: Files that come into the map's own resource folder, with their paths in it.
@@ -204,7 +205,7 @@ def _write_message(path: Path, message: Message, compress: bool) -> None:
 
 
 def _write_bytes(path: Path, data: bytes, compress: bool) -> None:
-    path.write_bytes(gzip.compress(data, _GZIP_LEVEL, mtime=0) if compress else data)
+    path.write_bytes(gzip.compress(data, _GZIP_LEVEL if compress else 0, mtime=0))
 
 
 def _write_text(path: Path, text: str) -> None:

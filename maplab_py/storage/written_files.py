@@ -19,6 +19,7 @@ from maplab_py.storage.tables_to_messages import Partition
 
 STABLE = Partition(vertices=50, edges=200, is_stable=True)
 """Few files change when a mission grows or a part of a map is optimised."""
+_COMPRESSED, _STORED = b"compressed", b"stored"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,27 +65,32 @@ class TakenOver:
     """
 
     def __init__(self, before: WrittenFiles, folder: Path, *, compress: bool) -> None:
-        """Write to a folder what `before` does not have."""
+        """Write to a folder what `before` does not have.
+
+        Without `compress`, files that were compressed before are taken over as well.
+        """
         self.partition = before.partition
         self.checksums: dict[str, str] = {}
         self.linked: set[Path] = set()
         self._measurements = ColumnDigests(before.measurements)
         self._before, self._folder = before, folder
-        self._suffix = b"gzip" if compress else b"plain"
+        self._packings = (_COMPRESSED,) if compress else (_STORED, _COMPRESSED)
         self._names: dict[bytes, str] = {}
 
     def take_over(self, content: FileContent, name: str) -> bool:
         """Bring an equal file to a path in the folder; False where there is none."""
-        key = content.digest(self._measurements) + self._suffix
-        self._names[key] = name
-        file = self._before.find(key)
-        if file is None:
-            return False
-        with contextlib.suppress(FileNotFoundError):  # deleted just now
-            if link_or_copy(file.path, self._folder / name):
-                self.linked.add(self._folder / name)
-            self.checksums[name] = file.sha256
-            return True
+        digest = content.digest(self._measurements)
+        for packing in self._packings:
+            file = self._before.find(digest + packing)
+            if file is None:
+                continue
+            with contextlib.suppress(FileNotFoundError):  # deleted just now
+                if link_or_copy(file.path, self._folder / name):
+                    self.linked.add(self._folder / name)
+                self.checksums[name] = file.sha256
+                self._names[digest + packing] = name
+                return True
+        self._names[digest + self._packings[0]] = name
         return False
 
     def finish(self, target: Path, listed: str) -> None:

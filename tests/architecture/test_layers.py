@@ -105,6 +105,7 @@ MAY_WRITE = (
     "maplab_py/pipeline/child.py",  # the output of a running task
     "maplab_py/pipeline/execution.py",  # its log is appended to
     "maplab_py/server/status.py",  # likewise
+    "maplab_py/server/worker.py",  # likewise
 )
 
 

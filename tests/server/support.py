@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MaplabError
-from maplab_py.pipeline.orders import Ending, Order, Outcome
+from maplab_py.pipeline.orders import Ending, Outcome
 from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
 from maplab_py.server.server import MapServer
 from maplab_py.server.spool import Spool, push
+from maplab_py.server.worker import SubmapOrder
+from maplab_py.server.worker_pool import WorkerPool
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
@@ -57,7 +59,7 @@ def dies_in(patch: pytest.MonkeyPatch, owner: Any, name: str, at_call: int, *, a
     patch.setattr(owner, name, dying)
 
 
-Execute = Callable[[Order, Callable[[], bool]], Outcome]
+Execute = Callable[[SubmapOrder, Callable[[], bool]], Outcome]
 
 
 def submaps(robot: str) -> list[VIMap]:
@@ -77,15 +79,14 @@ def put(spool: Spool, robot: str, submap: VIMap, name: str, scratch: Path) -> Pa
     return push(spool, robot, folder)
 
 
-def copying(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+def copying(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
     """Do a worker's work without its optimisation: check a submap and copy it."""
-    assert order.result is not None
     try:
-        load_map(order.inputs[0])
+        load_map(order.submap)
     except MaplabError as error:
         return Outcome(order.title, Ending.REFUSED, str(error))
     shutil.rmtree(order.result, ignore_errors=True)
-    shutil.copytree(order.inputs[0], order.result)
+    shutil.copytree(order.submap, order.result)
     return Outcome(order.title, Ending.DONE)
 
 
@@ -109,7 +110,11 @@ class Servers:
 
     def work(self, execute: Execute) -> None:
         """Let workers do something else."""
-        self._monkeypatch.setattr("maplab_py.server.preparation.execute", execute)
+
+        def run(_: WorkerPool, order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
+            return execute(order, is_cancelled)
+
+        self._monkeypatch.setattr(WorkerPool, "run", run)
 
     def put(self, robot: str, number: int, submap: VIMap | None = None, name: str = "") -> Path:
         """Push a submap of a robot, or another one in its name."""

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.pipeline.orders import Ending, Order, Outcome
+from maplab_py.pipeline.orders import Ending, Outcome
 from maplab_py.sensors import SensorSet
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Arrival, Entry, Spool, push
+from maplab_py.server.worker import SubmapOrder
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_new_ids
@@ -131,11 +132,11 @@ def test_a_full_disk_delays_the_map_and_loses_nothing(
     monkeypatch.setattr("maplab_py.server.server._SECONDS_BETWEEN_RETRIES", 0.1)
     publish, failures = Publisher.publish, [1, 2]
 
-    def full(publisher: Publisher, vi_map: VIMap) -> None:
+    def full(publisher: Publisher, vi_map: VIMap, *, compress: bool) -> None:
         if failures:
             failures.pop()
             raise UserError("city: cannot be saved (No space left on device)")
-        publish(publisher, vi_map)
+        publish(publisher, vi_map, compress=compress)
 
     monkeypatch.setattr(Publisher, "publish", full)
     for number in range(3):
@@ -171,7 +172,7 @@ def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
     monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
     attempts: Counter[str] = Counter()
 
-    def full(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+    def full(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         attempts[order.title] += 1
         if attempts[order.title] <= 4:
             error = f".worker.{len(attempts)}: cannot be saved (No space left on device)"
@@ -194,7 +195,7 @@ def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
 def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
     killed: list[str] = []
 
-    def dying(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+    def dying(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         if not killed:
             killed.append(order.title)
             return Outcome(order.title, Ending.OVER_MEMORY, "was killed")
@@ -221,7 +222,7 @@ def test_a_failure_that_is_not_the_submap_s_is_tried_again(
     monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
     failed: list[str] = []
 
-    def failing(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+    def failing(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         if not failed:
             failed.append(order.title)
             return Outcome(order.title, ending, error)

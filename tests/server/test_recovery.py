@@ -15,12 +15,13 @@ from typing import Any
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.pipeline.orders import Order, Outcome
+from maplab_py.pipeline.orders import Outcome
 from maplab_py.server.journal import Journal, MergedSubmap, read_journal, write_journal
 from maplab_py.server.merging import Stretch
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Spool
 from maplab_py.server.status import status_without_server
+from maplab_py.server.worker import SubmapOrder
 from tests.server.support import ROBOTS, Servers, copying, submaps
 from tests.support.waiting import wait_until
 
@@ -73,7 +74,7 @@ def test_what_a_worker_has_made_is_used_after_a_kill(
         shutil.rmtree(prepared)
     calls = []
 
-    def counted(order: Order, is_cancelled: Callable[[], bool]) -> Outcome:
+    def counted(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         calls.append(order.title)
         return copying(order, is_cancelled)
 

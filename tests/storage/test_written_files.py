@@ -81,6 +81,23 @@ def test_only_what_has_changed_is_written(tmp_path: Path) -> None:
     assert written.reused == len(first) - len(ALWAYS) - 1
 
 
+def test_stored_files_are_gzip_files_and_are_compressed_later(tmp_path: Path) -> None:
+    vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
+    save_map(vi_map, target, compress=False, written=written)
+    stored = (target / "vi_map" / "vertices0").read_bytes()
+    assert stored[:2] == b"\x1f\x8b"
+    assert len(stored) > len(gzip.decompress(stored))
+    assert holds(target, vi_map)
+    save_map(vi_map, target, force=True, written=written)
+    assert written.reused == 0
+    packed = (target / "vi_map" / "vertices0").read_bytes()
+    assert gzip.decompress(packed) == gzip.decompress(stored)
+    assert len(packed) < len(stored)
+    files = inodes(target)
+    save_map(vi_map, target, force=True, compress=False, written=written)
+    assert changed(files, inodes(target)) == ALWAYS  # compressed ones serve as well
+
+
 def test_what_is_taken_over_equals_what_would_be_written(tmp_path: Path) -> None:
     vi_map, written = three_missions(), WrittenFiles()
     edited = moved(vi_map, 0)

@@ -19,6 +19,7 @@ from maplab_py.algorithms.loop_closure.gates import judge
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import closure_ids
+from maplab_py.algorithms.loop_closure.search_scope import SearchScope
 from maplab_py.algorithms.loop_closure.verification import PoseSearch, search_poses
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
@@ -29,6 +30,8 @@ from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.index import MatchRule
 from maplab_py.vision.projection import DescriptorProjection
 from maplab_py.vision.projection_file import load_projection
+
+_EVERYTHING = SearchScope()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,6 +55,7 @@ def detect(
     only_other_missions: bool = False,
     trust_base_frames: bool = True,
     choice: AlignmentChoice | None = None,
+    scope: SearchScope = _EVERYTHING,
     progress: Progress = SILENT,
 ) -> Detection:
     """Detect loop closures within and between missions.
@@ -63,6 +67,7 @@ def detect(
         only_other_missions: Ignore places of the query's mission.
         trust_base_frames: Limit the corrections between missions with known base frames too.
         choice: An alignment of two missions that a person has chosen.
+        scope: What is left out.
         progress: Progress.
 
     Raises:
@@ -73,11 +78,14 @@ def detect(
     given = None
     if options.projection_matrix_filename:
         given = load_projection(Path(options.projection_matrix_filename))
-    features, used = _features(vi_map, missions, options, given)
+    features, used = _features(vi_map, missions, options, given, scope)
     # the queries' missions are always searched: they reveal ambiguous places
     rule = MatchRule(round(options.min_image_time_seconds * 1e9))
     progress.step(1, 4, "descriptor matches")
-    matches, database_landmarks = match_features(features, options, rule, only_other_missions)
+    asked = None if scope.queries is None else np.flatnonzero(scope.queries[features.vertex])
+    matches, database_landmarks = match_features(
+        features, options, rule, only_other_missions, asked
+    )
     progress.step(2, 4, "places")
     candidates = find_candidates(
         vi_map,
@@ -111,7 +119,7 @@ def detect(
     progress.step(4, 4, "loop closures")
     return Detection(
         closures=closures,
-        query_vertices=len(distinct(features.vertex)),
+        query_vertices=len(distinct(features.vertex if asked is None else features.vertex[asked])),
         database_landmarks=database_landmarks,
         descriptor_matches=len(matches),
         best_votes=int(candidates.votes.max(initial=0)),
@@ -121,7 +129,11 @@ def detect(
 
 
 def _features(
-    vi_map: VIMap, missions: I64, options: LoopClosureOptions, given: DescriptorProjection | None
+    vi_map: VIMap,
+    missions: I64,
+    options: LoopClosureOptions,
+    given: DescriptorProjection | None,
+    scope: SearchScope,
 ) -> tuple[MapFeatures, DescriptorProjection]:
     return map_features(
         vi_map,
@@ -130,6 +142,7 @@ def _features(
         dimensions=options.target_dimensionality,
         feature_type=options.type_number,
         sizes=options.sizes,
+        memory=scope.projections,
     )
 
 

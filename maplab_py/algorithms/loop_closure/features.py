@@ -8,6 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.reports import TrainingReport
+from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
@@ -24,7 +25,7 @@ from maplab_py.vimap.descriptors import (
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
-from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_projection
+from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection
 
 _BYTES_PER_KEYPOINT = 300
 """Memory per keypoint [bytes] without its descriptor, which is stored twice."""
@@ -56,6 +57,7 @@ def map_features(
     dimensions: int = DIMENSIONS,
     feature_type: int = FeatureType.BINARY,
     sizes: tuple[int, ...] = (),
+    memory: ProjectionMemory | None = None,
 ) -> tuple[MapFeatures, DescriptorProjection]:
     """Collect the features of some missions; learn the projection from their tracks unless given.
 
@@ -71,6 +73,7 @@ def map_features(
         dimensions: Dimensions of a projection that is learned.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.
+        memory: Where a projection is kept for the next call.
 
     Raises:
         EstimationError: There are no such descriptors, all of a mission have another length than
@@ -92,7 +95,8 @@ def map_features(
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoint, :size])
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
     if projection is None or projection.kind != kind:
-        projection = learn_projection(raw, landmark, kind=kind, dimensions=dimensions)
+        memory = memory or ProjectionMemory()
+        projection = memory.learned(raw, landmark, kind, dimensions)
     vertex = vi_map.keypoint_vertex[keypoint].astype(np.int64)
     descriptors = DescriptorSet(
         projected=projection.project(raw),

@@ -28,23 +28,35 @@ _MIN_VOTES = 2
 
 
 def match_features(
-    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, apart: bool
+    features: MapFeatures,
+    options: LoopClosureOptions,
+    rule: MatchRule,
+    apart: bool,
+    asked: I64 | None = None,
 ) -> tuple[Matches, int]:
     """Match keypoints with the nearest landmarks; also return the number of landmarks searched.
 
     With `apart` the query's mission and the others are searched separately, because landmarks of
     the query's mission would displace those of others among the nearest neighbours.
+
+    Args:
+        features: Keypoints and landmarks.
+        options: How they are compared.
+        rule: Which landmarks a query may match.
+        apart: See above.
+        asked: Features (rows, ascending) that are the queries; None = all.
     """
+    queries = np.arange(len(features)) if asked is None else asked
     database = np.flatnonzero(features.in_database)
     landmarks = len(distinct(features.descriptors.label[database]))
-    if landmarks == 0:
+    if landmarks == 0 or not len(queries):
         empty = np.zeros(0, dtype=np.int64)
-        return Matches(empty, empty, empty.astype(np.int32)), 0
+        return Matches(empty, empty, empty.astype(np.int32)), landmarks
     d = features.descriptors
     missions = distinct(d.session[database])
     if len(missions) > options.max_missions_per_query + 1:
-        return _in_chosen_missions(features, options, rule, database), landmarks
-    query, matched = _in_all_missions(features, options, rule, apart, database)
+        return _in_chosen_missions(features, options, rule, database, queries), landmarks
+    query, matched = _in_all_missions(features, options, rule, apart, database, queries)
     return _similar(features, options, query, matched), landmarks
 
 
@@ -69,14 +81,16 @@ def _in_all_missions(
     rule: MatchRule,
     apart: bool,
     database: I64,
+    queries: I64,
 ) -> tuple[I64, I64]:
     """Return the pairs of features and their nearest database features."""
     d = features.descriptors
+    asked = d if len(queries) == len(d) else d.take(queries)
     others = MatchRule(rule.min_time_ns, True)
     rows = nearest_rows(
         options.detector_engine,
         d.take(database),
-        d,
+        asked,
         _neighbours(options),
         [rule, others] if apart else [rule],
         seed=options.seed,
@@ -85,14 +99,18 @@ def _in_all_missions(
     )
     row = rows[0]
     if apart:
-        same_session = (row >= 0) & (d.session[database][row] == d.session[:, None])
+        same_session = (row >= 0) & (d.session[database][row] == asked.session[:, None])
         row = np.concatenate([np.where(same_session, row, -1), rows[1]], axis=1)
     query, column = np.nonzero(row >= 0)
-    return query, database[row[query, column]]
+    return queries[query], database[row[query, column]]
 
 
 def _in_chosen_missions(
-    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, database: I64
+    features: MapFeatures,
+    options: LoopClosureOptions,
+    rule: MatchRule,
+    database: I64,
+    queries: I64,
 ) -> Matches:
     """Return the matches of each query with the missions chosen for it; see `remembered`."""
     setting = (
@@ -100,36 +118,39 @@ def _in_chosen_missions(
         f"{options.num_words_for_nn_search} {options.max_missions_per_query} "
         f"{_largest(features, options)!r} {features.kind!r} {rule!r}"
     )
-    columns = (features.vertex, features.in_database)
+    columns = (features.vertex, features.in_database, queries)
     query, matched, bits = remembered(
         features.descriptors,
         columns,
         setting,
-        lambda: _searched_missions(features, options, rule, database),
+        lambda: _searched_missions(features, options, rule, database, queries),
     )
     return Matches(query.astype(np.int64), matched.astype(np.int64), bits)
 
 
 def _searched_missions(
-    features: MapFeatures, options: LoopClosureOptions, rule: MatchRule, database: I64
+    features: MapFeatures,
+    options: LoopClosureOptions,
+    rule: MatchRule,
+    database: I64,
+    queries: I64,
 ) -> I32:
     """Return the matches (3, M) with the nearest features in chosen missions: query, feature, bits.
 
     A query's mission is always searched: it reveals places that look alike.
     """
     d = features.descriptors
-    queries = np.arange(len(features))
     other = MatchRule(rule.min_time_ns, True)
     nearest = _nearest(features, options, other, queries, database, max_difference=np.inf)
     size = int(d.session.max()) + 1
     chosen = _chosen_missions(features, *nearest, options.max_missions_per_query, size)
     del nearest
-    parts = []
+    parts = [np.zeros((3, 0), dtype=np.int32)]
     for mission in range(size):
         in_mission = database[d.session[database] == mission]
         wants = np.zeros(int(features.vertex.max()) + 1, dtype=np.bool_)
         wants[chosen[chosen % size == mission] // size] = True
-        asked = np.flatnonzero((d.session == mission) | wants[features.vertex])
+        asked = queries[(d.session[queries] == mission) | wants[features.vertex[queries]]]
         if len(in_mission) and len(asked):
             pairs = _nearest(
                 features, options, rule, asked, in_mission, _largest(features, options)

@@ -14,6 +14,7 @@ from maplab_py.algorithms.loop_closure.edges import closure_edges
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
+from maplab_py.algorithms.loop_closure.search_scope import SearchScope
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
@@ -22,6 +23,7 @@ from maplab_py.vimap import LoopClosureEdges, VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
 
 _DEFAULT = LoopClosureOptions()
+_EVERYTHING = SearchScope()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,6 +39,7 @@ def close_loops(
     options: LoopClosureOptions = _DEFAULT,
     *,
     missions: I64 | None = None,
+    scope: SearchScope = _EVERYTHING,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LoopClosureReport]:
     """Find loop closures and merge landmarks of the same point.
@@ -47,13 +50,14 @@ def close_loops(
         vi_map: The map; the quality of landmarks is evaluated first where it is unknown.
         options: Thresholds.
         missions: Mission rows, None for all.
+        scope: What is left out.
         progress: Progress.
 
     Raises:
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
     judged, notes = evaluate_unknown_quality(vi_map, progress)
-    detection = _detect(judged, options, missions, progress)
+    detection = _detect(judged, options, missions, progress, scope)
     closures = detection.closures
     merged, result = merging.merge_verified_landmarks(judged, closures, options)
     used = np.zeros(len(closures), dtype=np.bool_)
@@ -145,7 +149,11 @@ def insert_edges(
 
 
 def _detect(
-    vi_map: VIMap, options: LoopClosureOptions, missions: I64 | None, progress: Progress
+    vi_map: VIMap,
+    options: LoopClosureOptions,
+    missions: I64 | None,
+    progress: Progress,
+    scope: SearchScope = _EVERYTHING,
 ) -> Detection:
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
     return detect(
@@ -153,6 +161,7 @@ def _detect(
         options,
         missions=rows,
         only_other_missions=options.only_against_other_missions,
+        scope=scope,
         progress=progress,
     )
 
