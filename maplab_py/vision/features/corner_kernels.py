@@ -11,6 +11,8 @@ from maplab_py.compilation import compiled
 
 WINDOW_HALF_PX = 3
 """Half the side of the window in which a corner's gradients count."""
+_CLIMB_PX = 3
+"""Farthest that a corner is moved to the strongest place near it, in each direction."""
 
 
 class Selection(NamedTuple):
@@ -54,6 +56,72 @@ def corner_strengths(image, uv, strength):  # type: ignore[no-untyped-def]
         mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
         # central differences span two pixels
         strength[n] = (mean - np.sqrt(half * half + float(xy) * xy)) / (4.0 * samples)
+
+
+@compiled()
+def climb_to_corners(image, uv, place):  # type: ignore[no-untyped-def]
+    """Fill in the local maximum of the corner strength in windows of 3 x 3 pixels, near each corner.
+
+    Corners near to the border stay where they are.
+
+    Args:
+        image: Grey values (H, W).
+        uv: Whole pixels (N, 2).
+        place: Filled in (N, 2), interpolated by parabolas.
+    """
+    height, width = image.shape
+    reach = _CLIMB_PX + 3
+    near = np.empty((3, 3))
+    for n in range(len(uv)):
+        u, v = uv[n, 0], uv[n, 1]
+        place[n, 0], place[n, 1] = u, v
+        if u < reach or v < reach or u >= width - reach or v >= height - reach:
+            continue
+        for _ in range(_CLIMB_PX):
+            best_u, best_v = u, v
+            strongest = _strength_3(image, u, v)
+            for dv in range(-1, 2):
+                for du in range(-1, 2):
+                    strength = _strength_3(image, u + du, v + dv)
+                    if strength > strongest:
+                        strongest, best_u, best_v = strength, u + du, v + dv
+            if best_u == u and best_v == v:
+                break
+            u, v = best_u, best_v
+        for dv in range(-1, 2):
+            for du in range(-1, 2):
+                near[dv + 1, du + 1] = _strength_3(image, u + du, v + dv)
+        place[n, 0] = u + _summit(near[1, 0], near[1, 1], near[1, 2])
+        place[n, 1] = v + _summit(near[0, 1], near[1, 1], near[2, 1])
+
+
+@compiled()
+def _strength_3(image, u, v):  # type: ignore[no-untyped-def]
+    """Return the smaller eigenvalue of the sum of outer products of Sobel gradients over 3 x 3 pixels."""
+    xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
+    for row in range(v - 1, v + 2):
+        for column in range(u - 1, u + 2):
+            dx, dy = np.int64(0), np.int64(0)
+            for k in range(-1, 2):
+                weight = 2 - abs(k)
+                right, left = image[row + k, column + 1], image[row + k, column - 1]
+                below, above = image[row + 1, column + k], image[row - 1, column + k]
+                dx += weight * (np.int64(right) - np.int64(left))
+                dy += weight * (np.int64(below) - np.int64(above))
+            xx += dx * dx
+            xy += dx * dy
+            yy += dy * dy
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    return mean - np.sqrt(half * half + float(xy) * xy)
+
+
+@compiled()
+def _summit(before, here, after):  # type: ignore[no-untyped-def]
+    """Return where the parabola through values at -1, 0, 1 is largest, within half a step."""
+    curvature = 2.0 * here - before - after
+    if not curvature > 0.0:
+        return 0.0
+    return min(max(0.5 * (after - before) / curvature, -0.5), 0.5)
 
 
 @compiled()
@@ -112,3 +180,10 @@ def strengths(image: U8, uv: I64) -> F64:
     strength = np.empty(len(uv))
     corner_strengths(image, uv, strength)
     return strength
+
+
+def strongest_places(image: U8, uv: I64) -> F64:
+    """Return the strongest places (N, 2) near corners at whole pixels (N, 2); see `climb_to_corners`."""
+    place = np.empty((len(uv), 2))
+    climb_to_corners(image, uv, place)
+    return place

@@ -62,6 +62,12 @@ def in_plane_turn(R_C1_C0: F64) -> float:
     return float(np.arctan2(R_C1_C0[1, 0] - R_C1_C0[0, 1], R_C1_C0[0, 0] + R_C1_C0[1, 1]))
 
 
+def turn_matrix(angle_rad: float) -> F64:
+    """Return the matrix (2, 2) of a turn in the image."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 def turned_in_plane(image: U8, uv: F64, centre: F64, angle_rad: float) -> tuple[U8, F64]:
     """Turn an image (H, W) and its keypoints (K, 2) about a point.
 
@@ -71,8 +77,7 @@ def turned_in_plane(image: U8, uv: F64, centre: F64, angle_rad: float) -> tuple[
     """
     import cv2
 
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    R = np.array([[cos, -sin], [sin, cos]])
+    R = turn_matrix(angle_rad)
     M = np.column_stack([R, centre - R @ centre])
     height, width = image.shape
     turned = cv2.warpAffine(image, M, (width, height), borderMode=cv2.BORDER_REPLICATE)

@@ -13,11 +13,13 @@ from maplab_py.array_types import F64, U8, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.vision.features.detection import GridDetector
+from maplab_py.vision.features.detection import GridDetector, refined
+from maplab_py.vision.tracking.drift import align, patches
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
     follow,
     in_plane_turn,
+    turn_matrix,
     turned_in_plane,
 )
 from maplab_py.vision.tracking.live_tracks import LiveTracks
@@ -36,7 +38,7 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 _MIN_IN_PLANE_TURN_RAD = 0.01
 """From this turn about the optical axis on, the earlier image is turned with the camera."""
 _SAME_POINT_PX = 3.0
-"""A track of a camera alone ends where a track of its leader arrives."""
+"""A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -157,14 +159,17 @@ class FrameTracker:
         tracks = state.tracks
         with watch("flow"):
             R_C1_C0 = camera_turn(view.R_I_C, R_I0_I1)
-            before, start, guess = state.image, tracks.uv, tracks.uv
+            before, start, guess, turn = state.image, tracks.uv, tracks.uv, np.eye(2)
             if R_C1_C0 is not None:
                 turned, visible = view.pixels(tracks.ray @ R_C1_C0.T)
                 guess = np.where(visible[:, None], turned, tracks.uv)
                 angle_rad = in_plane_turn(R_C1_C0)
+                turn = turn_matrix(angle_rad)
                 if abs(angle_rad) > _MIN_IN_PLANE_TURN_RAD:
                     before, start = turned_in_plane(before, start, view.centre, angle_rad)
             uv, is_tracked = follow(before, image, start, guess, self._flow)
+            aligned = align(image, uv, tracks.patch, turn @ tracks.warp)
+            uv, tracks = aligned.uv, tracks.compared_with(aligned.patch, aligned.warp)
             ray, exists = view.rays(uv)
             left = is_tracked & exists & view.is_usable(uv)
             tracks, uv, ray, guess = tracks[left], uv[left], ray[left], guess[left]
@@ -195,8 +200,11 @@ class FrameTracker:
     def _with_new(self, row: int, image: U8, tracks: LiveTracks, shared: LiveTracks) -> LiveTracks:
         """Add new tracks where the image has room beside those of the camera and of its leader."""
         uv = self._detectors[row].detect(image, np.concatenate([shared.uv, tracks.uv]))
+        uv = refined(image, uv)
+        uv = uv[self._views[row].is_usable(uv) & _is_apart(uv, tracks.uv) & _is_apart_before(uv)]
         ray, exists = self._views[row].rays(uv)
         new = LiveTracks.new(uv[exists], ray[exists], self._next_id)
+        new = new.compared_with(patches(image, new.uv), new.warp)
         self._next_id += len(new)
         return tracks.joined(new)
 
@@ -215,6 +223,13 @@ def _is_apart(uv: F64, others_uv: F64) -> Mask:
     """Tell which keypoints (K, 2) are not where another (L, 2) is."""
     distance = np.linalg.norm(uv[:, None] - others_uv[None], axis=2)
     return np.asarray(np.all(distance > _SAME_POINT_PX, axis=1))
+
+
+def _is_apart_before(uv: F64) -> Mask:
+    """Tell which keypoints (K, 2) are not where one before them is."""
+    distance = np.linalg.norm(uv[:, None] - uv[None], axis=2)
+    is_same = np.tril(distance <= _SAME_POINT_PX, k=-1)
+    return np.asarray(~is_same.any(axis=1))
 
 
 class _Stopwatch:

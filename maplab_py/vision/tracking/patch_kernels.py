@@ -1,0 +1,223 @@
+"""Compiled kernels: patches about keypoints, and their alignment with an image under an affine warp.
+
+Source: S. Baker, I. Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse compositional); J. Shi, C. Tomasi,
+Good Features to Track, CVPR 1994 (affine motion since the first image tells whether a track drifts).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maplab_py.compilation import compiled
+
+HALF_PX = 7
+"""Half the side of a patch; one more pixel on each side serves for gradients."""
+SIDE_PX = 2 * HALF_PX + 3
+_PARAMETERS = 6
+_GREY_SIGMA = 4.0
+_WARP_SIGMA = 0.02
+"""Standard deviation of a change of the warp from image to image, at the edge of the patch [half sides]."""
+_ITERATIONS = 8
+_FAST = {"fastmath": {"contract", "nsz", "arcp", "reassoc"}}
+"""Sums are formed in several parts at a time."""
+_ZERO, _HALF, _UNITY = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_CONVERGED_PX = 0.01
+
+
+@compiled(**_FAST)
+def sample_patches(image, uv, patch):  # type: ignore[no-untyped-def]
+    """Fill in the patches (K, S, S) about keypoints uv (K, 2) of an image (H, W); they lie in it."""
+    height, width = image.shape
+    reach = HALF_PX + 1
+    for k in range(len(uv)):
+        for row in range(SIDE_PX):
+            for column in range(SIDE_PX):
+                u = min(max(uv[k, 0] + column - reach, 0.0), width - 1.001)
+                v = min(max(uv[k, 1] + row - reach, 0.0), height - 1.001)
+                patch[k, row, column] = _bilinear(image, u, v)
+
+
+@compiled(**_FAST)
+def _bilinear(image, u, v):  # type: ignore[no-untyped-def]
+    """Return the grey value at a place inside the image."""
+    column, row = int(u), int(v)
+    a, b = np.float32(u - column), np.float32(v - row)
+    above = (_UNITY - a) * np.float32(image[row, column]) + a * np.float32(image[row, column + 1])
+    below = (_UNITY - a) * np.float32(image[row + 1, column]) + a * np.float32(
+        image[row + 1, column + 1]
+    )
+    return (_UNITY - b) * above + b * below
+
+
+@compiled(**_FAST)
+def align_patches(image, patch, uv, warp, similarity):  # type: ignore[no-untyped-def]
+    """Align patches with an image under affine warps, gain and offset of the brightness.
+
+    Args:
+        image: Grey values (H, W).
+        patch: Patches (K, S, S) of earlier images.
+        uv: Where their centres are expected (K, 2); changed to where they are.
+        warp: Expected change (K, 2, 2) from offsets in the patch to offsets in the image; changed.
+        similarity: Filled in (K,): the correlation of patch and image, -1 where there is none.
+    """
+    side = 2 * HALF_PX + 1
+    count = side * side
+    slope = np.empty((_PARAMETERS, count), dtype=np.float32)
+    template = np.empty(count, dtype=np.float32)
+    sampled = np.empty(count, dtype=np.float32)
+    square = np.empty((_PARAMETERS, _PARAMETERS))
+    right = np.empty(_PARAMETERS)
+    for k in range(len(uv)):
+        similarity[k] = _align(
+            image, patch[k], uv[k], warp[k], slope, template, sampled, square, right
+        )
+
+
+@compiled(**_FAST)
+def _align(image, patch, uv, warp, slope, template, sampled, square, right):  # type: ignore[no-untyped-def]
+    """Align one patch; see `align_patches`."""
+    contrast = _prepare(patch, slope, template, square)
+    if not contrast > 0.0:
+        return -1.0
+    _factorise(square)
+    for _ in range(_ITERATIONS):
+        if not _sample(image, uv, warp, contrast, sampled):
+            return -1.0
+        for i in range(_PARAMETERS):
+            # slopes are orthogonal to the template
+            total = _ZERO
+            for n in range(len(template)):
+                total += slope[i, n] * sampled[n]
+            right[i] = total
+        _solve(square, right)
+        _compose(uv, warp, right)
+        if right[0] ** 2 + right[1] ** 2 < _CONVERGED_PX**2:
+            break
+    if not _sample(image, uv, warp, contrast, sampled):
+        return -1.0
+    total = _ZERO
+    for n in range(len(template)):
+        total += sampled[n] * template[n]
+    return total / (contrast * contrast)
+
+
+@compiled(**_FAST)
+def _prepare(patch, slope, template, square):  # type: ignore[no-untyped-def]
+    """Fill in slopes, centred grey values and normal equations of a patch; return its contrast.
+
+    Slopes by [u, v, A_uu, A_uv, A_vu, A_vv] are freed of what offset and gain of the brightness explain.
+    """
+    side = 2 * HALF_PX + 1
+    count = side * side
+    total = _ZERO
+    n = 0
+    for row in range(side):
+        for column in range(side):
+            here = patch[row + 1, column + 1]
+            du = _HALF * (patch[row + 1, column + 2] - patch[row + 1, column])
+            dv = _HALF * (patch[row + 2, column + 1] - patch[row, column + 1])
+            x = np.float32((column - HALF_PX) / HALF_PX)
+            y = np.float32((row - HALF_PX) / HALF_PX)
+            slope[0, n], slope[1, n] = du, dv
+            slope[2, n], slope[3, n] = du * x, du * y
+            slope[4, n], slope[5, n] = dv * x, dv * y
+            template[n] = here
+            total += here
+            n += 1
+    mean = np.float32(total / count)
+    squares = _ZERO
+    for n in range(count):
+        template[n] -= mean
+        squares += template[n] * template[n]
+    for i in range(_PARAMETERS):
+        total, along = _ZERO, _ZERO
+        for n in range(count):
+            total += slope[i, n]
+            along += slope[i, n] * template[n]
+        mean, share = np.float32(total / count), np.float32(along / max(squares, np.float32(1e-9)))
+        for n in range(count):
+            slope[i, n] -= mean + share * template[n]
+    for i in range(_PARAMETERS):
+        for j in range(i + 1):
+            total = _ZERO
+            for n in range(count):
+                total += slope[i, n] * slope[j, n]
+            square[i, j] = total
+    for i in range(_PARAMETERS):
+        square[i, i] += 1e-6 * square[i, i] + 1e-6
+        if i >= 2:
+            square[i, i] += (_GREY_SIGMA / (_WARP_SIGMA * HALF_PX)) ** 2
+    return np.sqrt(squares)
+
+
+@compiled(**_FAST)
+def _sample(image, uv, warp, contrast, sampled):  # type: ignore[no-untyped-def]
+    """Fill in grey values under a warp, of mean 0 and a contrast; return whether they are in the image."""
+    height, width = image.shape
+    reach_u = HALF_PX * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_v = HALF_PX * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    inside = reach_u <= uv[0] < width - 1.001 - reach_u
+    inside = inside and reach_v <= uv[1] < height - 1.001 - reach_v
+    if not inside:
+        return False
+    total = _ZERO
+    n = 0
+    for row in range(-HALF_PX, HALF_PX + 1):
+        u = uv[0] - HALF_PX * warp[0, 0] + warp[0, 1] * row
+        v = uv[1] - HALF_PX * warp[1, 0] + warp[1, 1] * row
+        for _ in range(2 * HALF_PX + 1):
+            sampled[n] = _bilinear(image, u, v)
+            total += sampled[n]
+            u += warp[0, 0]
+            v += warp[1, 0]
+            n += 1
+    mean = total / np.float32(n)
+    squares = _ZERO
+    for n in range(len(sampled)):
+        sampled[n] -= mean
+        squares += sampled[n] * sampled[n]
+    if squares < _UNITY:
+        return False
+    scale = contrast / np.sqrt(squares)
+    for n in range(len(sampled)):
+        sampled[n] *= scale
+    return True
+
+
+@compiled(**_FAST)
+def _compose(uv, warp, step):  # type: ignore[no-untyped-def]
+    """Replace a warp W by W o D^-1, where D is the step; the matrix part is given in half sides."""
+    a, b = 1.0 + step[2] / HALF_PX, step[3] / HALF_PX
+    c, d = step[4] / HALF_PX, 1.0 + step[5] / HALF_PX
+    determinant = a * d - b * c
+    a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
+    w00, w01 = warp[0, 0] * a + warp[0, 1] * c, warp[0, 0] * b + warp[0, 1] * d
+    w10, w11 = warp[1, 0] * a + warp[1, 1] * c, warp[1, 0] * b + warp[1, 1] * d
+    warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1] = w00, w01, w10, w11
+    uv[0] -= w00 * step[0] + w01 * step[1]
+    uv[1] -= w10 * step[0] + w11 * step[1]
+
+
+@compiled(**_FAST)
+def _factorise(square):  # type: ignore[no-untyped-def]
+    """Replace the lower triangle of a positive definite matrix by its Cholesky factor."""
+    for j in range(len(square)):
+        for i in range(j, len(square)):
+            total = square[i, j]
+            for k in range(j):
+                total -= square[i, k] * square[j, k]
+            square[i, j] = np.sqrt(total) if i == j else total / square[j, j]
+
+
+@compiled(**_FAST)
+def _solve(factor, right):  # type: ignore[no-untyped-def]
+    """Replace a right side by the solution, given a Cholesky factor."""
+    size = len(right)
+    for i in range(size):
+        for k in range(i):
+            right[i] -= factor[i, k] * right[k]
+        right[i] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            right[i] -= factor[k, i] * right[k]
+        right[i] /= factor[i, i]
