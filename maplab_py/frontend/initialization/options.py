@@ -53,7 +53,7 @@ class InitializationOptions:
         0.03, help="Largest standard deviation of the scale, as a share of it"
     )
     early_scale_sigma: float = option(
-        0.02, help="The same for a single camera before --vio_initialization_early_s has passed"
+        0.015, help="The same for a single camera before --vio_initialization_early_s has passed"
     )
     early_s: float = option(
         3.75, unit="s", help="Time during which a single camera waits for the better scale"

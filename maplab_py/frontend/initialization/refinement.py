@@ -8,10 +8,12 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection, camera_table
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.inertial import InertialChain
@@ -23,6 +25,11 @@ from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
 from maplab_py.frontend.initialization.imu_noise import noise_factor, with_least_noise
+from maplab_py.frontend.initialization.normal_points import (
+    Landmarks,
+    Rig,
+    with_normal_points,
+)
 from maplab_py.frontend.initialization.paced_work import Work, each_step
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import so3
@@ -39,7 +46,10 @@ _TOLERANCE = 1e-5
 _MIN_SHARE_IN_FRONT = 0.9
 _NEAR_SCALE_FACTOR = 2.0
 """The scale is not known more than so much better with less noise of the IMU."""
+_LEAST_INVERSE_DEPTH = 1e-4
+"""Of landmarks [1/m] for which observations are averaged."""
 _UNITS_PER_FRAME, _TRIANGULATION_UNITS, _COVARIANCE_UNITS = 0.17, 4.0, 5.0
+_NORMAL_POINTS_UNITS = 5.0
 """Units of work of an iteration for each frame, and of other parts."""
 
 
@@ -60,6 +70,7 @@ class Refined:
     covariance: F64  # (15, 15) of the last frame, order [p, theta, v, b_g, b_a]
     travelled_m: float  # largest distance from the first position
     travelled_sigma_m: float
+    scale_sigma: float  # standard deviation of the scale of all positions, as a share of it
     median_error_px: float
     num_landmarks: int
     num_rejected: int  # tracks with parallax that fit no point
@@ -71,11 +82,6 @@ class Refined:
         R = so3.to_matrix(self.states.T_M_I[-1, :4])
         in_M = R @ self.covariance[3:6, 3:6] @ R.T
         return float(np.sqrt(max(float(np.linalg.eigvalsh(in_M[:2, :2])[-1]), 0.0)))
-
-    @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale, as a share of it."""
-        return self.travelled_sigma_m / max(self.travelled_m, 1e-6)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +104,7 @@ class _Solved:
     chain: InertialChain
     states: WindowStates
     imu: Imu
-    landmarks: int
+    tracks: Tracks  # whose landmarks are those of the states
     rejected: int
     has_converged: bool
 
@@ -123,6 +129,7 @@ class Refinement:
             biases: What is known of them.
             data_sheet: The IMU with the least noise that it can have.
         """
+        self._rig = Rig(cameras, T_I_C)
         models, self._cameras = camera_table(cameras, T_I_C)
         self._kernels = window_kernels(models)
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
@@ -142,8 +149,8 @@ class Refinement:
         Args:
             segment: Frames.
             states: Their approximate states.
-            wanted_scale_sigma: Estimate the noise of the IMU, too, where the deviation of the scale comes
-                near to this; 0 = never.
+            wanted_scale_sigma: Where the deviation of the scale comes near to this, use the frames between
+                those of the segment and estimate the noise of the IMU, too; 0 = never.
         """
         round_ = _Round(
             segment, self._observations(segment), self._imu, _WIDE_GATE_CHI2, Loss.CAUCHY,
@@ -160,10 +167,22 @@ class Refinement:
         if refined is None or refined.scale_sigma > _NEAR_SCALE_FACTOR * wanted_scale_sigma:
             return refined
         assert solved is not None
-        imu = self._with_estimated_noise(solved)
+        segment = with_normal_points(
+            segment, solved.states, self._landmarks(solved), self._rig, self._options.gate_chi2
+        )
+        yield _NORMAL_POINTS_UNITS
+        imu, observed = self._with_estimated_noise(solved), self._observations(segment)
         yield _COVARIANCE_UNITS
-        again = yield from self._solved(dataclasses.replace(round_, imu=imu), solved.states)
+        round_ = dataclasses.replace(round_, segment=segment, observed=observed, imu=imu)
+        again = yield from self._solved(round_, solved.states)
         return self._judged(segment, again)
+
+    def _landmarks(self, solved: _Solved) -> Landmarks:
+        """Return the landmarks of a round that are not at infinity."""
+        tracks = solved.tracks
+        rows = tracks.landmark_rows[tracks.h[tracks.landmark_rows, 2] > _LEAST_INVERSE_DEPTH]
+        poses = CameraPoses.of(solved.states.T_M_I, self._rig.T_I_C)
+        return Landmarks(tracks.id[rows], tracks.points(rows, poses))
 
     def _with_estimated_noise(self, solved: _Solved) -> Imu:
         """Return the IMU with the noise that the residuals show; as assumed when they cannot tell."""
@@ -202,9 +221,9 @@ class Refinement:
         steps = optimizing_states(problem, start, solver, SILENT)
         states, summary = yield from each_step(steps, _UNITS_PER_FRAME * len(segment))
         has_converged = summary.iterations < round_.iterations and len(order) > 0
-        return _Solved(
-            problem, chain, states, round_.imu, len(rows), candidates - len(rows), has_converged
-        )
+        tracks.h[rows] = states.h
+        rejected = candidates - len(rows)
+        return _Solved(problem, chain, states, round_.imu, tracks, rejected, has_converged)
 
     @staticmethod
     def _judged(segment: Segment, solved: _Solved | None) -> Refined | None:
@@ -220,10 +239,12 @@ class Refinement:
         far = int(np.argmax(np.linalg.norm(states.T_M_I[:, 4:] - states.T_M_I[0, 4:], axis=1)))
         try:
             linear = problem.undamped_near(states)
-            covariance = problem.covariance(linear, len(states) - 1)
-            covariance_far = problem.covariance(linear, far)[:3, :3]
+            of_frames = problem.covariance_of_frames(linear)
         except NotPositiveDefinite:
             return None
+        last, first_far = FRAME_SIZE * (len(states) - 1), FRAME_SIZE * far
+        covariance = of_frames[last:, last:]
+        covariance_far = of_frames[first_far : first_far + 3, first_far : first_far + 3]
         way = states.T_M_I[far, 4:] - states.T_M_I[0, 4:]
         length = float(np.linalg.norm(way))
         ahead = way / max(length, 1e-9)
@@ -233,8 +254,9 @@ class Refinement:
             covariance=covariance,
             travelled_m=length,
             travelled_sigma_m=float(np.sqrt(max(float(ahead @ covariance_far @ ahead), 0.0))),
+            scale_sigma=_scale_sigma(states.T_M_I[:, 4:], of_frames),
             median_error_px=float(np.median(error_px)),
-            num_landmarks=solved.landmarks,
+            num_landmarks=len(solved.states.h),
             num_rejected=solved.rejected,
             imu=solved.imu,
         )
@@ -281,6 +303,24 @@ class Refinement:
             tracks, candidates, states.T_M_I, only_stereo=False
         )
         return tracks, min(len(candidates), options.max_landmarks)
+
+
+def _scale_sigma(p_M: F64, covariance: F64) -> float:
+    """Return the standard deviation of the scale of positions (F, 3), as a share of it.
+
+    It is that of a similarity alignment with the true positions: of s = sum q_i . p_i / sum q_i . q_i with
+    offsets q_i from the mean, to first order (S. Umeyama, PAMI 1991, equation 42). A single distance would
+    count the noise of two positions instead of all.
+
+    Args:
+        p_M: Positions.
+        covariance: Of all states (15 F, 15 F), which begin with the positions.
+    """
+    offset = p_M - p_M.mean(axis=0)
+    weight = np.zeros((len(p_M), FRAME_SIZE))
+    weight[:, :3] = offset / max(float(np.vdot(offset, offset)), 1e-12)
+    by_state = weight.ravel()
+    return float(np.sqrt(max(float(by_state @ covariance @ by_state), 0.0)))
 
 
 def mission_frame(g_A: F64) -> F64:

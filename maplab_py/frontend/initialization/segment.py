@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
+from typing import Self
 
 import numpy as np
 
@@ -16,19 +17,42 @@ from maplab_py.vimap.table import starts_of_counts
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Segment:
-    """F frames in the order of time, their N observations, and F - 1 inertial edges between them."""
+class ObservedFrames:
+    """F frames in the order of time, and their N observations."""
 
     time_ns: I64  # (F,)
-    inertial: InertialData  # (F - 1) edges
     frame: I32  # (N,) ascending
     camera: I32  # (N,)
     track_id: I64  # (N,)
     uv_px: F64  # (N, 2)
     sigma_px: F64  # (N,)
 
+    @classmethod
+    def of(cls, frames: list[WindowFrame]) -> Self:
+        """Join the observations of frames, which may be none."""
+        counts = [len(frame.track_id) for frame in frames]
+        none = np.zeros(0)
+        return cls(
+            time_ns=np.array([frame.time_ns for frame in frames], dtype=np.int64),
+            frame=np.repeat(np.arange(len(frames), dtype=np.int32), counts),
+            camera=np.concatenate([none, *(frame.camera for frame in frames)]).astype(np.int32),
+            track_id=np.concatenate(
+                [none.astype(np.int64), *(frame.track_id for frame in frames)]
+            ).astype(np.int64),
+            uv_px=np.concatenate([np.zeros((0, 2)), *(frame.uv_px for frame in frames)]),
+            sigma_px=np.concatenate([none, *(frame.sigma_px for frame in frames)]),
+        )
+
     def __len__(self) -> int:
         return len(self.time_ns)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Segment(ObservedFrames):
+    """F frames that get states, the inertial edges between them, and the frames that get none."""
+
+    inertial: InertialData  # (F - 1) edges
+    between: ObservedFrames  # at times of inertial samples
 
     @property
     def duration_s(self) -> float:
@@ -104,17 +128,15 @@ class History:
             imus=(imu,),
             imu_of_edge=np.zeros(len(edges), dtype=np.int64),
         )
-        kept = [frames[row] for row in chosen]
-        counts = [len(frame.track_id) for frame in kept]
+        is_chosen = np.zeros(len(frames), dtype=np.bool_)
+        is_chosen[chosen] = True
+        others = np.flatnonzero(~is_chosen[chosen[0] :]) + chosen[0]
+        kept = ObservedFrames.of([frames[row] for row in chosen])
+        between = ObservedFrames.of([frames[row] for row in others.tolist()])
         return Segment(
-            time_ns=np.array([frame.time_ns for frame in kept], dtype=np.int64),
-            inertial=inertial,
-            frame=np.repeat(np.arange(len(kept), dtype=np.int32), counts),
-            camera=np.concatenate([frame.camera for frame in kept]).astype(np.int32),
-            track_id=np.concatenate([frame.track_id for frame in kept]).astype(np.int64),
-            uv_px=np.concatenate([frame.uv_px for frame in kept]),
-            sigma_px=np.concatenate([frame.sigma_px for frame in kept]),
-        )
+            kept.time_ns, kept.frame, kept.camera, kept.track_id, kept.uv_px, kept.sigma_px,
+            inertial, between,
+        )  # fmt: skip
 
 
 def _joined(frames: list[WindowFrame]) -> tuple[I64, F64]:

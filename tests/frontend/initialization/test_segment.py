@@ -48,6 +48,10 @@ def test_all_samples_between_the_chosen_frames_are_kept_once() -> None:
         np.testing.assert_array_equal(values[:, 0], times_ns * 1e-9)
     assert segment.track_id.tolist() == [3, 4, 5, 7, 8, 9, 11, 12, 13]
     assert segment.frame.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    between = segment.between
+    assert between.time_ns.tolist() == [k * STEP_NS for k in (4, 5, 6, 8, 9, 10)]
+    assert between.track_id.reshape(-1, 3)[:, 0].tolist() == [4, 5, 6, 8, 9, 10]
+    assert between.frame.tolist() == np.repeat(np.arange(6), 3).tolist()
     times_ns, _ = filled(12).samples(0.1)
     assert times_ns.tolist() == list(range(9 * STEP_NS, 11 * STEP_NS + 1, 5_000_000))
 
