@@ -15,6 +15,7 @@ from maplab_py.storage.resource_types import resource_type
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap.resource_queries import resources_of
 
 
 def map_lookup(vi_map: VIMap, robot: str, timestamp_ns: int, sensor: str, p_S: F64) -> LookupReport:
@@ -40,7 +41,10 @@ def map_lookup(vi_map: VIMap, robot: str, timestamp_ns: int, sensor: str, p_S: F
         if len(times_ns) and times_ns[0] <= timestamp_ns <= times_ns[-1]:
             break
     else:
-        raise UserError(f"--timestamp_ns={timestamp_ns}: robot {robot} is not in the map then")
+        raise UserError(
+            f"--timestamp_ns={timestamp_ns}: robot {robot} is not in the map then, but "
+            + ", ".join(_times(vi_map, mission) for mission in rows)
+        )
     T_G_I, _ = interpolate_poses(
         times_ns, vi_map.T_G_I[of_mission], np.array([timestamp_ns], dtype=np.int64)
     )
@@ -72,7 +76,7 @@ def dense_points_in_range(
         radius_m: Its radius.
 
     Raises:
-        UserError: The map has no resource of the type.
+        UserError: The map has no resource of the type, or only in missions that are not anchored.
         MapError: A file is missing or damaged.
     """
     from maplab_py.viewer.options import PointCloudOptions
@@ -80,6 +84,12 @@ def dense_points_in_range(
 
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     name = resource_type(type_number).name
+    anchored = resources_of(vi_map, (type_number,), np.flatnonzero(known))
+    if not anchored.any() and resources_of(vi_map, (type_number,)).any():
+        raise UserError(
+            f"the resources of type '{name}' are all of missions that are not anchored yet, so it is not "
+            "known where they are in the map: serve_status says which robots have such missions"
+        )
     clouds = load_clouds(
         vi_map, map_folder, name, PointCloudOptions(), missions=np.flatnonzero(known)
     )
@@ -88,3 +98,9 @@ def dense_points_in_range(
     ]
     inside = [points for points in inside if len(points)]
     return np.concatenate(inside) if inside else np.zeros((0, 3)), len(inside)
+
+
+def _times(vi_map: VIMap, mission: int) -> str:
+    """Return the first and the last time of a mission (row) in words."""
+    times_ns = vi_map.vertices.timestamp_ns[slice(*vi_map.vertex_start[mission : mission + 2])]
+    return f"from {times_ns[0]} to {times_ns[-1]} ns" if len(times_ns) else "has no vertices"

@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
+from maplab_py.server.cloud_loops import with_cloud_loops
 from maplab_py.server.open_alignments import OpenAlignments
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.resource_folders import with_resources_taken_in
@@ -96,12 +98,14 @@ class _NewPart:
         rows: Its vertices in the map.
         part: They and their surroundings.
         searched: Numbers of the submaps in the part, the new ones last.
+        frequencies: Of the words (W,) of the submap.
     """
 
     stretches: list[Stretch]
     rows: I64
     part: Excerpt
     searched: list[int]
+    frequencies: F64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +129,7 @@ class Merger:
     Attributes:
         vi_map: The map; None before the first submap.
         radius: Trust region of the last joint optimisation; 0 = the default.
+        note: What the last joint optimisation had to leave out.
     """
 
     def __init__(
@@ -134,10 +139,20 @@ class Merger:
         *,
         loops: LoopClosureOptions | None = None,
         optimization: VIOptimizationOptions | None = None,
+        map_folder: Path | None = None,
     ) -> None:
-        """Start without a map."""
+        """Start without a map.
+
+        Args:
+            merging: How submaps become one map.
+            incremental: How much is looked at.
+            loops: How places are recognised.
+            optimization: Of a part, and of all.
+            map_folder: Where the map is published, for its clouds; None = clouds are not looked at.
+        """
         self.vi_map: VIMap | None = None
-        self.radius = 0.0
+        self.radius, self.note = 0.0, ""
+        self._map_folder = map_folder
         self._merging, self._incremental = merging, incremental
         self._loops = loops or LoopClosureOptions()
         self._optimization = optimization or VIOptimizationOptions(
@@ -184,8 +199,9 @@ class Merger:
         whole, local = self._optimized_around(whole, new.rows, progress)
         clock.lap("optimise")
         self.vi_map, self._open_alignments = self._laid_out(whole), pairs
+        is_whole = len(new.stretches) == 1 and self._places.is_trained
         for stretch in new.stretches:
-            self._remember(stretch, submap)
+            self._remember(stretch, submap, new.frequencies if is_whole else None)
         return MergeSteps(
             (*anchored, *others),
             loops.landmarks_merged,
@@ -213,7 +229,10 @@ class Merger:
         vi_map, _, _ = self._anchored(vi_map, progress)
         if self._merging.enable_visual_loop_closure:
             vi_map = self._with_all_loops(vi_map, progress)
-        options = self._optimization
+        options, self.note = self._optimization, ""
+        if self._merging.enable_lidar_loop_closure and self._map_folder is not None:
+            vi_map, self.note = with_cloud_loops(vi_map, self._map_folder, progress)
+            options = dataclasses.replace(options, include_loop_closure_edges=True)
         if self.radius > 0.0 and self._merging.preserve_trust_region_radius_across_merging:
             options = dataclasses.replace(options, initial_trust_region_radius=self.radius)
         vi_map, report = optimize(vi_map, options, progress=progress)
@@ -237,11 +256,10 @@ class Merger:
         whole, _ = merge_maps(base, submap.replace(baseframes=frames))
         return with_resources_taken_in(whole, submap)
 
-    def _similar(self, submap: VIMap) -> list[int]:
-        """Return the numbers of the submaps that look most like one."""
+    def _similar(self, frequencies: F64) -> list[int]:
+        """Return the numbers of the submaps that look most like one of some word frequencies (W,)."""
         if not self._merging.enable_visual_loop_closure:
             return []
-        frequencies = self._places.frequencies(submap)
         numbers = self._places.similar(frequencies, self._incremental.similar_stretches)
         return numbers.tolist()  # type: ignore[no-any-return]
 
@@ -249,10 +267,11 @@ class Merger:
         """Return the new vertices with the part of the map in which their loops are looked for."""
         stretches = stretches_of(submap)
         rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
-        similar, known = self._similar(submap), len(self._stretches)
+        frequencies = self._places.frequencies(submap)
+        similar, known = self._similar(frequencies), len(self._stretches)
         part = excerpt(whole, self._searched_vertices(whole, rows, similar))
         searched = [*similar, *range(known, known + len(stretches))]
-        return _NewPart(stretches, rows, part, searched)
+        return _NewPart(stretches, rows, part, searched, frequencies)
 
     def _searched_vertices(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
         """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
@@ -335,7 +354,9 @@ class Merger:
         if not is_wanted or known.all() or not known.any():
             return vi_map, (), False
         try:
-            result, report = anchor_missions(vi_map, loop_options=self._loops, progress=progress)
+            result, report = anchor_missions(
+                vi_map, loop_options=self._loops, projections=self._projections, progress=progress
+            )
         except EstimationError:  # no descriptors or too few tracks: it stays unknown
             return vi_map, (), False
         names = {id_[:8]: id_ for id_ in map(to_hex, vi_map.missions.id)}
@@ -382,12 +403,15 @@ class Merger:
         except EstimationError:  # nothing to recognise places by
             return vi_map
 
-    def _remember(self, stretch: Stretch, submap: VIMap) -> None:
+    def _remember(self, stretch: Stretch, submap: VIMap, frequencies: F64 | None = None) -> None:
+        """Make a stretch known to place recognition; its word frequencies (W,) may be given."""
         if not self._places.is_trained:
             with contextlib.suppress(EstimationError):  # another submap will have enough tracks
                 self._places.train(submap)
         self._stretches.append(stretch)
-        self._places.add(self._places.frequencies(submap, stretch.vertices(submap)))
+        if frequencies is None:
+            frequencies = self._places.frequencies(submap, stretch.vertices(submap))
+        self._places.add(frequencies)
 
 
 def _ids(names: Iterable[str]) -> IdArray:

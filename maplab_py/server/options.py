@@ -31,6 +31,11 @@ class MergingOptions:
     """How submaps become one map."""
 
     enable_visual_loop_closure: bool = option(True, help="Close loops within and between missions.")
+    enable_lidar_loop_closure: bool = option(
+        False,
+        help="Before joint optimisations, register clouds of lidars that are near one another, and use the "
+        "relative poses; needs the extra lidar. Clouds are registered again each time.",
+    )
     enable_visual_loop_closure_based_map_anchoring: bool = option(
         True, help="Anchor missions of unknown base frame to known ones by loop closures."
     )
@@ -139,6 +144,27 @@ class ServiceOptions:
     keep_submaps: bool = option(
         True, help="Keep submaps in the spool's folder merged, so that the map can be built again."
     )
+    save_on_shutdown: bool = option(
+        True,
+        help="At its end the server optimises jointly and publishes; otherwise it ends at once, and what it "
+        "has not published is merged again after the next start.",
+    )
+    visualization_interval_s: float = option(
+        10.0,
+        help="With --serve_visualize_map, show the published map at most every so often, and at the end; "
+        "0 = after every publication.",
+        unit="s",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the times.
+
+        Raises:
+            FlagError: One is negative.
+        """
+        for name in ("stop_when_idle_s", "visualization_interval_s"):
+            if not getattr(self, name) >= 0.0:
+                raise FlagError(f"--serve_{name} must not be negative")
 
 
 @dataclasses.dataclass(frozen=True)

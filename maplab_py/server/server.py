@@ -30,6 +30,7 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import Cancelled, MaplabError, UserError
 from maplab_py.progress import SILENT, Progress
+from maplab_py.server.display import Display
 from maplab_py.server.intake import Intake, Item
 from maplab_py.server.journal import Journal, MergedSubmap, write_journal
 from maplab_py.server.locking import locked_spool
@@ -97,9 +98,10 @@ class MapServer:
         self.events = Events(spool.log, progress)
         self.published: VIMap | None = None
         self.steps: list[dict[str, float]] = []
-        self._merger = Merger(options, self.incremental)
+        self._merger = self._new_merger()
         self._stationary = stationary or StationaryOptions()
-        self._progress, self._watch, self._shown_at = progress, watch, shown_at
+        self._progress, self._shown_at = progress, shown_at
+        self._display = Display(watch, self.service.visualization_interval_s)
         self._requests: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
         self._is_stopping = False
         self._problem, self._logged_problems = "", set[str]()
@@ -198,12 +200,15 @@ class MapServer:
         write_journal(self.journal, self.spool.journal)
         if recovered.is_changed:
             self._publish()
-        elif self.published is not None and self._watch is not None:
-            self._watch(self.published)
+        else:
+            self._display.offer(self.published)
+
+    def _new_merger(self) -> Merger:
+        return Merger(self.options, self.incremental, map_folder=self.publisher.folder)
 
     def _restore(self, vi_map: VIMap | None) -> None:
         stretches = [s for submap in self.journal.merged for s in submap.stretches]
-        self._merger = Merger(self.options, self.incremental)
+        self._merger = self._new_merger()
         self._merger.radius = self.journal.radius
         if vi_map is not None:
             self._merger.restore(vi_map, stretches)
@@ -217,10 +222,17 @@ class MapServer:
                 busy_s = time.monotonic()
             elif idle_s and time.monotonic() - busy_s >= idle_s:
                 break
+            self._display.show()
             if not has_worked:
                 self._wake.wait(_SECONDS_BETWEEN_LOOKS)
                 self._wake.clear()
         self._answer_requests()
+        if self.service.save_on_shutdown:
+            self._finish()
+        self._display.show(at_once=True)
+
+    def _finish(self) -> None:
+        """Optimise jointly, and publish."""
         self._retry_s = 0.0
         if self.journal.since_joint:
             self._publish_if_needed(force=True)
@@ -358,7 +370,8 @@ class MapServer:
         """Optimise the whole map; False where new work has interrupted it."""
         try:
             moved_m = self._merger.optimize_jointly(progress=progress)
-            self.events.add(f"optimised jointly: the largest move is {moved_m:.3f} m")
+            note = f"; {self._merger.note}" if self._merger.note else ""
+            self.events.add(f"optimised jointly: the largest move is {moved_m:.3f} m{note}")
             self._joint_count += 1
         except _Interrupted:
             return False
@@ -407,8 +420,7 @@ class MapServer:
         self.published, self._problem = vi_map, ""
         waiting = tuple(f"{item.entry.title}: " for item in self._intake.items.values())
         self._logged_problems = {p for p in self._logged_problems if p.startswith(waiting)}
-        if self._watch is not None and vi_map is not None:
-            self._watch(vi_map)
+        self._display.offer(vi_map)
         return True
 
     def _fail(self, problem: str) -> None:

@@ -12,6 +12,7 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server.client import NotRunning, ask, order
+from maplab_py.server.journal import read_journal
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, ServiceOptions
 from maplab_py.server.server import MapServer
@@ -110,6 +111,25 @@ def test_merged_submaps_are_published_before_a_joint_optimisation(
     times_ns = session("ant").vertices.timestamp_ns
     of_two = np.count_nonzero(times_ns <= submaps("ant")[1].vertices.timestamp_ns[-1])
     assert published == [of_two, len(times_ns)]
+
+
+def test_without_saving_at_the_end_a_later_server_goes_on(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    servers.service = ServiceOptions(stop_when_idle_s=0.5, save_on_shutdown=False)
+    for number in range(3):
+        servers.put("ant", number)
+    server = servers.make()
+    monkeypatch.setattr("maplab_py.server.server.pause_s", lambda _: 1e9)
+    report = server.run(lambda: len(server.steps) == 2)
+    assert report.joint_optimizations == 0
+    published = servers.published()
+    assert len(published.vertices) == len(submaps("ant")[0].vertices)
+    assert len(read_journal(servers.spool.journal).merged) == 1
+    servers.service = ServiceOptions(stop_when_idle_s=0.5)
+    server = servers.run()
+    servers.check_whole("ant")
+    assert server.journal.since_joint == 0
 
 
 def test_the_watcher_sees_every_published_map(servers: Servers) -> None:

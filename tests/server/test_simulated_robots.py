@@ -12,7 +12,7 @@ import pytest
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, write_ply
-from maplab_py.server.lookup import dense_points_in_range
+from maplab_py.server.lookup import dense_points_in_range, map_lookup
 from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import find_maps, save_map
@@ -98,6 +98,15 @@ def test_resources_of_recordings_come_along_and_the_server_finds_them(servers: S
         published, servers.map_folder, _POINT_CLOUD, center_G, 2.0
     )
     assert (len(points), clouds) == (2, 1)
+    frames = published.baseframes
+    unknown = published.replace(baseframes=frames.replace(is_known=np.zeros_like(frames.is_known)))
+    with pytest.raises(UserError, match="all of missions that are not anchored yet"):
+        dense_points_in_range(unknown, servers.map_folder, _POINT_CLOUD, center_G, 2.0)
+    with pytest.raises(UserError, match="no resources of type"):
+        dense_points_in_range(published, servers.map_folder, 8, center_G, 2.0)
+    first, last = published.vertices.timestamp_ns[published.vertices.mission == 0][[0, -1]]
+    with pytest.raises(UserError, match=f"then, but from {first} to {last} ns"):
+        map_lookup(published, published.missions.name[0], last + 1, "", np.zeros(3))
     shutil.rmtree(maps / "ant" / "resources")
     with pytest.raises(MapError, match="the resource's file is missing"):
         timed_submaps(recorded_sessions(maps), 3.0)

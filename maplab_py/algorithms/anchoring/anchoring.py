@@ -33,6 +33,7 @@ from maplab_py.algorithms.loop_closure.alignment_contest import AlignmentChoice
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
+from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.workflow import describe
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import yaw
@@ -53,6 +54,7 @@ def anchor_missions(
     missions: I64 | None = None,
     choice: AlignmentChoice | None = None,
     absolute: AbsoluteAnchoringOptions = _ABSOLUTE,
+    projections: ProjectionMemory | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, AnchoringReport]:
     """Anchor missions of unknown base frame by their absolute poses, then to those of known one.
@@ -68,6 +70,7 @@ def anchor_missions(
         missions: Mission rows to anchor; None = all unknown ones. Others may serve as bridges.
         choice: An alignment that a person has chosen; `options.hypothesis` is one, too.
         absolute: When the absolute poses of a mission count as agreeing.
+        projections: Keeps the descriptor projection from one call to the next; None = it is learned.
         progress: Progress.
 
     Raises:
@@ -87,15 +90,7 @@ def anchor_missions(
     if options.hypothesis:
         choice = AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
-    detection = detect(
-        judged,
-        loop_options,
-        missions=np.arange(len(known)),
-        only_other_missions=True,
-        trust_base_frames=False,
-        choice=choice,
-        progress=progress,
-    )
+    detection = _between_missions(judged, loop_options, choice, projections, progress)
     T_G_M, reached, pairs = _aligned(
         yaw.from_pose(vi_map.T_G_M),
         known,
@@ -125,6 +120,25 @@ def anchor_missions(
         return vi_map, report
     result = _with_base_frames(vi_map, T_G_M, anchored)
     return with_closures(result, detection.closures, "anchor"), report
+
+
+def _between_missions(
+    vi_map: VIMap,
+    options: LoopClosureOptions,
+    choice: AlignmentChoice | None,
+    projections: ProjectionMemory | None,
+    progress: Progress,
+) -> Detection:
+    return detect(
+        vi_map,
+        options,
+        missions=np.arange(len(vi_map.missions)),
+        only_other_missions=True,
+        trust_base_frames=False,
+        choice=choice,
+        scope=SearchScope(projections=projections),
+        progress=progress,
+    )
 
 
 def _unknown(known: NDArray[np.bool_], missions: I64 | None) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from maplab_py.vimap.ids import as_keys, to_hex
 from maplab_py.vimap.queries import mission_sensor_id
 from maplab_py.vimap.resource_queries import resources_of
 
-_CLOUDS = (16, 17, 21)
+CLOUD_TYPES = (16, 17, 21)
 """Resource types of clouds: plain, with colours, with intensities."""
 _KEPT = 400
 """Number of prepared clouds in memory."""
@@ -59,7 +59,7 @@ def map_scans(vi_map: VIMap, missions: I64, every_nth: int = 1) -> Scans:
         MapError: A sensor has no extrinsics.
     """
     table = vi_map.resources
-    chosen = resources_of(vi_map, _CLOUDS, missions)
+    chosen = resources_of(vi_map, CLOUD_TYPES, missions)
     chosen &= table.owner_kind == ResourceOwner.SENSOR
     rows = np.flatnonzero(chosen)
     keys = as_keys(table.sensor_id[rows])

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry import so3
-from maplab_py.sensors import Camera
+from maplab_py.sensors import Camera, Projection
+from maplab_py.sensors.camera import Distortion
 from maplab_py.sensors.projection import back_project
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 
 _TILE_PX = 4.0
 _TILES = 1 << 20  # larger than the height of an image
+_TILES_PER_KEYPOINT = 4
+"""With more keypoints all tiles of an image are computed, and kept for the next time."""
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 _SENSORS = [MissionSensor.IMU, MissionSensor.NCAMERA]
 
@@ -47,14 +52,45 @@ def bearings(camera: Camera, uv: F64) -> tuple[F64, F64, Mask]:
     The angle hardly changes from pixel to pixel: it is that of the middle of a small tile.
     """
     tile = np.floor(np.nan_to_num(uv) / _TILE_PX).astype(np.int64)
-    first = tile.min(axis=0, initial=0)
-    key = (tile - first) @ np.array([_TILES, 1])
-    key, of_keypoint = np.unique(key, return_inverse=True)
-    middle = (np.stack(np.divmod(key, _TILES), axis=1) + first + 0.5) * _TILE_PX
-    corners = (middle + offset for offset in _CORNERS)
-    rays, is_ray = back_project(camera, np.concatenate([uv, *corners]))
-    ray, right, below = rays[len(uv) :].reshape(3, -1, 3)
+    shape = (np.array([camera.width_px, camera.height_px]) / _TILE_PX).astype(np.int64) + 1
+    rays, is_ray = back_project(camera, uv)
+    if _TILES_PER_KEYPOINT * len(uv) >= shape.prod() and ((tile >= 0) & (tile < shape)).all():
+        angle, is_sound = _angles_of_image(
+            camera.projection, camera.distortion, camera.intrinsics.tobytes(),
+            camera.distortion_parameters.tobytes(), *shape.tolist(),
+        )  # fmt: skip
+        of_keypoint = tile @ np.array([shape[1], 1])
+    else:
+        first = tile.min(axis=0, initial=0)
+        key = (tile - first) @ np.array([_TILES, 1])
+        key, of_keypoint = np.unique(key, return_inverse=True)
+        angle, is_sound = _angles(camera, np.stack(np.divmod(key, _TILES), axis=1) + first)
+    return rays, angle[of_keypoint], is_ray & is_sound[of_keypoint]
+
+
+@lru_cache(maxsize=16)
+def _angles_of_image(
+    projection: Projection,
+    distortion: Distortion,
+    intrinsics: bytes,
+    parameters: bytes,
+    columns: int,
+    rows: int,
+) -> tuple[F64, Mask]:
+    """Return `_angles` of all tiles of an image, column after column; many keypoints share them."""
+    camera = Camera(
+        "", projection, distortion, np.frombuffer(intrinsics), np.frombuffer(parameters), 0, 0
+    )
+    tiles = np.stack(np.divmod(np.arange(columns * rows), rows), axis=1)
+    return _angles(camera, tiles)
+
+
+def _angles(camera: Camera, tiles: I64) -> tuple[F64, Mask]:
+    """Return the angles that a pixel covers in the middle of tiles (N, 2), and which are known."""
+    middle = (tiles + 0.5) * _TILE_PX
+    corners = np.concatenate([middle + offset for offset in _CORNERS])
+    rays, is_ray = back_project(camera, corners)
+    ray, right, below = rays.reshape(3, -1, 3)
     area = np.linalg.norm(np.cross(right - ray, below - ray), axis=1)
-    is_sound = is_ray[len(uv) :].reshape(3, -1).all(axis=0) & (area > 0.0)
-    angle = np.sqrt(np.where(is_sound, area, 1.0))
-    return rays[: len(uv)], angle[of_keypoint], is_ray[: len(uv)] & is_sound[of_keypoint]
+    is_sound = is_ray.reshape(3, -1).all(axis=0) & (area > 0.0)
+    return np.sqrt(np.where(is_sound, area, 1.0)), is_sound
