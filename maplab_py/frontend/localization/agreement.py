@@ -2,7 +2,7 @@
 
 Where the map looks like another place, wrong answers agree with each other for a while. A localised odometry
 knows where it is but for its drift since it last observed the map; answers that contradict it by more are
-believed only when they agree for longer.
+believed only when they agree for longer, or have many matches.
 """
 
 from __future__ import annotations
@@ -26,6 +26,12 @@ _LARGEST_DRIFT, _LARGEST_TURN_DEG = 0.05, 10.0
 """Possible drift since the map was last observed, as a share of the path, and possible turn."""
 _IMPOSSIBLE = 4
 """So many times as many answers must agree that the estimate is off by more than it can have drifted."""
+_ENOUGH_MATCHES = 80
+"""Matches of answers that agree, from which on their number does not matter.
+
+Where the map looks like another place, wrong answers have five to eleven matches (Tango): eight of them. In a
+map that was moved, an answer has dozens.
+"""
 
 
 class Verdict(Enum):
@@ -81,11 +87,17 @@ class AgreementFilter:
         if self._candidates and not _agree(self._candidates[-1], candidate):
             self._candidates.clear()
         self._candidates.append(candidate)
-        factor = 1 if all(c.is_possible for c in self._candidates) else _IMPOSSIBLE
-        if len(self._candidates) < factor * self._least:
+        if len(self._candidates) < self._required():
             return Verdict.WAIT
         self._observed_at_m = path_m
         return Verdict.START
+
+    def _required(self) -> int:
+        """Return how many answers must agree: more if the odometry cannot have drifted to some."""
+        matches = sum(len(candidate.answer) for candidate in self._candidates)
+        if all(c.is_possible for c in self._candidates) or matches >= _ENOUGH_MATCHES:
+            return self._least
+        return _IMPOSSIBLE * self._least
 
     def _may_drift(self, T_G_I: F64, answered: F64, path_m: float) -> bool:
         """Tell whether the odometry can have drifted from an answer to the estimate, both (7,)."""
