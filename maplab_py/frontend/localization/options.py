@@ -76,7 +76,7 @@ class OnlineLocalizationOptions:
     min_num_estimates: int = option(
         2,
         help="Answers in a row that must agree before T_G_M is set, or set again; four times as many "
-        "where they differ by more than the odometry drifts",
+        "where they differ by more than the odometry drifts and have fewer than 80 matches together",
         flag="rovioli_min_num_baseframe_estimates_before_init",
     )
     max_mean_error_px: float = option(
