@@ -14,7 +14,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.window.map_gate import contradicted_unless_most
+from maplab_py.estimation.window.map_gate import MAP_GATE_CHI2, contradicted_unless_most
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
@@ -234,7 +234,7 @@ class LocalizedSmoother(FixedLagSmoother):
             return
         error2 = terms.errors_px(self._states) ** 2
         mean2 = np.add.reduceat(error2, seen.start[:-1]) / np.diff(seen.start)
-        is_wrong = ~(mean2 <= self.options.gate_chi2 * self.rule.sigma_px**2)
+        is_wrong = ~(mean2 <= MAP_GATE_CHI2 * self.rule.sigma_px**2)
         if seen.information_G is not None:
             offset = self._states.p_G - seen.p_G
             chi2 = np.einsum("ai,aij,aj->a", offset, seen.information_G, offset)

@@ -52,7 +52,7 @@ class WindowOptions:
     )
     huber_sigmas: float = option(1.345, help="Scale of the Huber loss of reprojection errors.")
     gate_chi2: float = option(
-        13.8, help="Largest squared error of an observation in standard deviations (99.9 %: 13.8)."
+        9.21, help="Largest squared error of an observation in standard deviations (99 %: 9.21)."
     )
     prediction_sigma_px: float = option(
         2.0, unit="px", help="Uncertainty of a predicted place, for gates of new observations."

@@ -38,6 +38,8 @@ from maplab_py.sensors import Camera, Imu
 
 _GAUGE_SIGMA = 1e-4
 """Standard deviation of first position [m] and heading [rad], which are free to choose."""
+_GATE_CHI2 = 13.8
+"""Gate of observations (99.9 %). A track over 28 frames whose points all pass 99 % would be rare."""
 _WIDE_GATE_CHI2 = 30.0**2
 """Gate of the first round, in which positions are only as good as the closed form's."""
 _ITERATIONS = (15, 40)
@@ -134,7 +136,7 @@ class Refinement:
         self._kernels = window_kernels(models)
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
         self._inertial = residual_kernel("inertial", sources.inertial)
-        options = WindowOptions(max_landmarks=_MAX_LANDMARKS)
+        options = WindowOptions(max_landmarks=_MAX_LANDMARKS, gate_chi2=_GATE_CHI2)
         self._standstill = Standstill(
             residual_kernel("relative_pose", sources.relative_pose), options.standstill
         )

@@ -14,7 +14,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.alignment import aligned
 from maplab_py.estimation.window.localized import LocalizedSmoother, composition_jacobian
-from maplab_py.estimation.window.map_gate import contradicted_unless_most
+from maplab_py.estimation.window.map_gate import MAP_GATE_CHI2, contradicted_unless_most
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
@@ -169,7 +169,7 @@ class SlidingWindowEstimator(_LooseEstimator):
         states = dataclasses.replace(states, T_G_M=self.T_G_M[None])
         start = terms.observations.start
         mean2 = np.add.reduceat(terms.errors_px(states) ** 2, start[:-1]) / np.diff(start)
-        self._tracks.refuse(used[~(mean2 <= self._options.gate_chi2 * rule.sigma_px**2)])
+        self._tracks.refuse(used[~(mean2 <= MAP_GATE_CHI2 * rule.sigma_px**2)])
 
     def _terms(self, smoother: FixedLagSmoother) -> tuple[MapTerms, I64]:
         """Return the observations of the map in the window, and their associations (rows)."""
