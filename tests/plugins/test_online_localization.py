@@ -7,24 +7,36 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.frontend.reports import MappingReport
 from maplab_py.interop.trajectories import Trajectory, write_euroc
+from maplab_py.simulation.scenario import SessionOptions
 from maplab_py.storage.native import save_map
-from maplab_py.storage.summary_map import write_summary_map
+from maplab_py.storage.summary_map import SummaryMap, write_summary_map
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.display.viewer import Viewer
-from tests.frontend.localization.places import place, summary
+from tests.frontend.localization.places import Place, place_of
+
+
+def walk() -> Place:
+    """A map and a session of 12 s in it; a single camera may take 4 s to start."""
+    return place_of(SessionOptions(duration_s=12.0, turns=0.7, start_turn=0.2, height_m=1.7))
+
+
+def walk_summary() -> SummaryMap:
+    return make_summary_map(walk().vi_map, SummaryMapOptions())
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the map, its summary map, the recording, and the truth of both in G."""
-    folder, where = tmp_path_factory.mktemp("localisation"), place()
+    folder, where = tmp_path_factory.mktemp("localisation"), walk()
     save_map(where.vi_map, folder / "map")
     save_map(where.query, folder / "query")
-    write_summary_map(summary(), folder / "summary")
+    write_summary_map(walk_summary(), folder / "summary")
     write_euroc(Trajectory(where.times_ns, where.T_G_I), folder / "truth.csv")
     write_euroc(
         Trajectory(where.vi_map.vertices.timestamp_ns, where.vi_map.T_G_I), folder / "map_truth.csv"
@@ -119,7 +131,7 @@ def test_wrong_input_is_told_in_one_line(folders: Path, tmp_path: Path) -> None:
 
 
 def test_evaluation_tells_what_is_missing(folders: Path, tmp_path: Path) -> None:
-    late = Trajectory(place().times_ns + 10**12, place().T_G_I)
+    late = Trajectory(walk().times_ns + 10**12, walk().T_G_I)
     write_euroc(late, tmp_path / "late.csv")
     with Session() as session:
         with pytest.raises(UserError, match="--localization_csv=FILE"):
@@ -164,8 +176,8 @@ def test_the_viewer_shows_the_map_both_paths_and_the_matches(
     subject = shown[-1]
     run = subject.localized
     assert run is not None
-    where = place()
-    np.testing.assert_array_equal(run.p_G, summary().p_G)
+    where = walk()
+    np.testing.assert_array_equal(run.p_G, walk_summary().p_G)
     rows = np.searchsorted(where.times_ns, subject.vi_map.vertices.timestamp_ns)
     error_m = np.linalg.norm(subject.vi_map.T_G_I[:, 4:] - where.T_G_I[rows, 4:], axis=1)
     assert np.median(error_m) < 0.1  # the map of the run is drawn in G
