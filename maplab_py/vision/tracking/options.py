@@ -20,7 +20,7 @@ class TrackingOptions(FeatureOptions):
     flag_prefix: ClassVar[str] = "feature_tracking_"
 
     keypoint_sigma_px: float = option(
-        0.8, help="Standard deviation of a tracked keypoint", unit="px"
+        0.5, help="Standard deviation of a tracked keypoint", unit="px"
     )
     patch_size_px: int = option(15, help="Side of the patches that are compared", unit="px")
     pyramid_levels: int = option(3, help="Levels of half resolution above the image")
