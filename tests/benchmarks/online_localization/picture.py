@@ -49,7 +49,7 @@ def draw(of: Setting, share: float, target: Path = TARGET) -> None:
     axes.set(xlabel="time [s]", ylabel="position error in the map [cm]", ylim=(0.0, None))
     for each in (above, axes):
         each.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, ncols=4, loc="upper left")
+    axes.legend(frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     figure.savefig(target, metadata={"Date": None})
 
 
