@@ -46,7 +46,8 @@ def align(image: U8, uv: F64, patch: F32, warp: F64) -> AlignedKeypoints:
     """
     aligned_uv, aligned_warp, similarity = uv.copy(), warp.copy(), np.empty(len(uv))
     align_patches(image, patch, aligned_uv, aligned_warp, similarity)
-    step_px = np.linalg.norm(aligned_uv - uv, axis=1)
+    with np.errstate(invalid="ignore"):  # of places that are no numbers
+        step_px = np.linalg.norm(aligned_uv - uv, axis=1)
     is_finite = np.isfinite(step_px) & np.isfinite(aligned_warp).all(axis=(1, 2))
     shows = is_finite & (similarity >= _MIN_SIMILARITY) & (step_px <= _LARGEST_STEP_PX)
     aligned_uv[~shows], aligned_warp[~shows] = uv[~shows], np.eye(2)

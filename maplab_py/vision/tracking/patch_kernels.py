@@ -26,14 +26,16 @@ _CONVERGED_PX = 0.01
 
 @compiled(**_FAST)
 def sample_patches(image, uv, patch):  # type: ignore[no-untyped-def]
-    """Fill in the patches (K, S, S) about keypoints uv (K, 2) of an image (H, W); they lie in it."""
+    """Fill in the patches (K, S, S) about keypoints uv (K, 2) of an image (H, W), continued at its border."""
     height, width = image.shape
     reach = HALF_PX + 1
     for k in range(len(uv)):
         for row in range(SIDE_PX):
             for column in range(SIDE_PX):
-                u = min(max(uv[k, 0] + column - reach, 0.0), width - 1.001)
-                v = min(max(uv[k, 1] + row - reach, 0.0), height - 1.001)
+                u, v = uv[k, 0] + column - reach, uv[k, 1] + row - reach
+                # of places that are no numbers, too, as nothing may be read outside the image
+                u = min(u, width - 1.001) if u > 0.0 else 0.0
+                v = min(v, height - 1.001) if v > 0.0 else 0.0
                 patch[k, row, column] = _bilinear(image, u, v)
 
 

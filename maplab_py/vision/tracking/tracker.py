@@ -168,10 +168,11 @@ class FrameTracker:
                 if abs(angle_rad) > _MIN_IN_PLANE_TURN_RAD:
                     before, start = turned_in_plane(before, start, view.centre, angle_rad)
             uv, is_tracked = follow(before, image, start, guess, self._flow)
+            tracks, uv, guess = tracks[is_tracked], uv[is_tracked], guess[is_tracked]
             aligned = align(image, uv, tracks.patch, turn @ tracks.warp)
             uv, tracks = aligned.uv, tracks.compared_with(aligned.patch, aligned.warp)
             ray, exists = view.rays(uv)
-            left = is_tracked & exists & view.is_usable(uv)
+            left = exists & view.is_usable(uv)
             tracks, uv, ray, guess = tracks[left], uv[left], ray[left], guess[left]
         with watch("outliers"):
             motion = image_motion(

@@ -142,3 +142,11 @@ def test_corners_at_the_border_stay_near_it() -> None:
     uv = np.array([[1.0, 2.0], [358.0, 238.0]])
     assert np.linalg.norm(refined(image, uv) - uv, axis=1).max() <= 2.0
     assert refined(image, uv[:0]).shape == (0, 2)
+
+
+def test_places_that_are_no_numbers_or_outside_read_nothing_outside_the_image() -> None:
+    image = np.full((48, 64), 7, dtype=np.uint8)
+    nowhere = np.array([[np.nan, np.nan], [1e9, -1e9], [np.inf, -np.inf]])
+    np.testing.assert_array_equal(patches(image, nowhere), 7.0)
+    aligned = align(image, nowhere, patches(image, nowhere), np.tile(np.eye(2), (3, 1, 1)))
+    np.testing.assert_array_equal(aligned.warp, np.tile(np.eye(2), (3, 1, 1)))
