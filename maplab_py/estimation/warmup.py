@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from functools import partial
 
@@ -12,7 +11,7 @@ from maplab_py.estimation.linear import block_cholesky
 from maplab_py.estimation.problem import iterative
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.terms import factor, visual
-from maplab_py.sensors import Distortion, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS, is_known_to_maplab
 
 _RESIDUALS = (
     "inertial",
@@ -37,7 +36,7 @@ def optimizer_jobs() -> dict[str, Callable[[], None]]:
     jobs["block Cholesky"] = block_cholesky.compile_kernels
     jobs["conjugate gradients"] = iterative.compile_without_images
     jobs["preintegration"] = preintegration.compile_kernels
-    for projection, distortion in itertools.product(Projection, Distortion):
+    for projection, distortion in filter(lambda model: is_known_to_maplab(*model), CAMERA_MODELS):
         model = f"{projection.name} {distortion.name}"
         models = ((projection, distortion),)
         jobs[f"reprojection {model}"] = partial(_compile_reprojection, models)

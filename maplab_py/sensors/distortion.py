@@ -36,7 +36,7 @@ def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
 def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
     """Return undistorted points (..., 2) and whether they are valid (...,).
 
-    Points beyond the image of the model (for radial-tangential and equidistant: beyond the radius
+    Points beyond the image of the model (for Brown's models and equidistant: beyond the radius
     up to which the distortion grows) are invalid; their value is finite but has no meaning.
     """
     if kind is Distortion.NONE:
@@ -45,7 +45,7 @@ def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
         return _undistort_fov(parameters, x_d)
     if kind is Distortion.EQUIDISTANT:
         return _undistort_equidistant(parameters, x_d)
-    return _undistort_radtan(parameters, x_d)
+    return _undistort_brown(parameters, x_d)
 
 
 def largest_radius(kind: Distortion, parameters: F64) -> float:
@@ -53,12 +53,29 @@ def largest_radius(kind: Distortion, parameters: F64) -> float:
 
     Beyond this radius the polynomial models are not injective.
     """
-    if kind is Distortion.RADTAN:
-        return float(np.sqrt(_first_root((1.0, 3 * parameters[0], 5 * parameters[1]))))
+    if kind in (Distortion.RADTAN, Distortion.RADTAN5, Distortion.RATIONAL):
+        return _largest_brown_radius(tuple(float(k) for k in parameters))
     if kind is Distortion.EQUIDISTANT:
         theta = _largest_theta(parameters)
         return float(np.tan(theta)) if theta < 0.5 * np.pi else float(np.inf)
     return float(np.inf)
+
+
+def _largest_brown_radius(k: tuple[float, ...]) -> float:
+    """Return where r N / D, N and D polynomials of t = r^2, stops growing or has a pole."""
+    k1, k2, _, _, *more = k
+    radial = [k1, k2, *more[:1]]
+    slope = (1.0, *((2 * i + 3) * value for i, value in enumerate(radial)))
+    if len(more) < 2:
+        return float(np.sqrt(_first_root(slope)))
+    below = np.array([1.0, *more[1:]])
+    product = np.polynomial.polynomial.polymul
+    falling = 2.0 * product(
+        [1.0, *radial], np.concatenate([[0.0], np.polynomial.polynomial.polyder(below)])
+    )
+    rising = product(slope, below)
+    first = _first_root(tuple((rising - falling).tolist())), _first_root(tuple(below.tolist()))
+    return float(np.sqrt(min(first)))
 
 
 def _largest_theta(k: F64) -> float:
@@ -86,13 +103,31 @@ def _radial(x: F64, s: F64, ds_over_r: F64, ds_dparameters: F64) -> Distorted:
     return s[..., None] * x, J, x[..., :, None] * ds_dparameters[..., None, :]
 
 
-def _radtan(parameters: F64, x: F64) -> Distorted:
-    """Brown's model, k1 k2 p1 p2, as OpenCV orders them."""
-    k1, k2, p1, p2 = (float(k) for k in parameters)
+def _radial_factor(k: tuple[float, ...], r2: F64) -> tuple[F64, F64, F64 | float]:
+    """Return Brown's s, 2 ds/dr^2, and the denominator of s; parameters as `_brown` has them."""
+    k1, k2 = k[:2]
+    if len(k) == 4:
+        return 1.0 + r2 * (k1 + k2 * r2), 2.0 * k1 + 4.0 * k2 * r2, 1.0
+    above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k[4]))
+    slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * k[4] * r2)
+    if len(k) == 5:
+        return above, slope, 1.0
+    k4, k5, k6 = k[5:]
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    s = above / below
+    return s, (slope - s * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * k6 * r2))) / below, below
+
+
+def _brown(parameters: F64, x: F64) -> Distorted:
+    """Brown's model, k1 k2 p1 p2 and perhaps k3 or k3 k4 k5 k6, as OpenCV orders them."""
+    k = tuple(float(value) for value in parameters)
+    p1, p2 = k[2:4]
     u, v = x[..., 0], x[..., 1]
     r2, uv = u * u + v * v, u * v
-    s = 1.0 + k1 * r2 + k2 * r2**2
-    radial, J, d_radial = _radial(x, s, 2.0 * k1 + 4.0 * k2 * r2, np.stack([r2, r2**2], axis=-1))
+    s, slope, below = _radial_factor(k, r2)
+    powers = [r2 / below, r2**2 / below, *([r2**3 / below] if len(k) > 4 else [])]
+    powers += [-s * power for power in powers] if len(k) > 5 else []
+    radial, J, d_radial = _radial(x, s, slope, np.stack(powers, axis=-1))
     tangential = np.stack(
         [2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u), p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1
     )
@@ -103,7 +138,8 @@ def _radtan(parameters: F64, x: F64) -> Distorted:
     d_p1 = np.stack([2.0 * uv, r2 + 2.0 * v * v], axis=-1)
     d_p2 = np.stack([r2 + 2.0 * u * u, 2.0 * uv], axis=-1)
     d_tangential = np.stack([d_p1, d_p2], axis=-1)
-    return radial + tangential, J, np.concatenate([d_radial, d_tangential], axis=-1)
+    columns = [d_radial[..., :2], d_tangential, d_radial[..., 2:]]
+    return radial + tangential, J, np.concatenate(columns, axis=-1)
 
 
 def _equidistant(parameters: F64, x: F64) -> Distorted:
@@ -150,7 +186,9 @@ def _fov(parameters: F64, x: F64) -> Distorted:
 
 _FORWARD: dict[Distortion, Callable[[F64, F64], Distorted]] = {
     Distortion.NONE: _none,
-    Distortion.RADTAN: _radtan,
+    Distortion.RADTAN: _brown,
+    Distortion.RADTAN5: _brown,
+    Distortion.RATIONAL: _brown,
     Distortion.EQUIDISTANT: _equidistant,
     Distortion.FOV: _fov,
 }
@@ -198,34 +236,33 @@ def _undistort_equidistant(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
     return np.where(small, series, np.tan(theta) / safe)[..., None] * x_d, valid
 
 
-def _undistort_radtan(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
+def _undistort_brown(parameters: F64, x_d: F64) -> tuple[F64, Mask]:
     """Newton's method on the plane, kept inside the radius where the model grows.
 
     Points are taken in blocks that fit into the processor's cache, which is several times faster.
     """
     k = tuple(float(value) for value in parameters)
-    limit = largest_radius(Distortion.RADTAN, parameters)
+    limit = _largest_brown_radius(k)
     columns = np.ascontiguousarray(x_d.reshape(-1, 2).T)
     x, valid = np.empty_like(columns), np.empty(columns.shape[1], dtype=np.bool_)
     for begin in range(0, columns.shape[1], _BLOCK):
         block = slice(begin, begin + _BLOCK)
-        x[:, block], valid[block] = _newton_radtan(k, columns[:, block], limit)
+        x[:, block], valid[block] = _newton_brown(k, columns[:, block], limit)
     return np.ascontiguousarray(x.T).reshape(x_d.shape), valid.reshape(x_d.shape[:-1])
 
 
-def _newton_radtan(k: tuple[float, ...], x_d: F64, limit: float) -> tuple[F64, Mask]:
+def _newton_brown(k: tuple[float, ...], x_d: F64, limit: float) -> tuple[F64, Mask]:
     """Return undistorted points (2, N) of x_d (2, N), and which are valid."""
-    k1, k2, p1, p2 = k
+    p1, p2 = k[2:4]
     x = _shorten(x_d, 0.9 * limit)
     for _ in range(_MAX_ITERATIONS):
         u, v = x
         r2 = u * u + v * v
-        s = 1.0 + r2 * (k1 + k2 * r2)
-        slope = 2.0 * k1 + 4.0 * k2 * r2
+        s, slope, _ = _radial_factor(k, r2)
         mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
         of_u = s + slope * u * u + (2.0 * p1 * v + 6.0 * p2 * u)
         of_v = s + slope * v * v + (6.0 * p1 * v + 2.0 * p2 * u)
-        error_u, error_v = _radtan_values(k, x) - x_d
+        error_u, error_v = _brown_values(k, x) - x_d
         determinant = of_u * of_v - mixed * mixed
         determinant[np.abs(determinant) < 1e-9] = 1e-9
         step_u = (of_v * error_u - mixed * error_v) / determinant
@@ -236,17 +273,17 @@ def _newton_radtan(k: tuple[float, ...], x_d: F64, limit: float) -> tuple[F64, M
         radius = _length(x)
         if np.all(change <= _CONVERGED * (1.0 + radius)):
             break
-    residual = _length(_radtan_values(k, x) - x_d)
+    residual = _length(_brown_values(k, x) - x_d)
     near = residual <= 100.0 * _CONVERGED * (1.0 + radius)
     return x, near & (change <= _CONVERGED * (1.0 + radius)) & (radius < limit)
 
 
-def _radtan_values(k: tuple[float, ...], x: F64) -> F64:
+def _brown_values(k: tuple[float, ...], x: F64) -> F64:
     """Return distorted points (2, N) of x (2, N), without derivatives."""
-    k1, k2, p1, p2 = k
+    p1, p2 = k[2:4]
     u, v = x
     r2, uv = u * u + v * v, u * v
-    s = 1.0 + r2 * (k1 + k2 * r2)
+    s = _radial_factor(k, r2)[0]
     return np.stack(
         [
             s * u + 2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u),

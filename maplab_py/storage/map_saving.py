@@ -18,6 +18,8 @@ from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
+from maplab_py.sensors import CameraRig, Distortion
+from maplab_py.sensors.camera import is_known_to_maplab
 from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.storage import checksums, mission_names, tables_to_messages
 from maplab_py.storage import maplab_map_pb2 as pb
@@ -107,8 +109,22 @@ def save_map(
         _add_resources((*resource_files, *resources.into_map), temporary)
     if taken is not None:
         taken.finish(folder, listed)
+    for line in _unknown_models(vi_map):
+        progress.line(line)
     seconds = time.perf_counter() - began
     return SaveReport(str(folder), files, size / 1e6, checksums.fingerprint_of(listed), seconds)
+
+
+def _unknown_models(vi_map: VIMap) -> list[str]:
+    """Return a line for each camera model that C++ maplab does not know."""
+    rigs = [sensor for sensor in vi_map.sensors.sensors.values() if isinstance(sensor, CameraRig)]
+    models = {(camera.projection, camera.distortion) for rig in rigs for camera in rig.cameras}
+    return sorted(
+        f"C++ maplab cannot load this map: it does not know the camera model {projection.value}"
+        + ("" if distortion is Distortion.NONE else f" with {distortion.value} distortion")
+        for projection, distortion in models
+        if not is_known_to_maplab(projection, distortion)
+    )
 
 
 def check_target(

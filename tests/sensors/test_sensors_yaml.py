@@ -20,6 +20,7 @@ from maplab_py.sensors import (
     Projection,
     SensorSet,
 )
+from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.sensors_yaml import (
     parse_sensors,
     read_legacy_sensors,
@@ -189,17 +190,16 @@ def test_a_changed_pose_is_written_anew() -> None:
     assert np.allclose(again.T_B_C, moved, atol=1e-15)
 
 
-@pytest.mark.parametrize("projection", list(Projection))
-@pytest.mark.parametrize("distortion", list(Distortion))
+@pytest.mark.parametrize(("projection", "distortion"), CAMERA_MODELS)
 def test_all_camera_models_round_trip_bit_for_bit(projection, distortion) -> None:
     rng = np.random.default_rng(3)
-    size = {Distortion.NONE: 0, Distortion.FOV: 1}.get(distortion, 4)
+    mirror = rng.uniform(0.1, 0.9, INTRINSICS_SIZE[projection] - 4)
     camera = Camera(
         id=CAMERA_ID,
         projection=projection,
         distortion=distortion,
-        intrinsics=rng.uniform(1.0, 500.0, 5 if projection is Projection.UNIFIED else 4),
-        distortion_parameters=rng.normal(size=size) * 1e-7,
+        intrinsics=np.concatenate([mirror, rng.uniform(1.0, 500.0, 4)]),
+        distortion_parameters=rng.normal(size=DISTORTION_SIZE[distortion]) * 1e-7,
         width_px=640,
         height_px=480,
     )

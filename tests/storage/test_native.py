@@ -18,11 +18,14 @@ import pytest
 
 from maplab_py.atomic import replaced_folder
 from maplab_py.errors import MapError, UserError
+from maplab_py.progress import SilentProgress
+from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import disk_copy, find_maps, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
+from tests.support.scene import Scene
 
 SUBMAP = "maplab_maps/euroc_v1_01/euroc_v1_01_submap_3"
 
@@ -309,3 +312,25 @@ def test_the_second_program_that_saves_is_told(tmp_path: Path) -> None:
             save_map(vi_map, tmp_path / "map")
         (temporary / "file").write_text("first")
     assert (tmp_path / "map/file").read_text() == "first"
+
+
+def test_saving_says_once_that_maplab_does_not_know_a_model(tmp_path: Path) -> None:
+    class Lines(SilentProgress):
+        def __init__(self) -> None:
+            self.lines: list[str] = []
+
+        def line(self, text: str) -> None:
+            self.lines.append(text)
+
+    known, unknown = Lines(), Lines()
+    radtan = (Projection.PINHOLE, Distortion.RADTAN)
+    double_sphere = (Projection.DOUBLE_SPHERE, Distortion.NONE)
+    save_map(Scene(vertices=3, models=(radtan,)).make(), tmp_path / "a", progress=known)
+    vi_map = Scene(vertices=3, models=(radtan, double_sphere, double_sphere)).make()
+    save_map(vi_map, tmp_path / "b", progress=unknown)
+    assert known.lines == []
+    assert unknown.lines == [
+        "C++ maplab cannot load this map: it does not know the camera model double-sphere"
+    ]
+    loaded, _ = load_map(tmp_path / "b")
+    assert set(differences(vi_map, loaded)) <= {"frames.present"}

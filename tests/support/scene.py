@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, ImuIntrinsics, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import is_inside_image, project
 from maplab_py.sensors.sensor_set import Extrinsics, SensorSet
 from maplab_py.vimap import VIMap
@@ -34,10 +35,12 @@ from tests.support.imu_model import distort_imu
 
 F64 = NDArray[np.float64]
 
-EVERY_MODEL = tuple((p, d) for p in Projection for d in Distortion)
+EVERY_MODEL = CAMERA_MODELS
 _DISTORTION = {
     Distortion.NONE: [],
     Distortion.RADTAN: [-0.28, 0.07, 1e-3, -5e-4],
+    Distortion.RADTAN5: [-0.28, 0.07, 1e-3, -5e-4, 0.01],
+    Distortion.RATIONAL: [0.3, -0.1, 1e-3, -5e-4, 0.02, 0.5, 0.05, 0.01],
     Distortion.EQUIDISTANT: [-0.01, 0.02, -0.01, 0.003],
     Distortion.FOV: [0.93],
 }
@@ -267,9 +270,12 @@ def make_camera(
     projection: Projection, distortion: Distortion, camera_id: str = "0" * 32
 ) -> Camera:
     """Return a camera of a model, 640 x 480."""
-    intrinsics = [310.0, 312.0, 321.0, 238.0]
-    if projection is Projection.UNIFIED:
-        intrinsics = [0.8, 520.0, 523.0, 321.0, 238.0]
+    intrinsics = {
+        Projection.PINHOLE: [310.0, 312.0, 321.0, 238.0],
+        Projection.UNIFIED: [0.8, 520.0, 523.0, 321.0, 238.0],
+        Projection.DOUBLE_SPHERE: [-0.2, 0.6, 250.0, 252.0, 321.0, 238.0],
+        Projection.EXTENDED_UNIFIED: [0.6, 1.1, 310.0, 312.0, 321.0, 238.0],
+    }[projection]
     parameters = np.array(_DISTORTION[distortion])
     return Camera(camera_id, projection, distortion, np.array(intrinsics), parameters, 640, 480)
 

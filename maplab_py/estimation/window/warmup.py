@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from functools import partial
 
@@ -27,13 +26,18 @@ from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.sensors.camera import (
+    CAMERA_MODELS,
+    DISTORTION_SIZE,
+    INTRINSICS_SIZE,
+    is_known_to_maplab,
+)
 
 
 def window_jobs() -> dict[str, Callable[[], None]]:
     """Return by name what compiles one kernel each."""
     jobs: dict[str, Callable[[], None]] = {"window": _run_frames}
-    for projection, distortion in itertools.product(Projection, Distortion):
+    for projection, distortion in filter(lambda model: is_known_to_maplab(*model), CAMERA_MODELS):
         name = f"window {projection.name} {distortion.name}"
         jobs[name] = partial(_run_landmarks, projection, distortion)
     return jobs

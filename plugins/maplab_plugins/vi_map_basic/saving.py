@@ -288,6 +288,7 @@ def _save_map(
         force=options.force,
         descriptor_layout=options.descriptor_layout,
         resource_files=files,
+        progress=context.progress,
     )
     context.maps.update(entry.with_value(vi_map, "save"))
     context.mark_saved(key, folder, DiskCopy(folder.resolve(), report.fingerprint))

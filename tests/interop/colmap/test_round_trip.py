@@ -24,6 +24,7 @@ from maplab_py.interop.colmap.point_scan_kernel import compile_kernels
 from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.sensors import Distortion, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS, is_known_to_maplab
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
@@ -32,7 +33,7 @@ from tests.interop.small_map import make_map
 from tests.support.data import shared_data
 from tests.support.scene import Scene
 
-PINHOLES = tuple((Projection.PINHOLE, distortion) for distortion in Distortion)
+PINHOLES = tuple(m for m in CAMERA_MODELS if m[0] is Projection.PINHOLE and is_known_to_maplab(*m))
 EVERYTHING = ColmapExportOptions(quality="all")
 # in a process of its own: what pycolmap computes from the files
 ERRORS = """

@@ -12,20 +12,29 @@ from maplab_py.algorithms.dense.stereo.rectification import StereoPair, stereo_p
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, CameraRig, Distortion, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import back_project, is_inside_image, project
 
 WIDTH, HEIGHT = 160, 120
 PARAMETERS = {
     Distortion.NONE: [],
     Distortion.RADTAN: [-0.28, 0.07, 2e-4, 2e-5],
+    Distortion.RADTAN5: [-0.28, 0.07, 2e-4, 2e-5, 0.01],
+    Distortion.RATIONAL: [0.3, -0.1, 2e-4, 2e-5, 0.02, 0.5, 0.05, 0.01],
     Distortion.EQUIDISTANT: [-0.01, 0.02, -0.01, 0.002],
     Distortion.FOV: [0.9],
 }
-MODELS = [(p, d) for p in Projection for d in Distortion]
+MIRROR = {
+    Projection.PINHOLE: [],
+    Projection.UNIFIED: [0.7],
+    Projection.DOUBLE_SPHERE: [-0.2, 0.6],
+    Projection.EXTENDED_UNIFIED: [0.6, 1.1],
+}
+MODELS = list(CAMERA_MODELS)
 
 
 def make_camera(number: int, projection: Projection, distortion: Distortion) -> Camera:
-    mirror = [0.7] if projection is Projection.UNIFIED else []
+    mirror = MIRROR[projection]
     focal = 130.0 if mirror else 80.0
     return Camera(
         f"{number:032x}",
