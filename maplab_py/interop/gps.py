@@ -18,6 +18,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_text
+from maplab_py.interop.stamps import FIXES
 from maplab_py.interop.text_table import TextTable, parse_text_table
 
 _MAX_BYTES = 500_000_000
@@ -48,13 +49,14 @@ class GpsTrack:
         return len(self.times_ns)
 
 
-def read_gps(path: Path, date: str = "") -> GpsTrack:
+def read_gps(path: Path, date: str = "", time_unit: str = "") -> GpsTrack:
     """Read fixes from CSV or NMEA, which is told from the content.
 
     Args:
         path: File. CSV has a header with latitude, longitude and altitude after the time stamp, or just
             these four columns [s or ns, deg, deg, m].
         date: Day of the first fix as YYYY-MM-DD, for NMEA without RMC sentences.
+        time_unit: Unit of the time stamps of CSV; empty = see `stamps`.
 
     Raises:
         MapError: The file cannot be read or has no fixes; angles are no degrees; stamps go back.
@@ -68,7 +70,7 @@ def read_gps(path: Path, date: str = "") -> GpsTrack:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise MapError(f"cannot read {path}: {reason}") from error
     is_nmea = text.lstrip().startswith(("$", "!"))
-    track = _from_nmea(text, str(path), date) if is_nmea else _from_csv(text, str(path))
+    track = _from_nmea(text, str(path), date) if is_nmea else _from_csv(text, str(path), time_unit)
     return check_track(track)
 
 
@@ -88,8 +90,8 @@ def check_track(track: GpsTrack) -> GpsTrack:
     return track
 
 
-def _from_csv(text: str, source: str) -> GpsTrack:
-    table = parse_text_table(text, source)
+def _from_csv(text: str, source: str, time_unit: str) -> GpsTrack:
+    table = parse_text_table(text, source, FIXES, unit=time_unit)
     columns = _columns(table)
     lat, lon, alt = (table.values[:, column] for column in columns)
     _check_degrees(lat, lon, source, table.line_numbers)

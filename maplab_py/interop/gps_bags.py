@@ -28,7 +28,7 @@ _FIX_FROM = 0
 """Status of a fix without augmentation; -1 is none."""
 
 
-def read_fixes(path: Path, date: str = "", topic: str = "") -> GpsTrack:
+def read_fixes(path: Path, date: str = "", topic: str = "", time_unit: str = "") -> GpsTrack:
     """Read fixes from a bag, or from CSV or NMEA; arguments and errors as in the readers of these.
 
     Raises:
@@ -38,7 +38,7 @@ def read_fixes(path: Path, date: str = "", topic: str = "") -> GpsTrack:
         return read_gps_bag(path, topic)
     if topic:
         raise UserError(f"{path} is no bag: leave out --gps_topic={topic}")
-    return read_gps(path, date)
+    return read_gps(path, date, time_unit)
 
 
 def read_gps_bag(path: Path, topic: str = "") -> GpsTrack:

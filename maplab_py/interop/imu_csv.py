@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
+from maplab_py.interop.stamps import IMU
 from maplab_py.interop.text_table import format_rows, read_text_table
 from maplab_py.output_files import write_text
 
@@ -32,7 +33,7 @@ def read_imu_csv(path: Path) -> ImuRecording:
     Raises:
         MapError: The file cannot be read, has other columns, or its stamps do not increase.
     """
-    table = read_text_table(path)
+    table = read_text_table(path, IMU)
     if table.values.shape[1] != 6:
         raise MapError(
             f"{path}: 7 columns are expected (time, gyroscope xyz, accelerometer xyz), "

@@ -1,8 +1,4 @@
-"""Fast reading and writing of text tables of numbers.
-
-Time stamps are parsed from their digits without conversion to float: 19-digit nanoseconds and
-"1403715529.112143517" seconds are both exact.
-"""
+"""Fast reading and writing of text tables of numbers whose first column is a time stamp."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import dataclasses
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +15,12 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
+from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
-_NANOSECONDS_FROM = 10**14
-"""Integers above this are nanoseconds; as seconds they would be three million years."""
+_TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,28 +32,55 @@ class TextTable:
     times_ns: I64  # (N,)
     values: F64  # (N, columns - 1)
     line_numbers: I64  # (N,) line of each row in the file, from 1
-    is_nanoseconds: bool  # the file's time stamps were whole nanoseconds
+    unit: str  # of the time stamps as written: s, ms, us or ns
     has_commas: bool
+    note: str = ""  # one line on the unit, where it was concluded against header or custom
+
+    @property
+    def is_nanoseconds(self) -> bool:
+        """The file's time stamps were nanoseconds."""
+        return self.unit == "ns"
 
 
-def read_text_table(path: Path) -> TextTable:
+def read_text_table(
+    path: Path,
+    kind: StampKind = POSES,
+    *,
+    unit: str = "",
+    span_ns: tuple[int, int] | None = None,
+) -> TextTable:
     """Read a table separated by commas or white space, with `#` comments and an optional header.
 
+    The names of the columns may stand in any line that has as many words as the rows.
+
+    Args:
+        path: File.
+        kind: Kind of its rows, which bounds the distances between their stamps.
+        unit: Unit of the stamps, from --time_unit; empty = concluded.
+        span_ns: First and last time of what was recorded beside it.
+
     Raises:
-        MapError: The file cannot be read, is empty, or a line is not a row of numbers like the
-            first one; names file and line.
+        MapError: The file cannot be read, is empty, the unit of the stamps is open, or a line is not a
+            row of numbers like the first one; names file and line.
     """
     try:
         text = read_text(path, _MAX_BYTES, remedy=_SPLIT, error=MapError, encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise MapError(f"cannot read {path}: {reason}") from error
-    return parse_text_table(text, str(path))
+    return parse_text_table(text, str(path), kind, unit=unit, span_ns=span_ns)
 
 
-def parse_text_table(text: str, source: str) -> TextTable:
-    """Parse the text of a table; `source` is its name in error messages."""
-    lines, numbers, header = _data_lines(text)
+def parse_text_table(
+    text: str,
+    source: str,
+    kind: StampKind = POSES,
+    *,
+    unit: str = "",
+    span_ns: tuple[int, int] | None = None,
+) -> TextTable:
+    """Parse the text of a table; `source` is its name in error messages, see `read_text_table`."""
+    lines, numbers, others = _data_lines(text)
     if not lines:
         raise MapError(f"{source}: there are no rows in the file: write or copy it again")
     has_commas = "," in lines[0]
@@ -73,9 +95,28 @@ def parse_text_table(text: str, source: str) -> TextTable:
         )
     if widths[0] < 2:
         raise MapError(f"{source}:{numbers[0]}: a time stamp and values are expected")
-    times, is_nanoseconds = _parse_times([row[0] for row in rows], source, numbers)
+    header, time_name = _header(others, int(widths[0]))
+    stamps = parse_stamps(
+        [row[0] for row in rows],
+        kind,
+        source,
+        numbers,
+        unit=unit,
+        header=time_name,
+        custom="ns" if has_commas else "s",
+        span_ns=span_ns,
+    )
     values = _parse_values([row[1:] for row in rows], source, numbers)
-    return TextTable(source, header, times, values, np.array(numbers), is_nanoseconds, has_commas)
+    return TextTable(
+        source,
+        header,
+        stamps.times_ns,
+        values,
+        np.array(numbers),
+        stamps.unit,
+        has_commas,
+        stamps.note,
+    )
 
 
 def format_rows(row_format: str, columns: Sequence[NDArray[Any] | list[Any]]) -> Iterator[str]:
@@ -104,22 +145,22 @@ def seconds_text(times_ns: I64) -> tuple[I64, I64]:
     return seconds, rest
 
 
-def _data_lines(text: str) -> tuple[list[str], list[int], tuple[str, ...]]:
-    """Return the rows, their line numbers, and the column names above them."""
+def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
+    """Return the rows, their line numbers, and the comments and headers."""
     lines: list[str] = []
     numbers: list[int] = []
-    header: tuple[str, ...] = ()
+    others: list[str] = []
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
         if not line:
             continue
         is_comment = line.startswith(("#", "%"))
-        if is_comment or (not lines and not header and not _starts_with_number(line)):
-            header = _column_names(line) if not lines else header
+        if is_comment or (not lines and not others and not _starts_with_number(line)):
+            others.append(line)
             continue
         lines.append(line)
         numbers.append(number)
-    return lines, numbers, header
+    return lines, numbers, others
 
 
 def _starts_with_number(line: str) -> bool:
@@ -131,31 +172,26 @@ def _starts_with_number(line: str) -> bool:
     return True
 
 
-def _column_names(line: str) -> tuple[str, ...]:
-    names = line.lstrip("#% ")
-    cut = names.split(",") if "," in names else names.split()
-    return tuple(re.sub(r"[\[(].*?[\])]", "", name).strip().lower() for name in cut)
+def _header(others: list[str], width: int) -> tuple[tuple[str, ...], str]:
+    """Return the names of the columns, units removed, and what tells the unit of the stamps.
+
+    Of several lines with as many words as the rows, the last one that begins with a time counts.
+    """
+    lines = [_words(line) for line in others]
+    fitting = [words for words in lines if len(words) == width]
+    timed = [words for words in fitting if _TIME_NAME.search(words[0].lower())]
+    chosen = (timed or fitting or lines or [[]])[-1]
+    # as in "# time stamps in microseconds"
+    about = [line for line in others if re.search(r"time|stamp", line.lower())]
+    telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
+    time_name = telling[0] if telling else ""
+    names = [re.sub(r"[\[(].*?[\])]", "", word).strip().lower() for word in chosen]
+    return tuple(names), time_name
 
 
-def _parse_times(tokens: list[str], source: str, numbers: list[int]) -> tuple[I64, bool]:
-    try:
-        whole = np.array(tokens, dtype=np.str_).astype(np.int64)
-    except (ValueError, OverflowError):
-        return _decimal_times(tokens, source, numbers), False
-    if np.all(np.abs(whole) < _NANOSECONDS_FROM):
-        return _decimal_times(tokens, source, numbers), False
-    return whole, True
-
-
-def _decimal_times(tokens: list[str], source: str, numbers: list[int]) -> I64:
-    """Parse seconds to nanoseconds, digit by digit."""
-    times = np.empty(len(tokens), dtype=np.int64)
-    for row, token in enumerate(tokens):
-        try:
-            times[row] = int((Decimal(token) * 1_000_000_000).to_integral_value())
-        except (InvalidOperation, ValueError, OverflowError) as error:
-            raise MapError(f"{source}:{numbers[row]}: '{token}' is not a time stamp") from error
-    return times
+def _words(line: str) -> list[str]:
+    names = re.sub(r"\s+(?=[\[(])", "", line.lstrip("#% "))
+    return names.split(",") if "," in names else names.split()
 
 
 def _parse_values(rows: list[list[str]], source: str, numbers: list[int]) -> F64:

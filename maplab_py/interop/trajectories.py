@@ -17,6 +17,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.input_files import read_text
+from maplab_py.interop.stamps import POSES, read_stamps
 from maplab_py.interop.text_table import (
     TextTable,
     format_rows,
@@ -63,21 +64,26 @@ class Trajectory:
     gyro_bias: F64 | None = None  # (N, 3) [rad/s]
     accel_bias: F64 | None = None  # (N, 3) [m/s^2]
     source: str = ""
+    note: str = ""  # one line on the unit of the stamps, where it was concluded
 
     def __len__(self) -> int:
         return len(self.times_ns)
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path, time_unit: str = "") -> Trajectory:
     """Read a trajectory; the format is detected from the content.
 
     Columns are identified by the names in the header if there is one; without names, eight columns
     are TUM (quaternion w last), whole nanoseconds with commas are EuRoC (w first).
 
+    Args:
+        path: File.
+        time_unit: Unit of the time stamps; empty = see `stamps`.
+
     Raises:
         MapError: The file cannot be read or is not a trajectory; names file and line.
     """
-    table = read_text_table(path)
+    table = read_text_table(path, POSES, unit=time_unit)
     names = _columns(table)
     missing = [name for name in _TUM_ORDER if name not in names]
     if missing:
@@ -98,30 +104,34 @@ def read_trajectory(path: Path) -> Trajectory:
         gyro_bias=_optional(table, names, "b_g"),
         accel_bias=_optional(table, names, "b_a"),
         source=str(path),
+        note=table.note,
     )
 
 
-def read_kitti(path: Path, times_file: Path) -> Trajectory:
-    """Read poses of KITTI's odometry benchmark and their time stamps [s].
+def read_kitti(path: Path, times_file: Path, time_unit: str = "") -> Trajectory:
+    """Read poses of KITTI's odometry benchmark and their time stamps, in seconds by custom.
 
     Raises:
         MapError: A file cannot be read, a line is no pose or time stamp, or their numbers differ.
     """
     matrices = _numbers(path, 12, "a pose of KITTI (3 x 4 numbers)").reshape(-1, 3, 4)
-    times_s = _numbers(times_file, 1, "a time stamp")[:, 0]
-    if len(times_s) != len(matrices):
-        raise MapError(f"{times_file} has {len(times_s)} time stamps, {path} {len(matrices)} poses")
+    stamps = read_stamps(times_file, POSES, unit=time_unit)
+    times_ns = stamps.times_ns
+    if len(times_ns) != len(matrices):
+        raise MapError(
+            f"{times_file} has {len(times_ns)} time stamps, {path} {len(matrices)} poses"
+        )
     R = matrices[:, :, :3]
     error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     wrong = np.flatnonzero((error > _UNIT_TOLERANCE) | (np.linalg.det(R) < 0.0))
     if len(wrong):
         raise MapError(f"{path}: pose {wrong[0] + 1} is no rotation and position")
-    if np.any(np.diff(times_s) < 0.0):
+    if np.any(np.diff(times_ns) < 0):
         raise MapError(f"{times_file}: the time stamps are not in the order of time")
     homogeneous = np.tile(np.eye(4), (len(R), 1, 1))
     homogeneous[:, :3] = matrices
-    times_ns = np.round(times_s * 1e9).astype(np.int64)
-    return Trajectory(times_ns, se3.from_matrix(homogeneous), source=str(path))
+    T_R_B = se3.from_matrix(homogeneous)
+    return Trajectory(times_ns, T_R_B, source=str(path), note=stamps.note)
 
 
 def _numbers(path: Path, width: int, what: str) -> F64:

@@ -19,6 +19,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
+from maplab_py.interop.stamps import WHEELS
 from maplab_py.interop.text_table import TextTable, read_text_table
 
 _MAX_RATE_RADPS = 30.0
@@ -54,19 +55,20 @@ class WheelTrack:
     is_planar: bool  # height, roll and pitch were not measured
     kind: str  # poses, motions or velocities
     source: str
+    note: str = ""  # one line on the unit of the stamps, where it was concluded
 
     def __len__(self) -> int:
         return len(self.times_ns)
 
 
-def read_wheel_odometry(path: Path) -> WheelTrack:
+def read_wheel_odometry(path: Path, time_unit: str = "") -> WheelTrack:
     """Read wheel odometry; what the rows are follows from the names of the columns.
 
     Raises:
         MapError: The file cannot be read, has no such columns or fewer than two rows, stamps do not
             increase, a quaternion is none, or turns are not in radians.
     """
-    table = read_text_table(path)
+    table = read_text_table(path, WHEELS, unit=time_unit)
     kind, is_planar, columns = _columns(table)
     backwards = np.flatnonzero(np.diff(table.times_ns) <= 0)
     if len(backwards):
@@ -82,7 +84,7 @@ def read_wheel_odometry(path: Path) -> WheelTrack:
     else:
         T = _poses(table, columns, is_planar=is_planar)
         T = accumulated(T) if kind == "motions" else T
-    track = WheelTrack(table.times_ns, T, is_planar, kind, str(path))
+    track = WheelTrack(table.times_ns, T, is_planar, kind, str(path), table.note)
     angular = columns[:, 2:] if is_planar else columns[:, 3:]
     _check_turns(track, angular if kind == "velocities" else None)
     return track

@@ -50,7 +50,9 @@ def evaluate_trajectory(
 
         truth = Truth.load(ground_truth).trajectory(str(ground_truth))
     else:
-        truth = read_trajectory(ground_truth)
+        truth = read_trajectory(ground_truth, options.time_unit)
+        if truth.note:
+            context.terminal.note(truth.note)
 
     def errors_of(vi_map: VIMap) -> TrajectoryEvaluationReport:
         missions = chosen.rows(vi_map)

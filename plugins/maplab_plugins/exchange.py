@@ -183,9 +183,11 @@ def import_trajectory(
 
     options.check()
     if options.times_file is None:
-        trajectory = read_trajectory(trajectory_file)
+        trajectory = read_trajectory(trajectory_file, options.time_unit)
     else:
-        trajectory = read_kitti(trajectory_file, options.times_file)
+        trajectory = read_kitti(trajectory_file, options.times_file, options.time_unit)
+    if trajectory.note:
+        context.terminal.note(trajectory.note)
     trajectory = shifted(trajectory, options.time_offset_s)
     if options.kind == "mission":
         return _new_mission(context, trajectory, options, map_key)
@@ -273,7 +275,7 @@ def import_gps(
 
     options.check()
     mission = context.mission_row(map_mission)
-    track = read_fixes(gps_file, options.date, options.topic)
+    track = read_fixes(gps_file, options.date, options.topic, options.time_unit)
     result = attach_fixes(context.vi_map, mission, track, options)
     context.commit(result.vi_map)
     return GpsImport(
@@ -318,7 +320,9 @@ def import_wheel_odometry(
 
     options.check()
     mission = context.mission_row(map_mission)
-    track = read_wheel_odometry(wheel_file)
+    track = read_wheel_odometry(wheel_file, options.time_unit)
+    if track.note:
+        context.terminal.note(track.note)
     result = attach_wheels(context.vi_map, mission, track, options)
     context.commit(result.vi_map)
     return WheelImport(

@@ -87,7 +87,7 @@ def plot_errors(
     figure.check_plot_file(plot_file, overwrite=overwrite)
     drawn, rmse_m = time_series.errors_over_time(
         context.vi_map,
-        read_trajectory(ground_truth),
+        read_trajectory(ground_truth, options.time_unit),
         options,
         context.mission_rows("", map_mission_list),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
+from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import option
 
 ALIGNMENTS = ("se3", "sim3", "yaw", "none")
@@ -46,3 +47,4 @@ class TrajectoryEvaluationOptions:
         help="Remove the constant rotation between the ground truth's body frame and the IMU, "
         "which otherwise adds to the relative errors",
     )
+    time_unit: str = time_unit_option()

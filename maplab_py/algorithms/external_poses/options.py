@@ -11,6 +11,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import FlagError
 from maplab_py.geometry import se3
+from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import option
 
 _UNIT_TOLERANCE = 1e-2
@@ -37,6 +38,7 @@ class TrajectoryOptions:
         1.0, help="Standard deviation per axis of orientations, likewise", unit="deg"
     )
     time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    time_unit: str = time_unit_option()
     max_gap_s: float = option(
         0.5, help="Poses of the file are not interpolated over longer gaps", unit="s"
     )
@@ -44,7 +46,7 @@ class TrajectoryOptions:
         "", help="Sensor or camera of the map whose poses the file has; empty = the IMU"
     )
     times_file: Path | None = option(
-        None, help="Time stamps of a KITTI trajectory, one per line [s] (times.txt)"
+        None, help="Time stamps of a KITTI trajectory, one per line (times.txt)"
     )
     align: bool = option(
         True,
@@ -79,6 +81,7 @@ class GpsOptions:
     )
     lever_arm_m: str = option("0,0,0", help="Position x,y,z of the antenna on the IMU", unit="m")
     time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    time_unit: str = time_unit_option()
     max_gap_s: float = option(
         2.0, help="Fixes between vertices that are further apart are left out", unit="s"
     )
@@ -168,6 +171,7 @@ class WheelOptions:
         "upwards",
     )
     time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    time_unit: str = time_unit_option()
     max_gap_s: float = option(
         0.5, help="Rows of the file are not interpolated over longer gaps", unit="s"
     )

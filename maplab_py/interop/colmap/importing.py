@@ -106,7 +106,11 @@ def _times(model: ColmapModel, side: SideFile | None, options: ColmapImportOptio
     file = Path(options.timestamps_file) if options.timestamps_file else None
     names = tuple(model.images.name[row] for row in new.tolist())
     times_ns[new] = image_times(
-        names, options.timestamps_from, file, interval_s=options.order_interval_s
+        names,
+        options.timestamps_from,
+        file,
+        interval_s=options.order_interval_s,
+        time_unit=options.time_unit,
     )
     return times_ns
 

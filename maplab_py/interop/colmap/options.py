@@ -6,6 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import option
 from maplab_py.report import Report
 
@@ -64,8 +65,9 @@ class ColmapImportOptions:
         choices=TIME_SOURCES,
     )
     timestamps_file: str = option(
-        "", help="File of lines `image name, time stamp [ns]` for --timestamps_from=file"
+        "", help="File of lines `image name, time stamp` for --timestamps_from=file"
     )
+    time_unit: str = time_unit_option()
     order_interval_s: float = option(
         1.0, help="Time between frames for --timestamps_from=order", unit="s"
     )
