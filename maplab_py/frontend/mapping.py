@@ -118,7 +118,7 @@ class Mapping:
             MaplabError: Nothing has been estimated, and the recording ended or cannot be read.
             Cancelled: The run was cancelled, or ended before anything was estimated.
         """
-        self.statistics = RunStatistics()
+        self.statistics = RunStatistics(notes=list(self._recording.device.notes))
         try:
             for event in self.stream:
                 self._keep_pace(event, is_to_end)

@@ -84,8 +84,8 @@ class Odometry:
         """
         if device.imu is None:
             raise UserError(
-                "odometry needs an IMU, and the calibration has none: give "
-                "--sensor_calibration_file=FILE with an IMU"
+                "odometry needs an IMU, and the calibration has none: give its file by "
+                "--imu_calibration_file=FILE, or a --sensor_calibration_file with an IMU"
             )
         self.options = options or OdometryOptions()
         self.options.check()

@@ -1,47 +1,74 @@
-"""Calibrations of other programs: kalibr, EuRoC, OpenVINS, Basalt, COLMAP. The inverse of the export.
+"""Calibrations of all programs: one set of readers behind every flag and command that takes one.
 
-The format follows from the content, not from the name. A time shift of kalibr or Basalt becomes the camera's
-time offset, t_imu = t_camera + offset.
+The format follows from the content, not from the name. Time shifts become the cameras' time offset,
+t_imu = t_camera + offset.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.basalt import read_basalt
-from maplab_py.interop.colmap.calibration import is_colmap, read_calibration
-from maplab_py.interop.recordings.calibration import (
-    ANY_DEVICE,
-    device_of,
-    read_folder_calibration,
+from maplab_py.interop.calibrations.basalt import read_basalt
+from maplab_py.interop.calibrations.euroc import (
+    is_kimera_folder,
+    read_camera_file,
+    read_folder,
+    read_imu_file,
+    read_kimera_folder,
 )
-from maplab_py.interop.recordings.kalibr import is_camera_chain, read_kalibr, read_kalibr_imu
-from maplab_py.interop.recordings.models import make_device, read_camera, read_entry, read_imu_noise
-from maplab_py.interop.recordings.options import DeviceOptions
-from maplab_py.interop.recordings.protocol import RecordedSensors
-from maplab_py.sensors import Extrinsics, Imu, SensorSet
-from maplab_py.sensors.sensors_yaml import read_sensors
+from maplab_py.interop.calibrations.kalibr import (
+    is_camera_chain,
+    read_camera_chain,
+    read_kalibr_imu,
+)
+from maplab_py.interop.calibrations.parts import Parts, read_entry, read_json_entry
+from maplab_py.interop.colmap.calibration import is_colmap, read_cameras
+from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
+from maplab_py.sensors import CameraRig, Extrinsics, Imu, SensorSet
+from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.sensors.sensors_yaml import note_unread_keys, read_sensors
 from maplab_py.sensors.yaml_entry import Entry
 
-_MAX_TIME_OFFSET_NS = 10_000_000_000
+ANY_DEVICE = DeviceOptions()
+KNOWN_FORMATS = (
+    "files of kalibr, EuRoC, OpenVINS, Basalt, COLMAP and maplab are read (docs/other_programs.md)"
+)
 _OPENVINS = "estimator_config.yaml"
 _SAME_POSE = 1e-9
+_ODD_SCALE = 0.1
+"""Scales of IMUs that are further from 1 than this are noted: those on the market are within 0.03."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CalibrationFile:
+class CalibrationFile(RecordedSensors):
     """What a calibration file has: a camera rig, an IMU, or both."""
 
-    source: Path
-    format: str  # for people: "kalibr", "EuRoC", "OpenVINS", "Basalt", "COLMAP", "maplab"
-    sensors: SensorSet
-    rig_id: str = ""  # empty = none
-    imu_id: str = ""
+    source: Path = Path()
+    format: str = ""  # for people: "kalibr", "EuRoC", "OpenVINS", "Basalt", "COLMAP", "maplab", ...
+
+
+def read_calibration(
+    path: Path, imu_file: Path | None = None, chosen: DeviceOptions = ANY_DEVICE
+) -> RecordedSensors:
+    """Read a calibration with cameras; see `import_calibration`.
+
+    Raises:
+        UserError: It is of an IMU alone.
+        MapError: A file cannot be read or is wrong.
+    """
+    result = import_calibration(path, imu_file, chosen)
+    if not result.rig_id:
+        raise UserError(
+            f"{path}: has an IMU and no cameras: give it as --imu_calibration_file, and the file of the "
+            "cameras as --sensor_calibration_file"
+        )
+    return result
 
 
 def import_calibration(
@@ -50,108 +77,251 @@ def import_calibration(
     """Read the calibration of another program.
 
     Args:
-        path: kalibr's or OpenVINS' camera chain or IMU file, OpenVINS' estimator_config.yaml or the
-            folder with it, a sensor.yaml of EuRoC or its folder, Basalt's json, the folder of a COLMAP
-            model or its cameras.txt or cameras.bin, or sensors.yaml.
-        imu_file: IMU file that belongs to a camera chain, or imu0/sensor.yaml to that of a camera.
+        path: File or folder; `docs/other_programs.md` lists the formats.
+        imu_file: File of the IMU, where `path` has the cameras alone.
         chosen: Sensors of a sensors.yaml that has several of a kind.
 
     Raises:
         MapError: A file cannot be read, a key is missing or wrong, or a model is not supported.
         UserError: The format is not known, or an IMU file is given where none belongs.
     """
-    if path.is_dir() and (path / _OPENVINS).exists():
-        path = path / _OPENVINS
-    result = _import_any(path, imu_file, chosen)
-    if result.format != "maplab":
+    cameras = _read(path)
+    if imu_file is None:
+        if isinstance(cameras, SensorSet):
+            return _of_maplab(path, cameras, chosen)
         chosen.check_unused(f"{path} is none")
-    for camera in result.sensors.camera_rig(result.rig_id).cameras if result.rig_id else ():
-        if abs(camera.time_offset_ns) > _MAX_TIME_OFFSET_NS:
-            raise MapError(
-                f"{path}: the time shift between camera and IMU is {camera.time_offset_ns * 1e-9:g} s: "
-                "it must be below 10 s (kalibr writes seconds, Basalt nanoseconds)"
-            )
-    return result
-
-
-def _import_any(path: Path, imu_file: Path | None, chosen: DeviceOptions) -> CalibrationFile:
-    if is_colmap(path):
-        _refuse_imu_file(path, imu_file)
-        return _file(path, "COLMAP", read_calibration(path))
-    if path.is_dir():
-        _refuse_imu_file(path, imu_file)
-        folder = path / "mav0" if (path / "mav0").is_dir() else path
-        return _file(path, "EuRoC", read_folder_calibration(folder))
-    if path.suffix.lower() == ".json":
-        _refuse_imu_file(path, imu_file)
-        return _file(path, "Basalt", read_basalt(path))
-    entry = read_entry(path)
-    if "relative_config_imucam" in entry:
-        _refuse_imu_file(path, imu_file)
-        chain, imu = (
-            path.parent / entry.text(key)
-            for key in ("relative_config_imucam", "relative_config_imu")
-        )
-        return _file(path, "OpenVINS", read_kalibr(chain, imu))
-    if is_camera_chain(entry):
-        return _file(path, "kalibr", read_kalibr(path, imu_file))
-    if (
-        "imu0" in entry
-        or "accelerometer_noise_density" in entry
-        or "gyroscope_noise_density" in entry
-    ):
-        _refuse_imu_file(path, imu_file)
-        is_euroc = "T_BS" in entry
-        sensor = read_imu_noise(entry) if is_euroc else _kalibr_imu_alone(path)
-        return _imu_alone(path, "EuRoC" if is_euroc else "kalibr", sensor)
-    if "T_BS" in entry:
-        return _file(path, "EuRoC", _euroc_camera(entry, imu_file))
-    if "sensors" in entry:
-        _refuse_imu_file(path, imu_file)
-        return _file(path, "maplab", device_of(read_sensors(path), str(path), chosen))
-    raise UserError(
-        f"{path}: the format is not known: give a camera chain or IMU file of kalibr, a sensor.yaml of "
-        "EuRoC, OpenVINS' estimator_config.yaml, Basalt's calibration.json, a COLMAP model or its "
-        "cameras.txt, or sensors.yaml"
-    )
-
-
-def _refuse_imu_file(path: Path, imu_file: Path | None) -> None:
-    if imu_file is not None:
+        return _finished(path, cameras)
+    if _takes_no_imu(cameras):
         raise UserError(
-            f"--imu_calibration_file={imu_file} belongs to a camera chain or to the sensor.yaml of a "
-            f"camera, and {path} is none"
+            f"--imu_calibration_file={imu_file} belongs to a camera chain of kalibr or to another file of "
+            f"cameras without IMU, and {path} is none"
         )
+    imu = _read(imu_file)
+    if isinstance(cameras, SensorSet) and isinstance(imu, SensorSet):
+        return _joined_of_maplab(path, cameras, imu_file, imu, chosen)
+    chosen.check_unused(f"{path if isinstance(imu, SensorSet) else imu_file} is none")
+    cameras, imu = (
+        _parts_of(value, name) if isinstance(value, SensorSet) else value
+        for name, value in ((path, cameras), (imu_file, imu))
+    )
+    return _finished(path, _joined(cameras, imu, imu_file))
 
 
-def _file(path: Path, form: str, device: RecordedSensors) -> CalibrationFile:
-    return CalibrationFile(path, form, device.sensors, device.rig_id, device.imu_id)
+def _takes_no_imu(cameras: Parts | SensorSet) -> bool:
+    """Return whether a file has no cameras, or an IMU of its own."""
+    if isinstance(cameras, SensorSet):
+        return bool(_ids(cameras, Imu)) or not _ids(cameras, CameraRig)
+    return not cameras.cameras or cameras.imu is not None
 
 
-def _kalibr_imu_alone(path: Path) -> Imu:
-    imu, T_I_i = read_kalibr_imu(path)
-    if np.max(np.abs(T_I_i - se3.identity())) > _SAME_POSE:
+def _finished(path: Path, parts: Parts) -> CalibrationFile:
+    """Return the sensors of a file with ids and the notes on them."""
+    is_turned = np.max(np.abs(parts.T_B_I - se3.identity())) > _SAME_POSE
+    if (
+        not parts.cameras
+        and is_turned
+        and parts.imu is not None
+        and parts.imu.intrinsics is not None
+    ):
         raise UserError(
             f"{path}: scale and misalignment turn the frame of the IMU, in which cameras are given: "
             "import the camera chain and name this file with --imu_calibration_file"
         )
-    return imu
+    T_B_C = parts.T_B_C.reshape(-1, 7)
+    T_I_C = T_B_C if parts.imu is None else se3.compose(se3.inverse(parts.T_B_I), T_B_C)
+    notes = [*parts.notes, *(_imu_notes(path, parts.imu) if parts.imu else [])]
+    device = make_device(parts.cameras, T_I_C, parts.imu, notes)
+    return _as_file(path, parts.format, device)
 
 
-def _imu_alone(path: Path, form: str, imu: Imu) -> CalibrationFile:
-    """Return an IMU without cameras; the id is that of the same IMU beside cameras."""
-    named = make_device([], np.zeros((0, 7)), imu)
-    imu_id = named.imu_id
-    mounts = {imu_id: Extrinsics(imu_id, se3.identity())}
-    sensors = SensorSet({imu_id: named.sensors.imu(imu_id)}, mounts)
-    return CalibrationFile(path, form, sensors, imu_id=imu_id)
+def _as_file(path: Path, form: str, device: RecordedSensors) -> CalibrationFile:
+    return CalibrationFile(
+        device.sensors, device.rig_id, device.imu_id, device.notes, source=path, format=form
+    )
 
 
-def _euroc_camera(entry: Entry, imu_file: Path | None) -> RecordedSensors:
-    """Return one camera of an EuRoC folder, with the IMU of another file if there is one."""
-    camera = read_camera(entry, "distortion_coefficients")
-    T_B_C = entry.pose("T_BS")[None]
-    if imu_file is None:
-        return make_device([camera], T_B_C, None)
-    imu = read_entry(imu_file)
-    return make_device([camera], se3.relative(imu.pose("T_BS"), T_B_C), read_imu_noise(imu))
+def _joined(cameras: Parts, imu: Parts, imu_file: Path) -> Parts:
+    """Return the cameras of one file with the IMU of another."""
+    if imu.imu is None:
+        raise UserError(f"--imu_calibration_file={imu_file}: has no IMU ({imu.format})")
+    if imu.cameras:
+        raise UserError(
+            f"--imu_calibration_file={imu_file}: has cameras, too: give it as the calibration of both"
+        )
+    if cameras.why_not_on_imu:
+        raise MapError(cameras.why_not_on_imu)
+    notes = [*cameras.notes, *imu.notes]
+    return dataclasses.replace(cameras, imu=imu.imu, T_B_I=imu.T_B_I, notes=notes)
+
+
+def _imu_notes(path: Path, imu: Imu) -> list[str]:
+    """Return notes on matrices of the IMU that no IMU has."""
+    if imu.intrinsics is None:
+        return []
+    notes = []
+    for name, matrix in (("gyroscope", imu.intrinsics.T_g), ("accelerometer", imu.intrinsics.T_a)):
+        scales = np.linalg.svd(matrix, compute_uv=False)
+        worst = scales[np.argmax(np.abs(scales - 1.0))]
+        if abs(worst - 1.0) > _ODD_SCALE:
+            notes.append(
+                f"{path}: the matrix of the {name} scales by {worst:.3g}, far from 1: is it of this IMU, "
+                "and in the same unit?"
+            )
+    return notes
+
+
+# -- maplab -------------------------------------------------------------------------------------
+
+
+def _of_maplab(path: Path, sensors: SensorSet, chosen: DeviceOptions) -> CalibrationFile:
+    notes = note_unread_keys(sensors, str(path))
+    if not _ids(sensors, CameraRig) and _ids(sensors, Imu):
+        imu_id = _of_kind(sensors, Imu, chosen.imu_sensor_id, f"{path}: IMUs", "imu")
+        device = RecordedSensors(sensors, "", imu_id)
+    else:
+        device = device_of(sensors, str(path), chosen)
+    if device.imu_id:
+        notes += _imu_notes(path, sensors.imu(device.imu_id))
+    return _as_file(path, "maplab", dataclasses.replace(device, notes=tuple(notes)))
+
+
+def _joined_of_maplab(
+    path: Path, rigs: SensorSet, imu_file: Path, imus: SensorSet, chosen: DeviceOptions
+) -> CalibrationFile:
+    """Return the rig of one file with the IMU of another; maplab 1.x has one file of each.
+
+    The body of a rig without IMU is the frame of the IMU.
+    """
+    rig = rigs.camera_rig(
+        _of_kind(rigs, CameraRig, chosen.ncamera_sensor_id, f"{path}: camera rigs", "ncamera")
+    )
+    imu = imus.imu(_of_kind(imus, Imu, chosen.imu_sensor_id, f"{imu_file}: IMUs", "imu"))
+    if imu.id in rigs.sensors:
+        raise MapError(f"{imu_file}: id {imu.id} is also that of the cameras in {path}")
+    both: dict[str, Sensor] = {imu.id: imu, rig.id: rig}
+    T_I_B = {imu.id: se3.identity(), rig.id: rigs.T_B_S(rig.id)}
+    mounts = {sensor_id: Extrinsics(imu.id, pose) for sensor_id, pose in T_I_B.items()}
+    sensors = SensorSet(both, mounts, {**imus.extra, **rigs.extra})
+    notes = note_unread_keys(rigs, str(path)) + note_unread_keys(imus, str(imu_file))
+    notes += _imu_notes(imu_file, imu)
+    device = RecordedSensors(sensors, rig.id, imu.id, tuple(notes))
+    return _as_file(path, "maplab", device)
+
+
+def _parts_of(sensors: SensorSet, path: Path) -> Parts:
+    """Return the cameras or the IMU of one of maplab's files, to be joined with another program's."""
+    imus = _ids(sensors, Imu)
+    if imus and not _ids(sensors, CameraRig):
+        imu = sensors.imu(_of_kind(sensors, Imu, "", f"{path}: IMUs", "imu"))
+        return Parts("maplab", imu=imu, notes=note_unread_keys(sensors, str(path)))
+    device = device_of(sensors, str(path))
+    return Parts(
+        "maplab",
+        device.cameras,
+        device.T_I_C,
+        device.imu,
+        notes=note_unread_keys(sensors, str(path)),
+    )
+
+
+def device_of(
+    sensors: SensorSet, source: str, chosen: DeviceOptions = ANY_DEVICE
+) -> RecordedSensors:
+    """Return the chosen camera rig of a set of sensors, with the chosen IMU if there is any.
+
+    Raises:
+        UserError: There is no rig, a choice fits none or several, or is missing where there are
+            several.
+    """
+    if not _ids(sensors, CameraRig):
+        raise UserError(f"{source} has no camera rig: give a calibration with cameras")
+    rig = _of_kind(
+        sensors, CameraRig, chosen.ncamera_sensor_id, f"{source}: camera rigs", "ncamera"
+    )
+    has_imu = bool(_ids(sensors, Imu) or chosen.imu_sensor_id)
+    imu = _of_kind(sensors, Imu, chosen.imu_sensor_id, f"{source}: IMUs", "imu") if has_imu else ""
+    return RecordedSensors(sensors, rig, imu)
+
+
+def _ids(sensors: SensorSet, kind: type[CameraRig] | type[Imu]) -> list[str]:
+    return [key for key, sensor in sensors.sensors.items() if isinstance(sensor, kind)]
+
+
+def _of_kind(
+    sensors: SensorSet, kind: type[CameraRig] | type[Imu], prefix: str, what: str, name: str
+) -> str:
+    """Return the only id of a kind of sensors that begins with a prefix."""
+    ids = _ids(sensors, kind)
+    flag = f"--selected_{name}_sensor_id"
+    matches = [sensor_id for sensor_id in ids if sensor_id.startswith(prefix.lower())]
+    if len(matches) == 1:
+        return matches[0]
+    known = ", ".join(ids) or "none"
+    if not prefix:
+        raise UserError(f"{what} are {known}: choose one by {flag}=ID")
+    number = "none of them begins" if not matches else "several of them begin"
+    raise UserError(f"{flag}={prefix}: {what} are {known}, and {number} so")
+
+
+# -- formats ------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> Parts | SensorSet:
+    """Return the content of a file or folder; that of maplab's files as it is.
+
+    Raises:
+        UserError: The format is not known.
+        MapError: The content is wrong.
+    """
+    if is_colmap(path):
+        cameras, T_B_C = read_cameras(path)
+        why = (
+            f"{path}: COLMAP does not know where the IMU is: give a calibration of cameras and IMU"
+        )
+        return Parts("COLMAP", cameras, T_B_C, why_not_on_imu=why)
+    if path.is_dir():
+        return _read_folder(path)
+    if path.suffix.lower() == ".json":
+        return read_basalt(read_json_entry(path))
+    entry = read_entry(path)
+    if "relative_config_imucam" in entry:
+        return _read_openvins(entry, path.parent)
+    for is_format, read in _FORMATS:
+        if is_format(entry):
+            return read(entry)
+    if _is_maplab(entry):
+        return read_sensors(path)
+    raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
+
+
+def _read_folder(path: Path) -> Parts:
+    if (path / _OPENVINS).exists():
+        return _read_openvins(read_entry(path / _OPENVINS), path)
+    if is_kimera_folder(path):
+        return read_kimera_folder(path)
+    return read_folder(path / "mav0" if (path / "mav0").is_dir() else path)
+
+
+def _read_openvins(entry: Entry, folder: Path) -> Parts:
+    chain, imu = (
+        folder / entry.text(key) for key in ("relative_config_imucam", "relative_config_imu")
+    )
+    cameras, inertial = read_camera_chain(read_entry(chain)), read_kalibr_imu(read_entry(imu))
+    return dataclasses.replace(_joined(cameras, inertial, imu), format="OpenVINS")
+
+
+def _is_maplab(entry: Entry) -> bool:
+    return "sensors" in entry or "cameras" in entry or "sigmas" in entry or "imu_sigmas" in entry
+
+
+def _has_imu_noise(entry: Entry) -> bool:
+    return "accelerometer_noise_density" in entry or "gyroscope_noise_density" in entry
+
+
+_FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] = (
+    (is_camera_chain, read_camera_chain),
+    (lambda entry: _has_imu_noise(entry) and "T_BS" in entry, read_imu_file),
+    (lambda entry: _has_imu_noise(entry) or "imu0" in entry, read_kalibr_imu),
+    (lambda entry: "T_BS" in entry, read_camera_file),
+)
+"""How a file is recognised, and its reader."""

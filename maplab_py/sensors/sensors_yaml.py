@@ -7,7 +7,7 @@ written back exactly as it was read while the pose it stands for is unchanged.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from maplab_py.sensors.camera import (
 from maplab_py.sensors.imu import Imu, ImuIntrinsics
 from maplab_py.sensors.rig import CameraRig
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor, Sensor, SensorSet
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors.yaml_entry import Entry, similar_key
 from maplab_py.sensors.yaml_text import dump_yaml, parse_yaml
 
 _NOISE_KEYS = (
@@ -41,6 +41,29 @@ _LIDAR_CAMERA = "camera-3d-lidar"
 _LINE_DELAY = "line-delay-nanoseconds"
 _MAX_READOUT_NS = 1_000_000_000
 _SAME_POSE = 1e-9
+_KEYS = (
+    *_NOISE_KEYS,
+    *_IMU_KEYS,
+    *(
+        "id",
+        "sensor_type",
+        "topic",
+        "description",
+        "sigmas",
+        "imu_intrinsics",
+        "T_g",
+        "T_a",
+        "R_AI",
+    ),
+    *("cameras", "camera", "T_B_C", "T_C_B", "time_offset_ns", "image_delay_s", _LINE_DELAY),
+    *("image_height", "image_width", "type", "intrinsics", "distortion", "parameters"),
+    *("sensor_id", "base_sensor_id", "T_B_S", "T_S_B", "sensors", "extrinsics"),
+)
+_KEPT_KEYS = (
+    *("T_G_B_fixed_covariance", "T_B_C", "T_C_B", "T_B_S", "T_S_B", _LINE_DELAY, "compressed"),
+    *("hardware_id", "label", "T_St_Stp1_fixed_covariance", "sensor_type", "id", "uuid"),
+)
+"""Keys of maplab that have no meaning here, and poses in the form in which they were read."""
 
 
 def read_sensors(path: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSet:
@@ -106,6 +129,29 @@ def parse_sensors(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) ->
     rest = top.rest()
     rest.pop("extrinsics", None)
     return SensorSet(sensors, extrinsics, rest)
+
+
+def note_unread_keys(sensor_set: SensorSet, source: str) -> list[str]:
+    """Return one note that names the keys which are kept but not understood, none if there are none."""
+    extras: list[Mapping[str, Any]] = [sensor_set.extra]
+    for sensor in sensor_set.sensors.values():
+        if isinstance(sensor, CameraRig):
+            extras += [sensor.extra, *sensor.camera_extra]
+            extras += [camera.extra for camera in sensor.cameras]
+        elif isinstance(sensor, Imu):
+            extras.append(sensor.extra)
+    extras += [mount.extra for mount in sensor_set.extrinsics.values()]
+    names = sorted({key for extra in extras for key in _leaf_keys(extra)} - set(_KEPT_KEYS))
+    words = [f"{name} ({hint}?)" if (hint := similar_key(name, _KEYS)) else name for name in names]
+    return [f"{source}: keys that are not understood: {', '.join(words[:12])}"] if words else []
+
+
+def _leaf_keys(extra: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in extra.items():
+        if isinstance(value, Mapping) and "data" not in value:
+            yield from _leaf_keys(value)
+        else:
+            yield str(key)
 
 
 def write_sensors(sensor_set: SensorSet) -> str:

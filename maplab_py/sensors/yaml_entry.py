@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Set
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,15 @@ from maplab_py.geometry import se3
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: hand-written calibrations with four digits pass."""
+_SIMILAR = 0.8
+"""Smallest ratio of common letters of a key and the one that it was probably meant to be."""
+
+
+def similar_key(key: str, names: Iterable[Any]) -> str:
+    """Return the name that a misspelt key probably stands for, "" if none is similar."""
+    known = {str(name).lower(): str(name) for name in sorted(map(str, names))}
+    matches = difflib.get_close_matches(key.lower(), known, n=1, cutoff=_SIMILAR)
+    return known[matches[0]] if matches else ""
 
 
 class Entry:
@@ -25,10 +35,17 @@ class Entry:
         self.where = where
         self._values = values
         self._used: set[str] = set()
+        self._asked: set[str] = set()
         self._children: dict[str, Entry] = {}
+        self._rows: dict[str, list[Entry]] = {}
 
     def __contains__(self, key: str) -> bool:
+        self._asked.add(key)
         return self._values.get(key) is not None
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield all keys in the order of the file."""
+        return iter(self._values)
 
     def raw(self, key: str) -> Any:
         """Return the value of a key as parsed and count the key as understood.
@@ -38,7 +55,9 @@ class Entry:
         """
         self._used.add(key)
         if key not in self:
-            raise MapError(f"{self.where}: key '{key}' is missing")
+            similar = similar_key(key, self._values.keys() - self._used)
+            hint = f"; is '{similar}' misspelt?" if similar else ""
+            raise MapError(f"{self.where}: key '{key}' is missing{hint}")
         return self._values[key]
 
     def rest(self) -> dict[str, Any]:
@@ -48,6 +67,31 @@ class Entry:
             if child_rest := child.rest():
                 rest[key] = child_rest
         return rest
+
+    def unknown(self, ignored: Set[str] = frozenset()) -> Iterator[tuple[str, str]]:
+        """Yield keys that were not read, and the absent key that each resembles or "".
+
+        Args:
+            ignored: Keys at any level that are left out.
+        """
+        absent = {key for key in self._asked if self._values.get(key) is None}
+        for key in self._values:
+            if key in self._children or key in self._rows:
+                parts = (
+                    [(str(key), self._children[key])]
+                    if key in self._children
+                    else [(f"{key}[{row}]", entry) for row, entry in enumerate(self._rows[key])]
+                )
+                for name, part in parts:
+                    yield from ((f"{name}: {k}", hint) for k, hint in part.unknown(ignored))
+            elif key not in self._used and key not in ignored:
+                yield str(key), similar_key(str(key), absent)
+
+    def entries(self, key: str) -> list[Entry]:
+        """Return the mappings of the list under a key."""
+        rows = [Entry(v, f"{self.where}: {key}[{row}]") for row, v in enumerate(self.items(key))]
+        self._rows[key] = rows
+        return rows
 
     def child(self, key: str) -> Entry:
         """Return the mapping under a key."""
@@ -107,6 +151,10 @@ class Entry:
             raise MapError(f"{self.where}: key '{key}' must be a whole number, not {value!r}")
         return value
 
+    def numbers(self, key: str) -> F64:
+        """Return all finite numbers under a key (N,)."""
+        return self._numbers(key).reshape(-1)
+
     def vector(self, key: str, count: int) -> F64:
         """Return `count` finite numbers: {rows, cols, data} or a plain list."""
         values = self._numbers(key)
@@ -147,6 +195,7 @@ class Entry:
         declared = None
         if isinstance(value, Mapping):
             entry = self.child(key)
+            entry.text("dt")  # OpenCV's type of the entries
             declared = (entry.integer("rows"), entry.integer("cols"))
             value = entry.raw("data")
         try:

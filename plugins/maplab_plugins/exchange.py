@@ -11,7 +11,7 @@ from maplab_py.algorithms.external_poses.options import (
     TrajectoryOptions,
     WheelOptions,
 )
-from maplab_py.interop.recordings.options import DeviceOptions
+from maplab_py.interop.device import DeviceOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,

@@ -1,4 +1,4 @@
-"""The cameras of a COLMAP model as a device: from the folder of a model, or its file of cameras."""
+"""The cameras of a COLMAP model: from the folder of a model, or its file of cameras."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from maplab_py.interop.colmap.binary_reading import REMEDY, read_binary_cameras
 from maplab_py.interop.colmap.camera_models import MODELS, map_camera
 from maplab_py.interop.colmap.model import ColmapCamera, ColmapModel, SensorType
 from maplab_py.interop.colmap.reading import read_model
-from maplab_py.interop.recordings.models import make_device
-from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.sensors import Camera
 
 _FILES = ("cameras.bin", "cameras.txt")
 _MAX_BYTES = 100_000_000
@@ -26,8 +25,8 @@ def is_colmap(path: Path) -> bool:
     return path.name in _FILES or any((path / name).is_file() for name in _FILES)
 
 
-def read_calibration(path: Path) -> RecordedSensors:
-    """Return the cameras of a model as a camera rig; its first camera is the body frame.
+def read_cameras(path: Path) -> tuple[list[Camera], F64]:
+    """Return the cameras of a model, without ids, and their poses (n, 7) on the first one.
 
     Args:
         path: Folder of a model with one rig, whose poses are taken to be in metres, or a file of one camera.
@@ -47,8 +46,7 @@ def read_calibration(path: Path) -> RecordedSensors:
                 f"{path}: has {len(cameras)} cameras, and does not say how they are mounted: name the "
                 "folder of a model with a rig of them"
             )
-    named = [map_camera(camera, "") for camera in cameras]
-    return make_device(named, se3.compose(se3.inverse(T_R_C[0]), T_R_C), None)
+    return [map_camera(camera, "") for camera in cameras], se3.relative(T_R_C[0], T_R_C)
 
 
 def _rig(model: ColmapModel, folder: Path) -> tuple[tuple[ColmapCamera, ...], F64]:

@@ -98,7 +98,13 @@ class BagRecording:
             self._streams = [self._examined(reader, stream) for stream in streams]
         if len({stream.topic for stream in self._streams}) < len(self._streams):
             raise UserError(f"{path}: two sensors have the same topic: give --camera_topics")
-        self.notes = () if device.imu_id else ("no IMU is read: the calibration has none",)
+        self.notes = (
+            ()
+            if device.imu_id
+            else (
+                "no IMU is read: the calibration has none, --imu_calibration_file names its file",
+            )
+        )
 
     @property
     def start_ns(self) -> int:

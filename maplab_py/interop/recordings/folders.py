@@ -62,7 +62,9 @@ class FolderRecording:
     def notes(self) -> tuple[str, ...]:
         """Parts of the recording that are not read."""
         if not self.device.imu_id and (self._root / "imu0").is_dir():
-            return ("imu0 is not read: the calibration has no IMU",)
+            return (
+                "imu0 is not read: the calibration has no IMU, --imu_calibration_file names its file",
+            )
         return ()
 
     @cached_property

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_py.errors import UserError
+from maplab_py.interop.calibration_import import import_calibration, read_calibration
+from maplab_py.interop.calibrations.euroc import HOW_TO_CALIBRATE
+from maplab_py.interop.device import RecordedSensors, with_cameras, with_time_offset
 from maplab_py.interop.recordings.bag_files import is_bag
 from maplab_py.interop.recordings.bags import BagRecording
-from maplab_py.interop.recordings.calibration import (
-    HOW_TO_CALIBRATE,
-    read_calibration,
-    read_folder_calibration,
-)
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
-from maplab_py.interop.recordings.models import with_cameras, with_time_offset
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import RecordedSensors, Recording
+from maplab_py.interop.recordings.protocol import Recording
 
 
 def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
@@ -33,7 +30,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
                 f"{path} is a folder: --imu_topic and --camera_topics apply to bags only"
             )
         active = options.active_cameras
-        device = _chosen(_calibration(options) or read_folder_calibration(root), options)
+        device = _chosen(_calibration(options) or import_calibration(root), options)
         return FolderRecording(root, device, active)
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")

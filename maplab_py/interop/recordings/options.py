@@ -6,35 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import ClassVar
 
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import FlagError
+from maplab_py.interop.device import DeviceOptions
 from maplab_py.options import option
-
-
-@dataclasses.dataclass(frozen=True)
-class DeviceOptions:
-    """Which sensors of a sensors.yaml make up the device, where it has several of a kind."""
-
-    flag_prefix: ClassVar[str] = "selected_"
-
-    ncamera_sensor_id: str = option(
-        "", help="Camera rig to use, if sensors.yaml has several: id or unambiguous prefix"
-    )
-    imu_sensor_id: str = option(
-        "", help="IMU to use, if sensors.yaml has several: id or unambiguous prefix"
-    )
-
-    def check_unused(self, source: str) -> None:
-        """Check that nothing is chosen.
-
-        Raises:
-            UserError: A sensor is chosen; `source` says why there is no choice.
-        """
-        for flag, value in (
-            ("selected_ncamera_sensor_id", self.ncamera_sensor_id),
-            ("selected_imu_sensor_id", self.imu_sensor_id),
-        ):
-            if value:
-                raise UserError(f"--{flag}={value} needs a sensors.yaml: {source}")
 
 
 @dataclasses.dataclass(frozen=True)

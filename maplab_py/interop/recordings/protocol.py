@@ -8,45 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64, U8, Mask
-from maplab_py.sensors import Camera, CameraRig, Imu, SensorSet
+from maplab_py.interop.device import RecordedSensors as RecordedSensors
+from maplab_py.sensors import Imu
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RecordedSensors:
-    """The calibrated sensors of a recording."""
-
-    sensors: SensorSet
-    rig_id: str
-    imu_id: str = ""  # empty when there is no IMU
-
-    @cached_property
-    def imu(self) -> Imu | None:
-        """The IMU, None when there is none."""
-        return self.sensors.imu(self.imu_id) if self.imu_id else None
-
-    @cached_property
-    def rig(self) -> CameraRig:
-        """The camera rig."""
-        return self.sensors.camera_rig(self.rig_id)
-
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """The cameras of the rig."""
-        return self.rig.cameras
-
-    @property
-    def T_I_C(self) -> F64:
-        """Poses (C, 7) of the cameras on the IMU, on the rig's body when there is no IMU."""
-        return self.sensors.T_I_C(self.imu_id, self.rig_id) if self.imu_id else self.rig.T_B_C
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

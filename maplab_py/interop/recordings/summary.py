@@ -95,8 +95,8 @@ def _report(
     every = [times for times in (statistics.imu, *statistics.images) if times.count]
     start_ns = min(times.first_ns for times in every)
     end_ns = max(times.last_ns for times in every)
-    notes = list(recording.notes)
-    if not recording.device.imu_id and not notes:
+    notes = [*recording.device.notes, *recording.notes]
+    if not recording.device.imu_id and not recording.notes:
         notes.append("there is no IMU")
     if statistics.imu_gaps:
         notes.append(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, MaplabError, UserError
-from maplab_py.interop.recordings.calibration import read_folder_calibration
+from maplab_py.interop.calibration_import import import_calibration
 from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import FrameSet, RecordedSensors
@@ -48,7 +48,7 @@ STORE = get_typestore(Stores.ROS1_NOETIC)
 @pytest.fixture(scope="module")
 def device(tmp_path_factory: pytest.TempPathFactory) -> RecordedSensors:
     folder = write_folder(make_content(frames=1), tmp_path_factory.mktemp("device") / "room")
-    return read_folder_calibration(folder / "mav0")
+    return import_calibration(folder / "mav0")
 
 
 @pytest.fixture

@@ -11,17 +11,15 @@ import pytest
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibration_export import exported
-from maplab_py.interop.calibration_import import import_calibration
-from maplab_py.interop.recordings.calibration import (
+from maplab_py.interop.calibration_import import (
     device_of,
+    import_calibration,
     read_calibration,
-    read_folder_calibration,
 )
-from maplab_py.interop.recordings.kalibr import upper_triangular_and_rotation
-from maplab_py.interop.recordings.models import make_device
+from maplab_py.interop.calibrations.kalibr import upper_triangular_and_rotation
+from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.interop.recordings.opening import open_recording
-from maplab_py.interop.recordings.options import DeviceOptions, SourceOptions
-from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.sensors import Camera, Distortion, Imu, ImuIntrinsics, Projection
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from tests.interop.recordings.written import make_content, write_calibration, write_folder
@@ -56,7 +54,7 @@ def test_kalibr_of_euroc() -> None:
         1.9393e-5,
     )
     assert (imu.topic, imu.intrinsics) == ("/imu0", None)
-    folder = read_folder_calibration(shared_data("euroc_mh01_10s/mav0"))
+    folder = import_calibration(shared_data("euroc_mh01_10s/mav0"))
     np.testing.assert_allclose(folder.T_I_C, device.T_I_C, atol=1e-12)
 
 
@@ -170,7 +168,7 @@ def test_ids_follow_from_the_calibration(tmp_path: Path) -> None:
 
 def test_sensors_yaml(tmp_path: Path) -> None:
     folder = write_folder(make_content(frames=1), tmp_path / "room")
-    device = read_folder_calibration(folder / "mav0")
+    device = import_calibration(folder / "mav0")
     again = read_calibration(write_calibration(device, tmp_path / "sensors.yaml"))
     assert (again.imu_id, again.rig_id) == (device.imu_id, device.rig_id)
     np.testing.assert_allclose(again.T_I_C, device.T_I_C, atol=1e-15)
@@ -186,7 +184,7 @@ def test_sensors_yaml(tmp_path: Path) -> None:
 
 def test_of_several_rigs_and_imus_the_chosen_ones_are_used(tmp_path: Path) -> None:
     folder = write_folder(make_content(frames=1), tmp_path / "room")
-    device = read_folder_calibration(folder / "mav0")
+    device = import_calibration(folder / "mav0")
     sensors, mounts = dict(device.sensors.sensors), dict(device.sensors.extrinsics)
     for old, new in ((device.imu_id, "f" * 32), (device.rig_id, "fe" * 16)):
         sensors[new] = dataclasses.replace(sensors[old], id=new)
@@ -238,7 +236,7 @@ def test_tum_vi_folder_with_calibration_beside_it(tmp_path: Path) -> None:
     for name, target in (("imucam_chain", "camchain"), ("imu_chain", "imu_config")):
         text = (source / f"kalibr_{name}.yaml").read_text()
         (folder / "dso" / f"{target}.yaml").write_text(text)
-    device = read_folder_calibration(folder / "mav0")
+    device = import_calibration(folder / "mav0")
     assert [camera.distortion for camera in device.cameras] == [Distortion.EQUIDISTANT] * 2
     assert device.imu is not None
     assert device.imu.acc_noise_density == 0.0028

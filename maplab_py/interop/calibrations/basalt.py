@@ -6,23 +6,22 @@ cameras are `T_imu_cam` on its frame i (basalt-headers, calib_bias.hpp and calib
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-from maplab_py.input_files import read_text
-from maplab_py.interop.recordings.kalibr import with_measurement_matrices
-from maplab_py.interop.recordings.models import make_device
-from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.interop.calibrations.kalibr import with_measurement_matrices
+from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.sensors.yaml_entry import Entry
 
-_MAX_BYTES = 16_000_000
 _UNIT_TOLERANCE = 1e-3
+_MAX_TIME_OFFSET_NS = 10_000_000_000
+_NOT_OF_THE_CALIBRATION = (
+    *("vignette", "imu_update_rate", "rpmax", "calib_mag_bias"),
+    *("T_mocap_world", "T_imu_marker", "mocap_time_offset_ns", "mocap_to_imu_offset_ns"),
+)
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _MODELS = {
     "pinhole": (Distortion.NONE, ()),
@@ -32,49 +31,36 @@ _MODELS = {
 }
 
 
-def read_basalt(path: Path) -> RecordedSensors:
+def read_basalt(top: Entry) -> Parts:
     """Read a calibration of Basalt; biases, the vignette and poses of markers are not used.
 
     Raises:
-        MapError: The file cannot be read, a key is missing or wrong, or a model is not supported.
+        MapError: A key is missing or wrong, or a model is not supported.
     """
-    top = Entry(_read_json(path), str(path))
     entry = top.child("value0") if "value0" in top else top
-    parts = [_entries(entry, key) for key in ("T_imu_cam", "intrinsics")]
+    poses, lenses = entry.entries("T_imu_cam"), entry.entries("intrinsics")
     sizes = entry.items("resolution")
-    if not parts[0] or not len(parts[0]) == len(parts[1]) == len(sizes):
+    if not poses or not len(poses) == len(lenses) == len(sizes):
         raise MapError(
             f"{entry.where}: 'T_imu_cam', 'intrinsics' and 'resolution' need an entry per camera"
         )
     offset_ns = entry.integer("cam_time_offset_ns", 0)
+    if abs(offset_ns) > _MAX_TIME_OFFSET_NS:
+        raise MapError(
+            f"{entry.where}: key 'cam_time_offset_ns': {1e-9 * offset_ns:g} s: it must be below 10 s: give "
+            "nanoseconds"
+        )
     resolution = entry.matrix("resolution", len(sizes), 2)
     if np.any(resolution < 1) or np.any(resolution != np.round(resolution)):
         raise MapError(f"{entry.where}: key 'resolution' wants positive whole numbers")
     cameras = [
         _camera(part, int(size[0]), int(size[1]), offset_ns)
-        for part, size in zip(parts[1], resolution, strict=True)
+        for part, size in zip(lenses, resolution, strict=True)
     ]
     imu, T_I_i = _imu(entry)
-    T_i_C = np.stack([_pose(part) for part in parts[0]])
-    return make_device(cameras, se3.compose(T_I_i, T_i_C), imu)
-
-
-def _read_json(path: Path) -> object:
-    try:
-        text = read_text(path, _MAX_BYTES, remedy="it is no calibration", error=MapError)
-        value: object = json.loads(text)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
-    except (ValueError, RecursionError) as error:
-        raise MapError(f"{path}: not valid JSON: {error}") from error
-    return value
-
-
-def _entries(entry: Entry, key: str) -> list[Entry]:
-    return [
-        Entry(value, f"{entry.where}: {key}[{row}]") for row, value in enumerate(entry.items(key))
-    ]
+    T_i_C = np.stack([_pose(part) for part in poses])
+    notes = note_unknown_keys(top, _NOT_OF_THE_CALIBRATION)
+    return Parts("Basalt", cameras, T_i_C, imu, se3.inverse(T_I_i), notes=notes)
 
 
 def _pose(entry: Entry) -> F64:

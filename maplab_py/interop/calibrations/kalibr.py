@@ -8,92 +8,122 @@ upper triangular: W = T_g R_I_i and A = T_a R_A_I R_I_i; both are RQ decompositi
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+import re
 
 import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.recordings.models import make_device, read_camera, read_entry, read_imu_noise
-from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.interop.calibrations.models import note_line_delays, read_camera, read_imu_noise
+from maplab_py.interop.calibrations.parts import Parts, compare_poses, note_unknown_keys
 from maplab_py.sensors import Camera, Imu, ImuIntrinsics
 from maplab_py.sensors.yaml_entry import Entry
 
 _IDENTITY_TOLERANCE = 1e-9
-
-
-def read_kalibr(camchain: Path, imu_file: Path | None) -> RecordedSensors:
-    """Read a camera chain, and an IMU file unless it is None.
-
-    Raises:
-        MapError: A file cannot be read, a key is missing or wrong, or a model is not supported.
-    """
-    top = read_entry(camchain)
-    cameras, T_cam_i = _read_chain(top, needs_imu=imu_file is not None)
-    if imu_file is None:
-        # without an IMU the body is the first camera
-        return make_device(cameras, se3.compose(T_cam_i[0], se3.inverse(T_cam_i)), None)
-    imu, T_I_i = read_kalibr_imu(imu_file)
-    return make_device(cameras, se3.compose(T_I_i, se3.inverse(T_cam_i)), imu)
+_NOT_OF_THE_CALIBRATION = ("cam_overlaps", "update_rate", "T_i_b", "overlaps", "rosbag")
+_PAIR = re.compile(r"^T_cam([0-9]{1,2})_cam([0-9]{1,2})$")
+_NO_IMU_POSE = (
+    "key 'T_cam_imu' is missing: calibrate cameras and IMU together (kalibr_calibrate_imu_camera)"
+)
 
 
 def is_camera_chain(entry: Entry) -> bool:
     """Tell whether a calibration file is kalibr's camera chain."""
-    return "cam0" in entry
+    return any(_camera_number(key) is not None for key in entry)
 
 
-def _read_chain(top: Entry, *, needs_imu: bool) -> tuple[list[Camera], F64]:
-    """Return the cameras and their poses T_cam_i (C, 7)."""
-    if not is_camera_chain(top):
-        raise MapError(f"{top.where}: key 'cam0' is missing: this is not a kalibr camera chain")
-    cameras: list[Camera] = []
-    poses: list[F64] = []
-    while f"cam{len(cameras)}" in top:
-        entry = top.child(f"cam{len(cameras)}")
-        cameras.append(
-            dataclasses.replace(
-                read_camera(entry, "distortion_coeffs"),
-                topic=entry.text("rostopic"),
-                time_offset_ns=round(1e9 * entry.number("timeshift_cam_imu", 0.0)),
-            )
-        )
-        poses.append(_camera_pose(entry, poses, needs_imu=needs_imu))
-    return cameras, np.stack(poses)
-
-
-def _camera_pose(entry: Entry, before: list[F64], *, needs_imu: bool) -> F64:
-    """Return T_cam_i (7,) of the camera that follows those `before`."""
-    if "T_cam_imu" in entry:
-        return entry.pose("T_cam_imu")
-    if "T_imu_cam" in entry:
-        return se3.inverse(entry.pose("T_imu_cam"))
-    if "T_cn_cnm1" in entry and before:
-        return se3.compose(entry.pose("T_cn_cnm1"), before[-1])
-    if not before and not needs_imu:
-        return se3.identity()
-    raise MapError(
-        f"{entry.where}: key 'T_cam_imu' is missing: calibrate cameras and IMU together "
-        "(kalibr_calibrate_imu_camera)"
-    )
-
-
-def read_kalibr_imu(path: Path) -> tuple[Imu, F64]:
-    """Return the IMU of kalibr's or OpenVINS' IMU file, and T_I_i (7,).
+def read_camera_chain(entry: Entry, form: str = "kalibr") -> Parts:
+    """Return the cameras of a chain, on the IMU where the chain has their poses on it.
 
     Raises:
-        MapError: The file cannot be read, a key is missing or wrong, or a model is not supported.
+        MapError: A key is missing or wrong, a model is not supported, or a camera is left out.
     """
-    top = read_entry(path)
+    numbers = sorted(n for key in entry if (n := _camera_number(key)) is not None)
+    if numbers != list(range(len(numbers))):
+        missing = min(set(range(numbers[-1])) - set(numbers))
+        raise MapError(
+            f"{entry.where}: has cam{numbers[-1]}, but no cam{missing}: number the cameras from cam0 on"
+        )
+    cameras: list[Camera] = []
+    T_cam_B: list[F64] = []
+    notes: list[str] = []
+    why = ""
+    for number in numbers:
+        part = entry.child(f"cam{number}")
+        cameras.append(read_camera(part, "distortion_coeffs"))
+        given = _given_poses(part, T_cam_B)
+        if number and not given:
+            raise MapError(f"{part.where}: {_NO_IMU_POSE}")
+        if why and given[0][0] != "T_cn_cnm1":
+            raise MapError(why)
+        if number == 0 and (not given or given[0][0] == "T_cn_cnm1"):
+            why = f"{part.where}: {_NO_IMU_POSE}"
+            given = [("", se3.identity())]
+        T_cam_B.append(given[0][1])
+        notes += compare_poses(part.where, given)
+    poses = np.stack(T_cam_B)
+    notes += _compare_pairs(entry, poses) + note_line_delays(entry, cameras)
+    notes += note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION)
+    if why:  # the body is the first camera
+        poses = se3.compose(poses, se3.inverse(poses[0]))
+    return Parts(form, cameras, se3.inverse(poses), why_not_on_imu=why, notes=notes)
+
+
+def _camera_number(key: object) -> int | None:
+    """Return the number of a key cam0, cam1, ..., None for others."""
+    text = str(key)
+    digits = text.removeprefix("cam")
+    is_camera = text.startswith("cam") and digits.isdecimal() and len(digits) < 3
+    return int(digits) if is_camera and digits.isascii() else None
+
+
+def _given_poses(entry: Entry, before: list[F64]) -> list[tuple[str, F64]]:
+    """Return all poses T_cam_B (7,) that a camera has, by key, the one that counts first."""
+    given = []
+    if "T_cam_imu" in entry:
+        given.append(("T_cam_imu", entry.pose("T_cam_imu")))
+    if "T_imu_cam" in entry:
+        given.append(("T_imu_cam", se3.inverse(entry.pose("T_imu_cam"))))
+    if "T_cn_cnm1" in entry:
+        T_cn_cnm1 = entry.pose("T_cn_cnm1")
+        if before:
+            given.append(("T_cn_cnm1", se3.compose(T_cn_cnm1, before[-1])))
+    return given
+
+
+def _compare_pairs(entry: Entry, T_cam_B: F64) -> list[str]:
+    """Return notes where T_cam1_cam0 contradicts the poses of the cameras."""
+    notes = []
+    for key in entry:
+        match = _PAIR.match(str(key))
+        if match and max(int(n) for n in match.groups()) < len(T_cam_B):
+            a, b = (T_cam_B[int(n)] for n in match.groups())
+            poses = [
+                ("T_cam_imu", se3.compose(a, se3.inverse(b))),
+                (str(key), entry.pose(str(key))),
+            ]
+            notes += compare_poses(entry.where, poses)
+    return notes
+
+
+def read_kalibr_imu(top: Entry, form: str = "kalibr") -> Parts:
+    """Return the IMU of kalibr's or OpenVINS' IMU file; B is the frame i that cameras refer to.
+
+    Raises:
+        MapError: A key is missing or wrong, or a model is not supported.
+    """
     entry = top.child("imu0") if "imu0" in top else top
     if "imu1" in top:
-        raise MapError(f"{path}: several IMUs are not supported: keep imu0 only")
+        raise MapError(f"{top.where}: several IMUs are not supported: keep imu0 only")
     if "T_i_b" in entry and not _is_identity(entry.pose("T_i_b"), se3.identity()):
         raise MapError(f"{entry.where}: key 'T_i_b' of the only IMU must be the identity")
     if abs(entry.number("time_offset", 0.0)) > 0.0:
         raise MapError(f"{entry.where}: key 'time_offset' of the only IMU must be 0")
-    imu = dataclasses.replace(read_imu_noise(entry), topic=entry.text("rostopic"))
-    return with_measurement_matrices(imu, *_measurement_matrices(entry))
+    imu = read_imu_noise(entry, topic=entry.text("rostopic"))
+    imu, T_I_i = with_measurement_matrices(imu, *_measurement_matrices(entry))
+    notes = note_unknown_keys(top, (*_NOT_OF_THE_CALIBRATION, "integration_sigma"))
+    return Parts(form, imu=imu, T_B_I=se3.inverse(T_I_i), notes=notes)
 
 
 def with_measurement_matrices(imu: Imu, W: F64, A: F64) -> tuple[Imu, F64]:
