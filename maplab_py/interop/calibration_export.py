@@ -16,6 +16,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Distortion, Imu, Projection, SensorSet
+from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 from maplab_py.sensors.imu import ImuIntrinsics
 from maplab_py.sensors.sensors_yaml import write_sensors
 
@@ -83,6 +84,12 @@ def _time_shift_s(camera: Camera) -> float:
     return camera.time_offset_ns * 1e-9 + camera.image_delay_s
 
 
+_PROJECTION_NAMES = {
+    Projection.PINHOLE: "pinhole",
+    Projection.UNIFIED: "omni",
+    Projection.DOUBLE_SPHERE: "ds",
+    Projection.EXTENDED_UNIFIED: "eucm",
+}
 _DISTORTION_NAMES = {
     Distortion.RADTAN: "radtan",
     Distortion.EQUIDISTANT: "equidistant",
@@ -94,11 +101,15 @@ _DISTORTION_NAMES = {
 def _chain(cameras: tuple[Camera, ...], T_imu_C: F64) -> dict[str, Any]:
     chain: dict[str, Any] = {}
     for row, camera in enumerate(cameras):
-        name = _DISTORTION_NAMES[camera.distortion]
+        name = _DISTORTION_NAMES.get(camera.distortion)
+        if name is None:
+            raise UserError(
+                f"kalibr and OpenVINS have no {camera.distortion.value} distortion: maplab and basalt have it"
+            )
         chain[f"cam{row}"] = {
             "T_cam_imu": _rows(np.linalg.inv(_matrix(T_imu_C[row]))),
             "cam_overlaps": [other for other in range(len(cameras)) if other != row],
-            "camera_model": "pinhole" if camera.projection is Projection.PINHOLE else "omni",
+            "camera_model": _PROJECTION_NAMES[camera.projection],
             "distortion_coeffs": [float(value) for value in camera.distortion_parameters],
             "distortion_model": name,
             "intrinsics": [float(value) for value in camera.intrinsics],
@@ -204,23 +215,46 @@ def _basalt(imu: Imu, cameras: tuple[Camera, ...], T_I_C: F64, rate_hz: float) -
     return json.dumps({"value0": content}, indent=2) + "\n"
 
 
+_BASALT_DISTORTIONS = {
+    Distortion.NONE: "pinhole",
+    Distortion.EQUIDISTANT: "kb4",
+    Distortion.RADTAN: "pinhole-radtan8",
+    Distortion.RADTAN5: "pinhole-radtan8",
+    Distortion.RATIONAL: "pinhole-radtan8",
+    Distortion.FOV: "fov",
+}
+_BASALT_PROJECTIONS = {
+    Projection.UNIFIED: "ucm",
+    Projection.DOUBLE_SPHERE: "ds",
+    Projection.EXTENDED_UNIFIED: "eucm",
+}
+
+
 def _basalt_camera(camera: Camera) -> dict[str, Any]:
-    names = {
-        Distortion.NONE: ("pinhole", ()),
-        Distortion.EQUIDISTANT: ("kb4", ("k1", "k2", "k3", "k4")),
-        Distortion.RADTAN: ("pinhole-radtan8", ("k1", "k2", "p1", "p2")),
-    }
-    if camera.projection is not Projection.PINHOLE or camera.distortion not in names:
+    values = dict(zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics[-4:]), strict=True))
+    if camera.projection is Projection.PINHOLE:
+        kind = _BASALT_DISTORTIONS[camera.distortion]
+        parameters = camera.distortion_parameters
+        values.update(zip(DISTORTION_NAMES[camera.distortion], map(float, parameters), strict=True))
+        if kind == "pinhole-radtan8":
+            more = ("k3", "k4", "k5", "k6", "rpmax")
+            values = {**values, **{key: values.get(key, 0.0) for key in more}}
+        return {"camera_type": kind, "intrinsics": values}
+    if camera.distortion is not Distortion.NONE:
         raise UserError(
             f"Basalt has no camera model for {camera.projection.value} with "
             f"{camera.distortion.value} distortion"
         )
-    kind, more = names[camera.distortion]
-    values = dict(zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics), strict=True))
-    values.update(zip(more, map(float, camera.distortion_parameters), strict=True))
-    if kind == "pinhole-radtan8":
-        values.update({"k3": 0.0, "k4": 0.0, "k5": 0.0, "k6": 0.0, "rpmax": 0.0})
-    return {"camera_type": kind, "intrinsics": values}
+    mirror = dict(
+        zip(MIRROR_NAMES[camera.projection], map(float, camera.intrinsics[:-4]), strict=True)
+    )
+    if (
+        camera.projection is Projection.UNIFIED
+    ):  # xi = alpha / (1 - alpha), focal lengths f (1 - alpha)
+        alpha = mirror["xi"] / (1.0 + mirror["xi"])
+        mirror = {"alpha": alpha}
+        values = {**values, "fx": values["fx"] * (1.0 - alpha), "fy": values["fy"] * (1.0 - alpha)}
+    return {"camera_type": _BASALT_PROJECTIONS[camera.projection], "intrinsics": values | mirror}
 
 
 def _yaml(value: dict[str, Any]) -> str:

@@ -265,7 +265,7 @@ def test_a_map_takes_over_what_the_file_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (CAMCHAIN.replace("pinhole", "ds"), "'ds' is not supported"),
+        (CAMCHAIN.replace("pinhole", "ocam"), "'ocam' is not supported"),
         (CAMCHAIN.replace("0.004", "4000000.0"), "below 10 s"),
         (CAMCHAIN.replace("640, 480", "640"), "'resolution' needs 2"),
         (CAMCHAIN.replace("[1.0, 0.0, 0.0, 0.02]", "[1.0, 1.0, 0.0, 0.02]"), "not a rotation"),
@@ -291,6 +291,7 @@ def test_wrong_files_are_refused_by_name(text: str, message: str, tmp_path: Path
     [
         ({"intrinsics": BASALT_CAMERAS[:1]}, "entry per camera"),
         ({"intrinsics": [{"camera_type": "ds", "intrinsics": {}}] * 2}, "'fx' is missing"),
+        ({"intrinsics": [{"camera_type": "ftheta", "intrinsics": {}}] * 2}, "'ftheta' is not"),
         ({"calib_accel_bias": [0.0] * 6}, "needs 9"),
         ({"accel_noise_std": [0.0] * 3}, "must be positive"),
         ({"cam_time_offset_ns": 10**12}, "below 10 s"),
@@ -311,17 +312,42 @@ def test_basalt_cut_anywhere_is_an_error_of_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
 
 
-def test_basalt_terms_that_no_model_has_are_refused(tmp_path: Path) -> None:
-    values = {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}
-    radtan = values | {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0}
-    fine = [{"camera_type": "pinhole-radtan8", "intrinsics": radtan}] * 2
-    assert cameras(import_calibration(basalt(tmp_path, intrinsics=fine)))[0].intrinsics[0] == 1.0
-    wrong = [{"camera_type": "pinhole-radtan8", "intrinsics": {**radtan, "k5": 0.1}}] * 2
-    with pytest.raises(MapError, match="k5"):
+@pytest.mark.parametrize(
+    ("kind", "more", "projection", "distortion"),
+    [
+        ("pinhole-radtan8", {"k3": 0.0}, Projection.PINHOLE, Distortion.RADTAN),
+        ("pinhole-radtan8", {"k3": 0.02}, Projection.PINHOLE, Distortion.RADTAN5),
+        ("pinhole-radtan8", {"k5": 0.1, "rpmax": 0.0}, Projection.PINHOLE, Distortion.RATIONAL),
+        ("ds", {"xi": -0.2, "alpha": 0.6}, Projection.DOUBLE_SPHERE, Distortion.NONE),
+        ("eucm", {"alpha": 0.6, "beta": 1.1}, Projection.EXTENDED_UNIFIED, Distortion.NONE),
+    ],
+)
+def test_basalt_models_there_and_back(
+    kind: str,
+    more: dict[str, float],
+    projection: Projection,
+    distortion: Distortion,
+    tmp_path: Path,
+) -> None:
+    pinhole = {"fx": 300.0, "fy": 301.0, "cx": 255.0, "cy": 256.0}
+    lens = {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0} if kind == "pinhole-radtan8" else {}
+    entry = {"camera_type": kind, "intrinsics": {**pinhole, **lens, **more}}
+    result = import_calibration(basalt(tmp_path, intrinsics=[entry] * 2))
+    camera = cameras(result)[0]
+    assert (camera.projection, camera.distortion) == (projection, distortion)
+    files = exported(result.sensors, result.imu_id, result.rig_id, "basalt", imu_rate_hz=200.0)
+    again = cameras(import_calibration(written(tmp_path, "again.json", files["calibration.json"])))[
+        0
+    ]
+    np.testing.assert_array_equal(again.intrinsics, camera.intrinsics)
+    np.testing.assert_array_equal(again.distortion_parameters, camera.distortion_parameters)
+
+
+def test_basalt_parameters_that_form_no_camera_are_refused(tmp_path: Path) -> None:
+    values = {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0, "xi": 0.1, "alpha": 2.0}
+    wrong = [{"camera_type": "ds", "intrinsics": values}] * 2
+    with pytest.raises(MapError, match=r"calibration.json.*0 <= alpha <= 1"):
         import_calibration(basalt(tmp_path, intrinsics=wrong))
-    double = [{"camera_type": "ds", "intrinsics": values}] * 2
-    with pytest.raises(MapError, match="'ds' is not supported"):
-        import_calibration(basalt(tmp_path, intrinsics=double))
 
 
 def test_an_imu_whose_frame_turns_needs_its_cameras(tmp_path: Path) -> None:

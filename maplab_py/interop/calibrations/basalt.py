@@ -12,8 +12,9 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.interop.calibrations.kalibr import with_measurement_matrices
+from maplab_py.interop.calibrations.models import make_camera
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
-from maplab_py.sensors import Camera, Distortion, Imu, Projection
+from maplab_py.sensors import Camera, Imu
 from maplab_py.sensors.yaml_entry import Entry
 
 _UNIT_TOLERANCE = 1e-3
@@ -23,12 +24,19 @@ _NOT_OF_THE_CALIBRATION = (
     *("T_mocap_world", "T_imu_marker", "mocap_time_offset_ns", "mocap_to_imu_offset_ns"),
 )
 _PINHOLE = ("fx", "fy", "cx", "cy")
-_MODELS = {
-    "pinhole": (Distortion.NONE, ()),
-    "kb4": (Distortion.EQUIDISTANT, ("k1", "k2", "k3", "k4")),
-    "pinhole-radtan8": (Distortion.RADTAN, ("k1", "k2", "p1", "p2")),
-    "fov": (Distortion.FOV, ("w",)),
+_TERMS = {
+    "pinhole": ("pinhole", "none", (), ()),
+    "kb4": ("pinhole", "equidistant", (), ("k1", "k2", "k3", "k4")),
+    "pinhole-radtan8": (
+        *("pinhole", "rational_polynomial", ()),
+        ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+    "fov": ("pinhole", "fov", (), ("w",)),
+    "ds": ("ds", "none", ("xi", "alpha"), ()),
+    "eucm": ("eucm", "none", ("alpha", "beta"), ()),
+    "ucm": ("omni", "none", ("alpha",), ()),
 }
+"""Projection, distortion, and the names of their parameters by Basalt's names of models."""
 
 
 def read_basalt(top: Entry) -> Parts:
@@ -74,47 +82,32 @@ def _pose(entry: Entry) -> F64:
 
 def _camera(entry: Entry, width_px: int, height_px: int, offset_ns: int) -> Camera:
     name = entry.text("camera_type")
+    if name not in _TERMS:
+        raise MapError(
+            f"{entry.where}: key 'camera_type': '{name}' is not supported: calibrate with one of "
+            f"{', '.join(_TERMS)}"
+        )
+    projection, distortion, mirror_names, names = _TERMS[name]
     values = entry.child("intrinsics")
-    pinhole = np.array([values.number(key, positive=key[0] == "f") for key in _PINHOLE])
-    projection, distortion, parameters = Projection.PINHOLE, Distortion.NONE, np.zeros(0)
-    if name == "ucm" or (name == "eucm" and values.number("beta") == 1.0):
+    focal = np.array([values.number(key, positive=True) for key in _PINHOLE[:2]])
+    centre = [values.number(key) for key in _PINHOLE[2:]]
+    mirror = [values.number(key) for key in mirror_names]
+    if name == "ucm":
         # x / (alpha d + (1 - alpha) z) is Mei's model with xi = alpha / (1 - alpha)
-        alpha = values.number("alpha")
+        alpha = mirror[0]
         if not 0.0 <= alpha < 1.0:
             raise MapError(f"{values.where}: key 'alpha' must be from 0 to 1, 1 excluded")
-        projection = Projection.UNIFIED
-        pinhole[:2] /= 1.0 - alpha
-        pinhole = np.concatenate([[alpha / (1.0 - alpha)], pinhole])
-    elif name in _MODELS:
-        distortion, names = _MODELS[name]
-        parameters = np.array([values.number(key) for key in names])
-        _refuse_more_terms(values, name)
-    else:
-        known = ", ".join([*_MODELS, "ucm"])
-        raise MapError(
-            f"{entry.where}: key 'camera_type': '{name}' is not supported: calibrate with one of {known}"
-        )
-    return Camera(
-        id="",
-        projection=projection,
-        distortion=distortion,
-        intrinsics=pinhole,
-        distortion_parameters=parameters,
-        width_px=width_px,
-        height_px=height_px,
+        mirror, focal = [alpha / (1.0 - alpha)], focal / (1.0 - alpha)
+    coefficients = [values.number(key, None if row < 4 else 0.0) for row, key in enumerate(names)]
+    return make_camera(
+        values,
+        ("camera_type", projection),
+        ("camera_type", distortion),
+        [*mirror, *focal, *centre],
+        coefficients,
+        (width_px, height_px),
         time_offset_ns=offset_ns,
     )
-
-
-def _refuse_more_terms(values: Entry, name: str) -> None:
-    if name != "pinhole-radtan8":
-        return
-    for key in ("k3", "k4", "k5", "k6"):
-        if values.number(key, 0.0) != 0.0:
-            raise MapError(
-                f"{values.where}: key '{key}': four distortion parameters (k1 k2 p1 p2) are supported: "
-                "calibrate with kb4, or with the others at 0"
-            )
 
 
 def _imu(entry: Entry) -> tuple[Imu, F64]:

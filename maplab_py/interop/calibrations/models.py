@@ -19,8 +19,9 @@ PROJECTIONS = {
     "perspective": Projection.PINHOLE,
     "omni": Projection.UNIFIED,
     "mei": Projection.UNIFIED,
+    "ds": Projection.DOUBLE_SPHERE,
+    "eucm": Projection.EXTENDED_UNIFIED,
 }
-_POLYNOMIAL = "radtan"
 _DISTORTIONS = {
     "none": Distortion.NONE,
     "radtan": Distortion.RADTAN,
@@ -39,7 +40,7 @@ _DISTORTIONS = {
     "fov": Distortion.FOV,
 }
 """Names of distortion models; the count of coefficients tells the polynomial ones apart."""
-_BY_COUNT = {4: Distortion.RADTAN}
+_BY_COUNT = {4: Distortion.RADTAN, 5: Distortion.RADTAN5, 8: Distortion.RATIONAL}
 _MAX_TIME_SHIFT_S = 10.0
 
 
@@ -83,7 +84,10 @@ def make_camera(
         raise MapError(
             f"{entry.where}: focal lengths and the size of images must be positive, the latter whole"
         )
-    return Camera("", shape, lens, numbers, values, int(width), int(height), **more)
+    try:
+        return Camera("", shape, lens, numbers, values, int(width), int(height), **more)
+    except MapError as error:  # the parameters do not form a camera
+        raise MapError(f"{entry.where}: {str(error).removeprefix('camera : ')}") from None
 
 
 def _is_size(value: float) -> bool:

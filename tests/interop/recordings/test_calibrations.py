@@ -273,7 +273,7 @@ update_rate: 200.0
             r"cam0: key 'T_cam_imu' is missing: calibrate cameras and IMU together",
         ),
         ("radtan", "ftheta", "cam0: key 'distortion_model': 'ftheta' is not supported"),
-        ("pinhole", "eucm", "cam0: key 'camera_model': 'eucm' is not supported"),
+        ("pinhole", "ocam", "cam0: key 'camera_model': 'ocam' is not supported"),
         ("[640, 480]", "[640]", "key 'resolution' needs 2 values"),
         ("[300.0", "[-300.0", "must be positive"),
         ("update_rate: 200.0", "time_offset: 0.01", "key 'time_offset' of the only IMU must be 0"),
