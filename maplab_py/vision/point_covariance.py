@@ -16,6 +16,8 @@ from maplab_py.compilation import compiled
 
 _FARTHEST_M = 100.0
 """Standard deviation of an unknown point."""
+_NEAREST_M = 0.01
+"""Distance from which on rays fix a point no better; the inverse of their information would overflow."""
 
 
 class LandmarkPairs(NamedTuple):
@@ -63,7 +65,7 @@ def _add_rays(to_point, sigma_rad, seen, owner, information):  # type: ignore[no
         square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
         if not seen[ray] or square == 0.0:
             continue
-        weight = 1.0 / (sigma_rad[ray] * sigma_rad[ray] * square)
+        weight = 1.0 / (sigma_rad[ray] * sigma_rad[ray] * max(square, _NEAREST_M * _NEAREST_M))
         for i in range(3):
             for j in range(3):
                 across = (1.0 if i == j else 0.0) - x[i] * x[j] / square
