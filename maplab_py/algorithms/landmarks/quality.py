@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.gate import Gate
 from maplab_py.algorithms.landmarks.covariance import landmark_covariance, largest_sigma
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.reports import LandmarkQualityReport
@@ -97,6 +98,20 @@ def reset_quality(
 
 def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Verdict:
     """Return the failed criteria of landmarks (N,); observations of all missions count."""
+    failed = {f.name: np.zeros(len(landmarks), dtype=np.bool_) for f in dataclasses.fields(Verdict)}
+    for gate in criteria(vi_map, landmarks, options):
+        failed[gate.verdict] |= gate.failed
+    return Verdict(**failed)
+
+
+def criteria(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> list[Gate]:
+    """Return the criteria for landmarks (N,): those of camera landmarks, then those of lidar landmarks.
+
+    Their verdicts are the fields of `Verdict`.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks)]
     start = starts_of_counts(np.diff(vi_map.observation_start)[landmarks])
     of_landmark = np.repeat(np.arange(len(landmarks)), np.diff(start))
@@ -106,44 +121,39 @@ def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Ver
     directions = p_G[of_landmark] - origins
     at_camera = ~np.any(directions != 0.0, axis=1)
     directions[at_camera] = [0.0, 0.0, 1.0]
-
-    lidar = is_lidar(vi_map, landmarks)
-    observers = _distinct(vi_map.keypoint_vertex[keypoints], of_landmark, len(landmarks))
-    closest = _least(seen.signed_distance_m, start, empty=np.inf)
     angle_deg = np.rad2deg(largest_ray_angle(directions, start))
     sigma_m = _scaled_sigma(vi_map, landmarks, keypoints, seen.error_px, start)
-    worst_px = -_least(-seen.error_px, start, empty=np.inf)
-    worst_m = -_least(-np.nan_to_num(seen.error_m), start, empty=np.inf)
-    o = options
-    checks_px = o.max_reprojection_error_px >= 0.0
-    checks_m = o.lidar_max_observation_error_m >= 0.0
-    return Verdict(
-        too_few_observers=observers < np.where(lidar, o.lidar_min_observers, o.min_observers),
-        too_small_angle=~lidar & (angle_deg < o.min_observation_angle_deg),
-        too_uncertain=~lidar
-        & (o.max_relative_sigma >= 0.0)
-        & ~(sigma_m <= o.max_relative_sigma * closest),
-        too_near_or_behind=closest
-        < np.where(
-            lidar,
-            o.lidar_min_distance_from_closest_observer,
-            o.min_distance_from_closest_observer,
-        ),
-        too_far=np.isfinite(closest)
-        & (
-            closest
-            > np.where(
-                lidar,
-                o.lidar_max_distance_from_closest_observer,
-                o.max_distance_from_closest_observer,
-            )
-        ),
-        too_large_error=np.where(
-            lidar,
-            checks_m & (worst_m > o.lidar_max_observation_error_m),
-            checks_px & (worst_px > o.max_reprojection_error_px),
-        ),
-    )
+    worst_px = np.maximum(-_least(-seen.error_px, start, empty=np.inf), 0.0)
+    worst_m = np.maximum(-_least(-np.nan_to_num(seen.error_m), start, empty=np.inf), 0.0)
+    observers = _distinct(vi_map.keypoint_vertex[keypoints], of_landmark, len(landmarks))
+    closest_m = _least(seen.signed_distance_m, start, empty=np.inf)
+    is_scan, o = is_lidar(vi_map, landmarks), options
+    least_angle, sigma_ratio = o.min_observation_angle_deg, o.max_relative_sigma
+    with np.errstate(invalid="ignore"):
+        most_m = np.where(sigma_ratio < 0.0, np.inf, sigma_ratio * closest_m)
+    gates = []
+    for prefix, here, worst in (("", ~is_scan, worst_px), ("lidar_", is_scan, worst_m)):
+        unit = "m" if prefix else "px"
+        error = "lidar_max_observation_error_m" if prefix else "max_reprojection_error_px"
+        near, far = (f"{prefix}{side}_distance_from_closest_observer" for side in ("min", "max"))
+        limits = [getattr(o, name) for name in (f"{prefix}min_observers", near, far, error)]
+        limit = limits[3] if limits[3] >= 0.0 else np.inf
+        gates += [
+            Gate.of("observing vertices", observers, limits[0], "too_few_observers",
+                    f"--elq_{prefix}min_observers", is_minimum=True, applies=here),
+            Gate.of("largest angle of two rays", angle_deg, least_angle, "too_small_angle",
+                    "--elq_min_observation_angle_deg", "deg", is_minimum=True,
+                    applies=here & ~is_scan),
+            Gate.of("deviation along the worst axis", np.nan_to_num(sigma_m, nan=np.inf), most_m,
+                    "too_uncertain", "--elq_max_relative_sigma", "m", applies=here & ~is_scan),
+            Gate.of("distance of the closest observer", closest_m, limits[1],
+                    "too_near_or_behind", f"--elq_{near}", "m", is_minimum=True, applies=here),
+            Gate.of("distance of the closest observer", closest_m, limits[2], "too_far",
+                    f"--elq_{far}", "m", applies=here & np.isfinite(closest_m)),
+            Gate.of("largest error of an observation", worst, limit, "too_large_error",
+                    f"--elq_{error}", unit, applies=here),
+        ]  # fmt: skip
+    return gates
 
 
 def predicted_sigma(vi_map: VIMap, landmarks: I64) -> F64:

@@ -22,11 +22,10 @@ class AmbiguityRule:
     drift_offset_m: float
     drift_ratio: float  # fraction of the arc length between the places
     max_turn_rad: float = 0.3
-    inlier_share: float = 0.5  # inliers of the second place relative to the best; above 1 = never
     min_inliers: int = 20  # of a distant place of the query's mission
 
 
-def ambiguous_queries(
+def rival_shares(
     query_vertex: I64,
     place_way_m: F64,
     place_mission: I64,
@@ -35,8 +34,10 @@ def ambiguous_queries(
     is_far_same_mission: Mask,
     candidate: Mask,
     rule: AmbiguityRule,
-) -> I64:
-    """Return the query vertices that match several places.
+) -> F64:
+    """Return the inliers (N,) of each query's strongest other place relative to the best place.
+
+    A distant place of the query's mission counts as equally strong.
 
     Args:
         query_vertex: Query (N,) of each closure.
@@ -60,7 +61,10 @@ def ambiguous_queries(
     turn = np.linalg.norm(so3.log(between[:, :4]), axis=1)
     drift = rule.drift_offset_m + rule.drift_ratio * np.abs(place_way_m[order] - place_way_m[best])
     is_other = (apart > drift) | (turn > rule.max_turn_rad)
-    rivals = is_other & (inliers[order] >= rule.inlier_share * inliers[best])
-    is_strong = (inliers[rows] >= rule.min_inliers) & (rule.inlier_share <= 1.0)
-    same_mission = rows[is_far_same_mission[rows] & is_strong]
-    return np.union1d(query_vertex[order[rivals]], query_vertex[same_mission])
+    queries, of_closure = np.unique(query_vertex, return_inverse=True)
+    shares = np.zeros(len(queries))
+    share = inliers[order] / np.maximum(inliers[best], 1)
+    np.maximum.at(shares, of_closure[order], np.where(is_other, share, 0.0))
+    far = candidate & is_far_same_mission & (inliers >= rule.min_inliers)
+    np.maximum.at(shares, of_closure[far], 1.0)
+    return np.asarray(shares[of_closure])

@@ -1,4 +1,4 @@
-"""Why closures were refused, and why missions are not joined: every gate with value and threshold."""
+"""Explanations of refused closures and of missions that are not joined: every gate with its value."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.acceptance import Acceptance, acceptance
+from maplab_py.algorithms.gate import Gate, any_failed
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.detection import detect
-from maplab_py.algorithms.loop_closure.gate_values import (
-    YES_NO,
-    GateValues,
-    gate_values,
-    shortfalls,
-)
 from maplab_py.algorithms.loop_closure.listing import describe_closure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
+from maplab_py.algorithms.loop_closure.recorded_gates import (
+    Acceptance,
+    acceptance,
+    recorded_gates,
+    shortfalls,
+)
 from maplab_py.algorithms.loop_closure.reports import OF_CLOUDS, Verdict
 from maplab_py.array_types import I64, Mask
 from maplab_py.progress import SILENT, Progress
@@ -119,8 +119,10 @@ def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> Clo
     """Return the gates of a recorded closure (a row of the closures of `read_record`)."""
     closures = read_record(vi_map).closures
     line = describe_closure(vi_map, row)
-    gates = gate_values(vi_map, closures, options)
-    lines = [_gate_line(gate, row) for gate in gates if gate.applies[row]]
+    gates = recorded_gates(vi_map, closures, options)
+    lines = [
+        GateLine(gate.name, *gate.describe(row), gate.flag) for gate in gates if gate.applies[row]
+    ]
     verdict = VERDICTS[closures.verdict[row]]
     failed = [gate for gate in gates if gate.failed[row]]
     if verdict is not Verdict.ACCEPTED and not failed:
@@ -177,7 +179,7 @@ def explain_pair(
         chosen = _between(vi_map, recorded, first, second)
         if not chosen.any():
             return _without_candidates((names[0], names[1]), detection.best_votes, options)
-    gates = [gate.take(chosen) for gate in gate_values(vi_map, recorded, options)]
+    gates = [gate.take(chosen) for gate in recorded_gates(vi_map, recorded, options)]
     closures = recorded.take(chosen)
     accepted = int(np.count_nonzero(closures.verdict == VERDICTS.index(Verdict.ACCEPTED)))
     lines = [_pair_gate(gate) for gate in gates if gate.failed.any()]
@@ -268,7 +270,7 @@ def _without_candidates(
 
 
 def _summary_of_closure(
-    verdict: Verdict, failed: list[GateValues], merged: int, acceptance: Acceptance | None
+    verdict: Verdict, failed: list[Gate], merged: int, acceptance: Acceptance | None
 ) -> str:
     if verdict is Verdict.ACCEPTED:
         pairs = counted(merged, "pair") if merged else "no pair"
@@ -291,7 +293,7 @@ def _summary_of_closure(
     )
 
 
-def _near_misses(closures: ClosureRecord, gates: list[GateValues]) -> tuple[NearMiss, ...]:
+def _near_misses(closures: ClosureRecord, gates: list[Gate]) -> tuple[NearMiss, ...]:
     total = shortfalls(gates)
     failed = np.sum([gate.failed for gate in gates], axis=0)
     refused = _refused_rows(closures, gates)
@@ -308,31 +310,14 @@ def _near_misses(closures: ClosureRecord, gates: list[GateValues]) -> tuple[Near
     )
 
 
-def _refused_rows(closures: ClosureRecord, gates: list[GateValues]) -> I64:
+def _refused_rows(closures: ClosureRecord, gates: list[Gate]) -> I64:
     """Return the refused closures that also fail a gate with the present flags."""
-    failed = np.any([gate.failed for gate in gates], axis=0)
     refused = closures.verdict != VERDICTS.index(Verdict.ACCEPTED)
-    return np.asarray(np.flatnonzero(refused & failed), dtype=np.int64)
+    return np.asarray(np.flatnonzero(refused & any_failed(gates)), dtype=np.int64)
 
 
-def _pair_gate(gate: GateValues) -> PairGate:
+def _pair_gate(gate: Gate) -> PairGate:
     failing = np.flatnonzero(gate.failed)
     nearest = int(failing[np.argmin(gate.shortfall[failing])])
-    line = _gate_line(gate, nearest)
-    return PairGate(gate.name, len(failing), line.value, line.wanted, gate.flag)
-
-
-def _gate_line(gate: GateValues, row: int) -> GateLine:
-    if gate.unit == YES_NO:
-        value, wanted = ("yes" if x else "no" for x in (gate.value[row], gate.threshold[row]))
-        result = "failed" if gate.failed[row] else "passed"
-        return GateLine(gate.name, value, wanted, result, gate.flag)
-    unit = f" {gate.unit}" if gate.unit else ""
-    side = "at least" if gate.is_minimum else "at most"
-    return GateLine(
-        gate.name,
-        f"{gate.value[row]:.4g}{unit}",
-        f"{side} {gate.threshold[row]:.4g}{unit}",
-        "failed" if gate.failed[row] else "passed",
-        gate.flag,
-    )
+    value, wanted, _ = gate.describe(nearest)
+    return PairGate(gate.name, len(failing), value, wanted, gate.flag)

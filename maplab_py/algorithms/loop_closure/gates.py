@@ -1,12 +1,17 @@
-"""Acceptance gates of closures; the verdict is the first gate that a closure fails."""
+"""Acceptance gates of closures; the verdict is the first gate that a closure fails.
+
+Closures of a search and those of the record are measured alike and pass the same gates.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.gate import Gate
 from maplab_py.algorithms.loop_closure.alignment_contest import (
     AlignmentChoice,
     Contest,
@@ -14,7 +19,8 @@ from maplab_py.algorithms.loop_closure.alignment_contest import (
     decide,
     with_choice,
 )
-from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule, ambiguous_queries
+from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule, rival_shares
+from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.consensus import (
     ConsensusRule,
@@ -41,6 +47,213 @@ _DRIFT_OFFSET_M = 0.5
 _USUAL_DRIFT_RATIO = 0.02
 """Drift relative to the path length, which closures between ambiguous places must not exceed.
 Between missions of known base frames the path begins at their starts: anchoring leaves drift."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeasuredClosures:
+    """Measurements (N) that the gates test, and the relations of the ends of closures."""
+
+    query: I64  # (N,) vertices
+    place: I64  # (N,)
+    mission_query: I64
+    mission_place: I64
+    way_query_m: F64  # arc length along the mission
+    way_place_m: F64
+    T_M_I: F64  # (N, 7) of the query, in the mission of the place
+    matches: I64
+    inliers: I64
+    tilt_deg: F64
+    rotation_sigma_deg: F64  # about the worst axis, NaN where the rotation is not determined
+    correction_m: F64
+    correction_deg: F64
+    related: Mask  # ends in one mission, or in two whose base frames are known
+
+    @classmethod
+    def of_solutions(
+        cls, vi_map: VIMap, query: I64, place: I64, s: PoseSolutions, is_known: Mask
+    ) -> MeasuredClosures:
+        """Measure estimated poses; `is_known` (M,) are missions whose base frames are trusted."""
+        T_G_M = vi_map.T_G_M[vi_map.vertices.mission[place]]
+        change = se3.local(vi_map.T_G_I[query], se3.compose(T_G_M, s.T_M_I))
+        return cls(
+            **_ends(vi_map, query, place, is_known),
+            T_M_I=s.T_M_I,
+            matches=s.keypoint_count,
+            inliers=s.inlier_count,
+            tilt_deg=np.degrees(s.tilt_rad),
+            rotation_sigma_deg=_rotation_sigma_deg(s.covariance),
+            correction_m=np.linalg.norm(change[:, :3], axis=1),
+            correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
+        )
+
+    @classmethod
+    def of_record(cls, vi_map: VIMap, c: ClosureRecord) -> MeasuredClosures:
+        """Measure recorded closures."""
+        query, place = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
+        # the record has the deviations about three axes; their largest and their norm are bounds of
+        # that about the worst axis, and the verdict tells which of them applies
+        sigma_rad = np.where(
+            c.verdict == VERDICTS.index(Verdict.ACCEPTED),
+            c.sigma[:, 3:].max(axis=1, initial=0.0),
+            np.linalg.norm(c.sigma[:, 3:], axis=1),
+        )
+        is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+        return cls(
+            **_ends(vi_map, query.astype(np.int64), place.astype(np.int64), is_known),
+            T_M_I=se3.compose(vi_map.vertices.T_M_I[place], se3.inverse(c.T_A_B)),
+            matches=c.matches.astype(np.int64),
+            inliers=c.inliers.astype(np.int64),
+            tilt_deg=c.tilt_deg.astype(np.float64),
+            rotation_sigma_deg=np.degrees(sigma_rad),
+            correction_m=c.correction_m.astype(np.float64),
+            correction_deg=c.correction_deg.astype(np.float64),
+        )
+
+    def take(self, rows: I64) -> MeasuredClosures:
+        """Return some of the closures."""
+        return MeasuredClosures(
+            **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)}
+        )
+
+    @property
+    def same(self) -> Mask:
+        """Closures (N,) inside one mission."""
+        return np.asarray(self.mission_query == self.mission_place)
+
+    @property
+    def between_m(self) -> F64:
+        """Length (N,) of the path between the ends, inside one mission."""
+        return np.abs(self.way_query_m - self.way_place_m)
+
+    @property
+    def is_usual(self) -> Mask:
+        """Closures (N,) that correct no more than odometry usually drifts."""
+        since = np.where(self.same, self.between_m, self.way_query_m + self.way_place_m)
+        return np.asarray(self.correction_m <= _DRIFT_OFFSET_M + _USUAL_DRIFT_RATIO * since)
+
+    def is_far(self, options: LoopClosureOptions) -> Mask:
+        """Return which closures (N,) inside a mission correct more than it can have drifted."""
+        drift_m = _DRIFT_OFFSET_M + options.max_drift_ratio * self.between_m
+        return np.asarray(self.same & (self.correction_m > drift_m))
+
+    def paired(self, vi_map: VIMap, stretch: I64) -> PairedClosures:
+        """Return the closures as relative poses of their missions."""
+        return PairedClosures.of(
+            (self.mission_query, self.mission_place),
+            (vi_map.vertices.T_M_I[self.query], self.T_M_I),
+            (self.way_query_m, self.way_place_m),
+            (stretch[self.query], stretch[self.place]),
+            self.inliers.astype(np.float64),
+        )
+
+
+def _ends(vi_map: VIMap, query: I64, place: I64, is_known: Mask) -> dict[str, NDArray[Any]]:
+    mission, way = vi_map.vertices.mission.astype(np.int64), path_lengths(vi_map)
+    a, b = mission[query], mission[place]
+    return {
+        "query": query, "place": place, "mission_query": a, "mission_place": b,
+        "way_query_m": way[query], "way_place_m": way[place],
+        "related": np.asarray((a == b) | (is_known[a] & is_known[b])),
+    }  # fmt: skip
+
+
+def _rotation_sigma_deg(covariance: F64) -> F64:
+    """Return the deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta]."""
+    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
+    sigma_rad = np.full(len(covariance), np.nan)
+    largest = np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1]
+    sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
+    return np.asarray(np.degrees(sigma_rad))
+
+
+def pose_gates(c: MeasuredClosures, o: LoopClosureOptions) -> list[Gate]:
+    """Return the gates on the pose of a closure."""
+    return [
+        Gate.of(
+            "inliers", c.inliers, o.min_inlier_count, Verdict.FEW_INLIERS.value,
+            "--lc_min_inlier_count", is_minimum=True,
+        ),
+        Gate.of(
+            "inliers / matches", c.inliers / np.maximum(c.matches, 1), o.min_inlier_ratio,
+            Verdict.LOW_RATIO.value, "--lc_min_inlier_ratio", is_minimum=True,
+        ),
+        Gate.of(
+            "angle of gravity", c.tilt_deg, o.max_gravity_deviation_deg, Verdict.TILTED.value,
+            "--lc_max_gravity_deviation_deg", "deg",
+        ),
+        Gate.of(
+            "deviation of the rotation", c.rotation_sigma_deg, o.max_rotation_sigma_deg,
+            Verdict.UNCERTAIN.value, "--lc_max_rotation_sigma_deg", "deg",
+        ),
+    ]  # fmt: skip
+
+
+def correction_gates(c: MeasuredClosures, o: LoopClosureOptions) -> list[Gate]:
+    """Return the gates on the correction that a closure makes."""
+    return [
+        Gate.of(
+            "correction", c.correction_m, _DRIFT_OFFSET_M + o.max_drift_ratio * c.between_m,
+            Verdict.IMPLAUSIBLE.value, "--lc_max_drift_ratio", "m", applies=c.same,
+            flag_value=(c.correction_m - _DRIFT_OFFSET_M) / np.maximum(c.between_m, 1e-9),
+        ),
+        Gate.of(
+            "correction of the position", c.correction_m, o.max_delta_position_m,
+            Verdict.IMPLAUSIBLE.value, "--lc_max_delta_position_m", "m",
+            applies=c.related & (o.max_delta_position_m >= 0.0),
+        ),
+        Gate.of(
+            "correction of the attitude", c.correction_deg, o.max_delta_rotation_deg,
+            Verdict.IMPLAUSIBLE.value, "--lc_max_delta_rotation_deg", "deg",
+            applies=c.related & (o.max_delta_rotation_deg >= 0.0),
+        ),
+    ]  # fmt: skip
+
+
+def shares_of_rivals(c: MeasuredClosures, geometric: Mask, options: LoopClosureOptions) -> F64:
+    """Return the inliers (N,) of the strongest other place / of the best; `geometric` pass on pose."""
+    rule = AmbiguityRule(_DRIFT_OFFSET_M, options.max_drift_ratio)
+    return rival_shares(
+        c.query, c.way_place_m, c.mission_place, c.T_M_I, c.inliers, c.is_far(options), geometric,
+        rule,
+    )  # fmt: skip
+
+
+def looks_alike(c: MeasuredClosures, shares: F64, options: LoopClosureOptions) -> Mask:
+    """Return which related closures (N,) are ambiguous; odometry and known base frames resolve it."""
+    ambiguous = (shares > 0.0) & (shares >= options.ambiguous_inlier_ratio)
+    return np.asarray(ambiguous & c.related & ~c.is_usual)
+
+
+def contests_of_missions(
+    vi_map: VIMap, c: MeasuredClosures, candidate: Mask, geometric: Mask, o: LoopClosureOptions
+) -> list[Contest]:
+    """Weigh the alignments of missions for which closures between unrelated missions vote.
+
+    Closures with far places of the query's mission show which places look alike.
+
+    Args:
+        vi_map: The map.
+        c: Closures (N).
+        candidate: Closures (N,) that passed all gates so far.
+        geometric: Closures (N,) that passed the gates on their poses.
+        o: Thresholds.
+    """
+    stretch = trajectory_stretches(vi_map)
+    is_alias = geometric & c.is_far(o) & (c.inliers >= AmbiguityRule.min_inliers)
+    voting = (candidate & ~c.related) | is_alias
+    pairs = alignments_of_pairs(c.paired(vi_map, stretch), voting, AgreementRule())
+    names = [to_hex(words)[:8] for words in vi_map.missions.id]
+    return decide(vi_map, pairs, stretch, ContestRule(o.max_ambiguous_ratio), names)
+
+
+def consensus(
+    vi_map: VIMap, c: MeasuredClosures, options: LoopClosureOptions
+) -> tuple[I64, Mask, Mask]:
+    """Return support (N,), and which closures neighbours support and which they contradict (N,)."""
+    rule = ConsensusRule(
+        min_support=options.min_support, max_difference=options.max_neighbour_difference
+    )
+    return check_consensus(vi_map, c.query, c.place, c.T_M_I, c.inliers, rule)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,177 +300,46 @@ def judge(
     Raises:
         UserError: The chosen alignment does not exist.
     """
-    s = solutions
-    mission = vi_map.vertices.mission[place].astype(np.int64)
-    same = vi_map.vertices.mission[query] == mission
-    related = is_known[vi_map.vertices.mission[query]] & is_known[mission]
-    change = se3.local(vi_map.T_G_I[query], se3.compose(vi_map.T_G_M[mission], s.T_M_I))
+    c = MeasuredClosures.of_solutions(vi_map, query, place, solutions, is_known)
     judgement = Judgement(
         verdict=np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8),
         support=np.zeros(len(query), dtype=np.int64),
-        correction_m=np.linalg.norm(change[:, :3], axis=1),
-        correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
+        correction_m=c.correction_m,
+        correction_deg=c.correction_deg,
     )
-    _check_geometry(vi_map, query, place, s, options, judgement)
-    geometric = judgement.passing
-    way = path_lengths(vi_map)
-    drift = _DRIFT_OFFSET_M + options.max_drift_ratio * np.abs(way[query] - way[place])
-    is_far_same_mission = same & (judgement.correction_m > drift)
-    limited = same | related
-    judgement.refuse(
-        is_far_same_mission | _beyond(options, judgement, limited), Verdict.IMPLAUSIBLE
-    )
-    rule = AmbiguityRule(
-        _DRIFT_OFFSET_M, options.max_drift_ratio, inlier_share=options.ambiguous_inlier_ratio
-    )
-    ambiguous = np.isin(
-        query,
-        ambiguous_queries(
-            query,
-            way[place],
-            mission,
-            s.T_M_I,
-            s.inlier_count,
-            is_far_same_mission,
-            geometric,
-            rule,
-        ),
-    )
-    # odometry and known base frames resolve the ambiguity
-    since = np.where(same, np.abs(way[query] - way[place]), way[query] + way[place])
-    usual = _DRIFT_OFFSET_M + _USUAL_DRIFT_RATIO * since
-    resolved = limited & (judgement.correction_m <= usual)
-    judgement.refuse(ambiguous & ~resolved & limited, Verdict.AMBIGUOUS)
-    is_alias = geometric & is_far_same_mission & (s.inlier_count >= rule.min_inliers)
-    _weigh_alignments(
-        vi_map,
-        query,
-        place,
-        s,
-        judgement,
-        _Relation(~limited, same, is_alias, judgement.correction_m <= usual),
-        ContestRule(options.max_ambiguous_ratio),
-        choice,
-    )
-    _check_neighbours(vi_map, query, place, s, options, judgement)
-    return judgement
-
-
-def _check_geometry(
-    vi_map: VIMap,
-    query: I64,
-    place: I64,
-    s: PoseSolutions,
-    options: LoopClosureOptions,
-    judgement: Judgement,
-) -> None:
-    """Reject closures that a user has removed or whose pose few or badly placed inliers determine."""
     judgement.refuse(banned(vi_map, query, place), Verdict.REMOVED)
-    judgement.refuse(s.inlier_count < options.min_inlier_count, Verdict.FEW_INLIERS)
-    low = s.inlier_count < options.min_inlier_ratio * s.keypoint_count
-    judgement.refuse(low, Verdict.LOW_RATIO)
-    tilted = np.degrees(s.tilt_rad) > options.max_gravity_deviation_deg
-    judgement.refuse(tilted, Verdict.TILTED)
-    judgement.refuse(np.isnan(s.covariance[:, 0, 0]), Verdict.FEW_INLIERS)
-    uncertain = rotation_sigma_deg(s.covariance) > options.max_rotation_sigma_deg
-    judgement.refuse(uncertain, Verdict.UNCERTAIN)
-
-
-def rotation_sigma_deg(covariance: F64) -> F64:
-    """Return the standard deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta].
-
-    It is NaN if the rotation is not determined.
-    """
-    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
-    sigma_rad = np.full(len(covariance), np.nan)
-    largest = np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1]
-    sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
-    return np.asarray(np.degrees(sigma_rad))
-
-
-def _beyond(options: LoopClosureOptions, judgement: Judgement, limited: Mask) -> Mask:
-    """Return which closures (N,) exceed the user's limits on the correction."""
-    beyond = np.zeros(len(limited), dtype=np.bool_)
-    if options.max_delta_position_m >= 0.0:
-        beyond |= judgement.correction_m > options.max_delta_position_m
-    if options.max_delta_rotation_deg >= 0.0:
-        beyond |= judgement.correction_deg > options.max_delta_rotation_deg
-    return beyond & limited
-
-
-def _check_neighbours(
-    vi_map: VIMap,
-    query: I64,
-    place: I64,
-    solutions: PoseSolutions,
-    options: LoopClosureOptions,
-    judgement: Judgement,
-) -> None:
-    """Reject closures that their neighbours contradict or do not support."""
-    left = np.flatnonzero(judgement.passing)
-    if len(left) == 0:
-        return
-    rule = ConsensusRule(
-        min_support=options.min_support, max_difference=options.max_neighbour_difference
-    )
-    support, supported, contradicted = check_consensus(
-        vi_map,
-        query[left],
-        place[left],
-        solutions.T_M_I[left],
-        solutions.inlier_count[left],
-        rule,
-    )
-    judgement.support[left] = support
-    judgement.verdict[left[contradicted]] = VERDICTS.index(Verdict.CONTRADICTED)
-    judgement.verdict[left[~supported & ~contradicted]] = VERDICTS.index(Verdict.NO_SUPPORT)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Relation:
-    """What is known about the missions that closures (N,) join."""
-
-    unrelated: Mask  # different missions without known relative pose
-    same: Mask  # one mission
-    is_alias: Mask  # one mission, but farther apart than it can have drifted
-    is_usual: Mask  # corrects no more than odometry usually drifts
-
-
-def _weigh_alignments(
-    vi_map: VIMap,
-    query: I64,
-    place: I64,
-    solutions: PoseSolutions,
-    judgement: Judgement,
-    relation: _Relation,
-    rule: ContestRule,
-    choice: AlignmentChoice | None,
-) -> None:
-    """Reject closures that follow no winning alignment of their missions.
-
-    Closures with far places of the query's mission show which places look alike.
-    """
-    v, way, stretch = vi_map.vertices, path_lengths(vi_map), trajectory_stretches(vi_map)
-    closures = PairedClosures.of(
-        (v.mission[query].astype(np.int64), v.mission[place].astype(np.int64)),
-        (v.T_M_I[query], solutions.T_M_I),
-        (way[query], way[place]),
-        (stretch[query], stretch[place]),
-        solutions.inlier_count.astype(np.float64),
-    )
-    inside = judgement.passing & relation.same
-    repeated = with_places_that_look_alike(
-        vi_map, closures, inside, relation.is_usual, stretch, rule
-    )
-    judgement.refuse(repeated, Verdict.AMBIGUOUS)
-    candidate = judgement.passing & relation.unrelated
-    pairs = alignments_of_pairs(closures, candidate | relation.is_alias, AgreementRule())
-    names = [to_hex(words)[:8] for words in vi_map.missions.id]
-    contests = decide(vi_map, pairs, stretch, rule, names)
+    for gate in pose_gates(c, options):
+        judgement.refuse(gate.failed, Verdict(gate.verdict))
+    judgement.refuse(np.isnan(c.rotation_sigma_deg), Verdict.FEW_INLIERS)
+    geometric = judgement.passing
+    for gate in correction_gates(c, options):
+        judgement.refuse(gate.failed, Verdict(gate.verdict))
+    shares = shares_of_rivals(c, geometric, options)
+    judgement.refuse(looks_alike(c, shares, options), Verdict.AMBIGUOUS)
+    judgement.refuse(_repeats(vi_map, c, judgement.passing & c.same, options), Verdict.AMBIGUOUS)
+    contests = contests_of_missions(vi_map, c, judgement.passing, geometric, options)
     if choice is not None:
         contests = with_choice(contests, choice)
     judgement.contests.extend(contests)
     follows = np.zeros(len(query), dtype=np.bool_)
     for contest in contests:
         follows[contest.accepted] = True
-    judgement.refuse(candidate & ~follows, Verdict.AMBIGUOUS)
+    judgement.refuse(~c.related & ~follows, Verdict.AMBIGUOUS)
+    left = np.flatnonzero(judgement.passing)
+    if len(left):
+        support, supported, contradicted = consensus(vi_map, c.take(left), options)
+        judgement.support[left] = support
+        judgement.verdict[left[contradicted]] = VERDICTS.index(Verdict.CONTRADICTED)
+        judgement.verdict[left[~supported & ~contradicted]] = VERDICTS.index(Verdict.NO_SUPPORT)
+    return judgement
+
+
+def _repeats(
+    vi_map: VIMap, c: MeasuredClosures, candidate: Mask, options: LoopClosureOptions
+) -> Mask:
+    """Return which closures (N,) inside missions join places that only look alike."""
+    stretch = trajectory_stretches(vi_map)
+    rule = ContestRule(options.max_ambiguous_ratio)
+    return with_places_that_look_alike(
+        vi_map, c.paired(vi_map, stretch), candidate, c.is_usual, stretch, rule
+    )

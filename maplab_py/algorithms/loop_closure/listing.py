@@ -18,8 +18,8 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     read_record,
 )
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.gate_values import gate_values, shortfalls
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.recorded_gates import recorded_gates, shortfalls
 from maplab_py.algorithms.loop_closure.reports import ClosureLine, ClosureReport, Verdict
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
@@ -117,7 +117,7 @@ def near_miss_order(vi_map: VIMap, closures: ClosureRecord) -> F64:
         vi_map: The map.
         closures: All recorded closures (N).
     """
-    gates = gate_values(vi_map, closures, LoopClosureOptions())
+    gates = recorded_gates(vi_map, closures, LoopClosureOptions())
     total = shortfalls(gates)
     failed = np.sum([gate.failed for gate in gates], axis=0)
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)

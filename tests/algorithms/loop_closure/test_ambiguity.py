@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule, ambiguous_queries
+from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule, rival_shares
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.geometry import se3
 from tests.algorithms.loop_closure.rooms import Walk, make_map
@@ -15,8 +15,9 @@ def queries(p, way, inliers, *, far_own=None, mission=None):
     count = len(p)
     T = se3.identity(count)
     T[:, 4:] = p
-    return ambiguous_queries(
-        np.array([7, 7, 8][:count]),
+    query = np.array([7, 7, 8][:count])
+    shares = rival_shares(
+        query,
         np.asarray(way, dtype=float),
         np.zeros(count, dtype=np.int64) if mission is None else np.asarray(mission),
         T,
@@ -24,7 +25,8 @@ def queries(p, way, inliers, *, far_own=None, mission=None):
         np.zeros(count, dtype=bool) if far_own is None else np.asarray(far_own),
         np.ones(count, dtype=bool),
         RULE,
-    ).tolist()
+    )
+    return np.unique(query[shares >= 0.5]).tolist()
 
 
 def test_two_far_places_of_one_mission_are_ambiguous():

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure.acceptance import acceptance
+from maplab_py.algorithms.gate import Gate
 from maplab_py.algorithms.loop_closure.closure_record import read_record, write_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.explanation import (
@@ -16,9 +16,13 @@ from maplab_py.algorithms.loop_closure.explanation import (
     explain_mission,
     explain_pair,
 )
-from maplab_py.algorithms.loop_closure.gate_values import GateValues, gate_values, shortfalls
 from maplab_py.algorithms.loop_closure.listing import accepted_by_mission, list_closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.recorded_gates import (
+    acceptance,
+    recorded_gates,
+    shortfalls,
+)
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.errors import UserError
@@ -151,9 +155,9 @@ def test_near_misses_and_reasons_select_and_sort(strict: VIMap) -> None:
     assert accepted_by_mission(strict).tolist() == [0, 0]
 
 
-def reference(vi_map: VIMap) -> tuple[list[GateValues], np.ndarray]:
+def reference(vi_map: VIMap) -> tuple[list[Gate], np.ndarray]:
     closures = read_record(vi_map).closures
-    gates = gate_values(vi_map, closures, OPTIONS)
+    gates = recorded_gates(vi_map, closures, OPTIONS)
     return gates, closures.verdict
 
 
