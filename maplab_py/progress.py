@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """What algorithms see of the console: a bar, a line of text, and the wish to cancel."""
+    """Interface of the console for algorithms: a bar, a line of text, and the wish to cancel."""
 
     def step(self, done: float, total: float, what: str = "") -> None:
         """Say that `done` of `total` is finished; raises Cancelled when the user wants to stop."""

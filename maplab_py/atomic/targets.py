@@ -1,4 +1,4 @@
-"""Where a write goes: symbolic links resolved, devices refused, names of the hidden siblings."""
+"""Targets of writes: symbolic links resolved, devices refused, names of the hidden siblings."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ STARTS = " starts "
 
 @dataclasses.dataclass(frozen=True)
 class ChildEnd:
-    """How a child process ended.
+    """Exit of a child process.
 
     Attributes:
         status: Exit status; negative for a signal.

@@ -30,7 +30,7 @@ _AGAIN = (Ending.FAILED, Ending.LOST)
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
-    """What every task of a run shares.
+    """Settings that all tasks of a run share.
 
     Attributes:
         options: How the pipeline is run.

@@ -1,4 +1,4 @@
-"""Where orders run: in this process one after another, or on the workers of Dask."""
+"""Execution of orders: in this process one after another, or on the workers of Dask."""
 
 from __future__ import annotations
 

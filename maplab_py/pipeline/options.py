@@ -1,4 +1,4 @@
-"""How a pipeline is run."""
+"""Options of a pipeline run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class PipelineOptions:
-    """Where the tasks of a pipeline run, and what happens to those that fail."""
+    """Workers of a pipeline, and treatment of tasks that fail."""
 
     scheduler: str = option(
         "none",

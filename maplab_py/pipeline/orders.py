@@ -1,4 +1,4 @@
-"""What travels to a worker and back: folder names, lines of commands, flags and numbers."""
+"""Messages to a worker and back: folder names, lines of commands, flags and numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class Ending(Enum):
-    """How a task ended."""
+    """Outcome of a task."""
 
     DONE = "done"
     FAILED = "failed"  # may be tried again
@@ -57,7 +57,7 @@ class Order:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of an order.
+    """Result of an order.
 
     Attributes:
         title: Stage and name of the task.

@@ -1,4 +1,4 @@
-"""What a pipeline is: stages of commands over maps, and which stages need which."""
+"""Plan of a pipeline: stages of commands over maps, and their dependencies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of a running pipeline, and its report."""
+"""Progress of a running pipeline, and its report."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class FailedTask:
 
 @dataclasses.dataclass(frozen=True)
 class PipelineReport(Report):
-    """What a pipeline did."""
+    """Result of a pipeline."""
 
     stages: tuple[StageLine, ...] = dataclasses.field(metadata={"title": ""})
     failed_tasks: tuple[FailedTask, ...]

@@ -1,4 +1,4 @@
-"""Who is shown the published map, and how often."""
+"""Rate-limited updates of the viewer with the published map."""
 
 from __future__ import annotations
 

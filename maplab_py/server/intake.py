@@ -20,7 +20,7 @@ from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 
 _ATTEMPTS = 3
-"""How often a submap is prepared whose worker dies or fails without saying what is wrong with the submap."""
+"""Attempts to prepare a submap whose worker dies or fails without naming a fault of the submap."""
 _DISK_FULL = os.strerror(errno.ENOSPC)
 _SECONDS_BETWEEN_RETRIES = 5.0
 

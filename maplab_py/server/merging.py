@@ -78,7 +78,7 @@ def stretches_of(submap: VIMap) -> list[Stretch]:
 
 @dataclasses.dataclass(frozen=True)
 class MergeSteps:
-    """What became of a submap, and the processor time [s] of each step."""
+    """Outcome of a submap, and the processor time [s] of each step."""
 
     anchored: tuple[str, ...]  # missions
     landmarks_merged: int
@@ -91,7 +91,7 @@ class MergeSteps:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _NewPart:
-    """What a submap has brought, and where its loops are looked for.
+    """Contents of a submap, and the scope of its search for loops.
 
     Attributes:
         stretches: Of its missions.
@@ -110,7 +110,7 @@ class _NewPart:
 
 @dataclasses.dataclass(frozen=True)
 class _ClosedLoops:
-    """What became of the loops of a submap.
+    """Outcome of the loops of a submap.
 
     Attributes:
         landmarks_merged: Landmarks that became one.

@@ -12,7 +12,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class SubmapOptions:
-    """What happens to a submap before it is merged."""
+    """Preparation of a submap before it is merged."""
 
     remove_outliers_in_absolute_pose_constraints: bool = option(
         True, help="Leave out absolute poses that contradict their neighbours (see optvi)."
@@ -28,7 +28,7 @@ class SubmapOptions:
 
 @dataclasses.dataclass(frozen=True)
 class MergingOptions:
-    """How submaps become one map."""
+    """Merging of submaps into one map."""
 
     enable_visual_loop_closure: bool = option(True, help="Close loops within and between missions.")
     enable_lidar_loop_closure: bool = option(
@@ -58,7 +58,7 @@ class MergingOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PublishingOptions:
-    """Where the map goes."""
+    """Destination of the map."""
 
     merged_map_folder: str = option(
         "", help="Folder of the merged map, replaced after every change; required."
@@ -95,7 +95,7 @@ class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions):
 
 @dataclasses.dataclass(frozen=True)
 class IncrementalOptions:
-    """What is optimised after each submap, and when all is."""
+    """Optimisation after each submap, and of the whole map."""
 
     full_optimization_every_nth: int = option(
         10,
@@ -128,7 +128,7 @@ class IncrementalOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ServiceOptions:
-    """Where the server answers requests, and what it keeps."""
+    """Address of the service, and the data that the server keeps."""
 
     flag_prefix: ClassVar[str] = "serve_"
 
@@ -169,7 +169,7 @@ class ServiceOptions:
 
 @dataclasses.dataclass(frozen=True)
 class SubmapOutput:
-    """Where submaps go while a recording is read."""
+    """Destination of submaps while a recording is read."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -191,7 +191,7 @@ class SubmapOutput:
 
 @dataclasses.dataclass(frozen=True)
 class PlayOptions:
-    """How sessions are cut, and how fast they are played."""
+    """Division of sessions into submaps, and their playback rate."""
 
     flag_prefix: ClassVar[str] = "robots_"
 

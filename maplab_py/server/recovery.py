@@ -1,4 +1,4 @@
-"""What a server finds when it starts: map, journal and spool, brought to agree.
+"""Recovery of a server at its start: map, journal and spool, brought to agree.
 
 The map is the truth: a submap is in it when its vertices are. The journal may lag behind by what was
 published last, and the map behind the journal where somebody has put a backup in its place.
@@ -24,7 +24,7 @@ from maplab_py.vimap.ids import to_hex_list
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recovered:
-    """Where to go on.
+    """State at which the server continues.
 
     Attributes:
         vi_map: The published map; None without one.

@@ -1,4 +1,4 @@
-"""What the server says of itself, and what its commands answer."""
+"""Reports of the server and of its commands."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ServerStatus(Report):
 
 @dataclasses.dataclass(frozen=True)
 class ServeReport(Report):
-    """What a server has done until it stopped."""
+    """Work of a server until it stopped."""
 
     merged_map_folder: str
     submaps_merged: int  # by this run
@@ -67,7 +67,7 @@ class ServeReport(Report):
 
     @property
     def failure(self) -> str:
-        """What kept the server from publishing its last state."""
+        """Error that kept the server from publishing its last state."""
         return self.problem
 
 
@@ -81,7 +81,7 @@ class DeletedMissions(Report):
 
 @dataclasses.dataclass(frozen=True)
 class LookupReport(Report):
-    """Where a point of a robot's sensor is in the global frame."""
+    """Position of a point of a robot's sensor in the global frame."""
 
     robot: str
     mission: str

@@ -1,4 +1,4 @@
-"""What the service answers: look-ups from the published map, changes through the loop."""
+"""Requests of the service: look-ups from the published map, changes through the loop."""
 
 from __future__ import annotations
 

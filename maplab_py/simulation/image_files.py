@@ -32,7 +32,7 @@ _PNG_LEVEL, _HUFFMAN_ONLY = 1, 2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SessionFolders:
-    """Where the images of a session go."""
+    """Destination of the images of a session."""
 
     images: Path  # has cam0, cam1, ...
     depths: Path  # gets depth0, depth1, ...

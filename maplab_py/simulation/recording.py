@@ -108,7 +108,7 @@ def record(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Clock:
-    """When samples and images are taken, counted from the session's begin."""
+    """Times of samples and images, counted from the session's begin."""
 
     sample_s: F64  # (S,)
     frame_row: I64  # (V,) sample at each image

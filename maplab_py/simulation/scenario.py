@@ -251,7 +251,7 @@ class MotionOptions:
 
 @dataclasses.dataclass(frozen=True)
 class SessionImages:
-    """What the rendered images of a session have of their own."""
+    """Properties of a session's rendered images."""
 
     light: float = 1.0  # by which grey values are multiplied
     gain_jump: float = 0.0  # the gain of the cameras jumps to values within 1 -+ gain_jump

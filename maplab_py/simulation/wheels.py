@@ -20,7 +20,7 @@ _HEADER = "#timestamp [ns], vx [m/s], vy [m/s], wz [rad/s]\n"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WheelVelocities:
-    """What wheels report: velocity of the sensor S in S, distances times their scale."""
+    """Wheel measurements: velocity of the sensor S in S, distances times their scale."""
 
     times_ns: I64  # (N,)
     values: F64  # (N, 3) vx, vy [m/s], wz [rad/s]

@@ -38,7 +38,7 @@ _OUTLINE_POINTS = 1500
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """What to show: a map and the references to compare it with."""
+    """Subject of a view: a map and the references to compare it with."""
 
     vi_map: VIMap
     title: str = "map"

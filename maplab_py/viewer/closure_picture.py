@@ -31,7 +31,7 @@ class Matches:
 
     @property
     def note(self) -> str:
-        """What the lines between both images are."""
+        """Meaning of the lines between both images."""
         what = "landmarks in common" if self.are_landmarks else "pairs of similar descriptors"
         return f"{len(self)} {what} in these images"
 

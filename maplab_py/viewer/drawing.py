@@ -1,4 +1,4 @@
-"""What all layers of one drawing share: the map, its colours, and where the scene's origin lies."""
+"""Data shared by all layers of a drawing: the map, its colours, and the scene's origin."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Drawing:
 
     @cached_property
     def mission_names(self) -> list[str]:
-        """What all missions are called, as in the console: names, else beginnings of ids."""
+        """Labels of all missions, as in the console: names, else beginnings of ids."""
         return mission_labels(self.vi_map)
 
     @cached_property
@@ -55,7 +55,7 @@ class Drawing:
 
     @cached_property
     def shift(self) -> F64:
-        """What takes positions of each mission (M, 3) from G to the scene."""
+        """Offsets (M, 3) that take positions of each mission from G to the scene."""
         return mission_shift(self.vi_map, self.options) - self.origin_G
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Where landmarks were observed first."""
+"""First observations of landmarks."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _BAR_COLOUR = colours.from_hex("#6b7280")[0]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ground:
-    """What the ground shows; positions are relative to the scene's origin, numbers are those of G."""
+    """Contents of the ground plane; positions are relative to the scene's origin, numbers are those of G."""
 
     cell_m: float
     section_m: float

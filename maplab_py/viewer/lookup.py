@@ -1,4 +1,4 @@
-"""Which vertex, landmark, loop closure or mission an id, or the beginning of an id, means."""
+"""Look-up of the vertex, landmark, loop closure or mission of an id or of its beginning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why a layer draws less than the map has, in words."""
+"""Notes on layers that draw less than the map has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is drawn and in which colours, with maplab's flag names where it has them."""
+"""Options of layers and colours, with maplab's flag names where it has them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MeshColouring = Literal["auto", "shaded", "colour", "height", "distance"]
 
 @dataclasses.dataclass(frozen=True)
 class VisualizationOptions:
-    """What is drawn of a map, and how."""
+    """Layers of a map and their style."""
 
     flag_prefix: ClassVar[str] = "vis_"
 
@@ -179,7 +179,7 @@ class VisualizationOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PlaybackOptions:
-    """How missions are played."""
+    """Playback of missions."""
 
     flag_prefix: ClassVar[str] = "vis_seq_"
 
@@ -205,7 +205,7 @@ class PlaybackOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PointCloudOptions:
-    """Which dense clouds are shown."""
+    """Selection of dense clouds."""
 
     flag_prefix: ClassVar[str] = "vis_pointcloud_"
 

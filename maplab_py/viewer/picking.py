@@ -1,4 +1,4 @@
-"""Which vertex, landmark or loop closure a click means."""
+"""Picking: the vertex, landmark or loop closure of a click."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BONUS_RAD = {
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pick:
-    """What was clicked."""
+    """Clicked entity."""
 
     entity: Entity
     row: int

@@ -20,7 +20,7 @@ _PLAYED_LAYERS = {"trajectories", "vertices", "landmarks", "bad_landmarks", "obs
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Timeline:
-    """Which step brings which vertex and landmark. Step 0 shows the first vertices only."""
+    """Steps that bring vertices and landmarks. Step 0 shows the first vertices only."""
 
     steps: int
     vertex_step: I64  # (V,)

@@ -20,7 +20,7 @@ WHOLE_MAP = ""
 
 
 class Entity(Enum):
-    """What the rows of a part are, for picking."""
+    """Meaning of the rows of a part, for picking."""
 
     NONE = "none"
     VERTEX = "vertex"
@@ -95,7 +95,7 @@ class LegendEntry:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Layer:
-    """What one checkbox of the panel shows."""
+    """Parts that one checkbox of the panel shows."""
 
     name: str
     title: str
@@ -109,7 +109,7 @@ class Layer:
 
     @property
     def drawn(self) -> int:
-        """How many are drawn."""
+        """Number of drawn rows."""
         return sum(len(part) for part in self.parts.values())
 
 
@@ -128,7 +128,7 @@ class MissionEntry:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Extent:
-    """Where the map is, without its outliers; relative to the scene's origin."""
+    """Bounds of the map without its outliers; relative to the scene's origin."""
 
     centre: F64  # (3,)
     radius_m: float

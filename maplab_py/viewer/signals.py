@@ -1,4 +1,4 @@
-"""What is plotted along a mission: states and errors, one value or vector per vertex."""
+"""Signals along a mission: states and errors, one value or vector per vertex."""
 
 from __future__ import annotations
 

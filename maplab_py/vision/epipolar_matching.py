@@ -27,7 +27,7 @@ class ImageRays:
 
 @dataclasses.dataclass(frozen=True)
 class EpipolarRule:
-    """What a match must fulfil."""
+    """Conditions that a match must fulfil."""
 
     gate_px: float  # largest distance from the epipolar line
     min_depth_m: float  # smallest distance of a point, which limits its parallax

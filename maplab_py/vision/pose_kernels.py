@@ -34,7 +34,7 @@ class MatchColumns(NamedTuple):
 
 
 class SearchSettings(NamedTuple):
-    """How long to search, and how firmly gravity is known."""
+    """Length of the search, and uncertainty of gravity."""
 
     max_iterations: int
     inverse_tilt: float  # 1 / standard deviation [1/rad] of the given roll and pitch

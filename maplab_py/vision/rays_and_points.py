@@ -1,4 +1,4 @@
-"""Which points lie near which rays: candidates for matches when the pose is known."""
+"""Points near rays: candidates for matches when the pose is known."""
 
 from __future__ import annotations
 

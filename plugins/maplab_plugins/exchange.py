@@ -48,7 +48,7 @@ class ReadCamera:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationImport(Report):
-    """What a calibration file has, and what became of it."""
+    """Contents of a calibration file, and their use."""
 
     file: Path
     format: str

@@ -100,7 +100,7 @@ class RelaxedMissionLine:
 
 @dataclasses.dataclass(frozen=True)
 class RelaxedMissionTable:
-    """What is shown of missions that were relaxed independently."""
+    """Displayed results of missions that were relaxed independently."""
 
     missions: tuple[RelaxedMissionLine, ...] = dataclasses.field(metadata={"title": ""})
     notes: tuple[str, ...] = ()

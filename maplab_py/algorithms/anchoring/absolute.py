@@ -34,7 +34,7 @@ _KNOWN_ORIENTATION_RAD = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class AbsoluteAnchoringOptions:
-    """When the absolute poses of a mission determine its base frame, with maplab's names."""
+    """Conditions under which absolute poses determine a mission's base frame, with maplab's names."""
 
     flag_prefix: ClassVar[str] = "abs_constraints_baseframe_"
 

@@ -34,7 +34,7 @@ class AlignmentHypothesis:
 
 @dataclasses.dataclass(frozen=True)
 class AnchoringReport(Report):
-    """Which missions were anchored."""
+    """Anchored missions."""
 
     already_known: tuple[str, ...]
     anchored: tuple[str, ...]

@@ -11,7 +11,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class CellOptions:
-    """How many cells, and how far they overlap."""
+    """Number of cells and their overlap."""
 
     flag_prefix: ClassVar[str] = "cell_"
 

@@ -85,7 +85,7 @@ def inscribed(views: list[tuple[Camera, F64]], width_px: int, height_px: int) ->
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageMap:
-    """Where each pixel of an image lies in another one; -1 where it is not seen there."""
+    """Map from the pixels of an image to those of another one; -1 where it is not seen there."""
 
     u: F32  # (H, W)
     v: F32  # (H, W)
@@ -99,7 +99,7 @@ class ImageMap:
 
     @property
     def valid(self) -> Mask:
-        """Which pixels are seen."""
+        """Mask of the pixels that are seen."""
         return np.asarray(self.u >= 0.0)
 
     def image(self, pixels: Any) -> Any:

@@ -18,7 +18,7 @@ _MAX_FEATURES = 100_000
 
 @dataclasses.dataclass(frozen=True)
 class ExtractionOptions:
-    """What is extracted from images."""
+    """Extraction of features from images."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -58,7 +58,7 @@ class ExtractionOptions:
 
 @dataclasses.dataclass(frozen=True)
 class FeatureTrackOptions:
-    """How keypoints of neighbouring frames are linked."""
+    """Links between keypoints of neighbouring frames."""
 
     flag_prefix: ClassVar[str] = "track_"
 

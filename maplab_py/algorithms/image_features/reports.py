@@ -1,4 +1,4 @@
-"""What the extraction and the tracks of features report."""
+"""Reports of the extraction and the tracks of features."""
 
 from __future__ import annotations
 

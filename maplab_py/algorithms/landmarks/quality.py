@@ -123,6 +123,7 @@ def criteria(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> 
     directions[at_camera] = [0.0, 0.0, 1.0]
     angle_deg = np.rad2deg(largest_ray_angle(directions, start))
     sigma_m = _scaled_sigma(vi_map, landmarks, keypoints, seen.error_px, start)
+    worst_sigma_m = np.where(np.isnan(sigma_m), np.inf, sigma_m)
     worst_px = np.maximum(-_least(-seen.error_px, start, empty=np.inf), 0.0)
     worst_m = np.maximum(-_least(-np.nan_to_num(seen.error_m), start, empty=np.inf), 0.0)
     observers = _distinct(vi_map.keypoint_vertex[keypoints], of_landmark, len(landmarks))
@@ -144,7 +145,7 @@ def criteria(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> 
             Gate.of("largest angle of two rays", angle_deg, least_angle, "too_small_angle",
                     "--elq_min_observation_angle_deg", "deg", is_minimum=True,
                     applies=here & ~is_scan),
-            Gate.of("deviation along the worst axis", np.nan_to_num(sigma_m, nan=np.inf), most_m,
+            Gate.of("deviation along the worst axis", worst_sigma_m, most_m,
                     "too_uncertain", "--elq_max_relative_sigma", "m", applies=here & ~is_scan),
             Gate.of("distance of the closest observer", closest_m, limits[1],
                     "too_near_or_behind", f"--elq_{near}", "m", is_minimum=True, applies=here),

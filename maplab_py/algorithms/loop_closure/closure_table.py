@@ -53,7 +53,7 @@ class Closures:
 
     @property
     def accepted(self) -> Mask:
-        """Which closures (N,) passed all gates."""
+        """Mask (N,) of the closures that passed all gates."""
         return np.asarray(self.verdict == VERDICTS.index(Verdict.ACCEPTED))
 
     def refused_by_reason(self) -> dict[str, int]:

@@ -31,7 +31,7 @@ _REASONS = {
     Verdict.CONTRADICTED: "closures nearby disagree",
     Verdict.AMBIGUOUS: "another place looks the same",
 }
-"""Why a closure is refused that passes all gates on its own pose."""
+"""Reasons to refuse a closure that passes all gates on its own pose."""
 
 
 @dataclasses.dataclass(frozen=True)

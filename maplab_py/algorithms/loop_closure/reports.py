@@ -50,7 +50,7 @@ class LoopClosureReport(Report):
     merges_refused: dict[str, int] = dataclasses.field(default_factory=dict)  # by reason
     notes: tuple[str, ...] = ()
     reason: str = dataclasses.field(default="", metadata={"is_prose": True})
-    """Why nothing was found, merged or added; empty when something was."""
+    """Reason that nothing was found, merged or added; empty when something was."""
 
     @property
     def failure(self) -> str:
@@ -152,7 +152,7 @@ class ShownClosure:
 
 @dataclasses.dataclass(frozen=True)
 class ClosureTable:
-    """What is shown of the recorded closures."""
+    """Displayed columns of the recorded closures."""
 
     closures: tuple[ShownClosure, ...] = dataclasses.field(metadata={"title": ""})
     summary: str = dataclasses.field(metadata={"is_prose": True})

@@ -1,4 +1,4 @@
-"""What a search for loop closures in a growing map may leave out, because earlier searches did it."""
+"""Scope of a search for loop closures in a growing map, without the results of earlier searches."""
 
 from __future__ import annotations
 

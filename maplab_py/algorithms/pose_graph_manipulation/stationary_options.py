@@ -1,4 +1,4 @@
-"""When a mission stands still, with maplab's flag names."""
+"""Criteria for a mission at rest, with maplab's flag names."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class StationaryOptions:
-    """When a mission stands still."""
+    """Criteria for a mission at rest."""
 
     flag_prefix: ClassVar[str] = "maplab_stationary_submaps_"
 

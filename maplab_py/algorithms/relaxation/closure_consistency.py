@@ -1,4 +1,4 @@
-"""Which loop closures agree with a solution: errors measured against the graph's own accuracy.
+"""Consistency of loop closures with a solution: errors measured against the graph's own accuracy.
 
 The covariances of a graph are often off by a common factor. Adjustment theory estimates it from the
 graph: the weighted sum of squares over the number of redundant measurements, the VARIANCE FACTOR (the

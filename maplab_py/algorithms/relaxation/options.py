@@ -1,4 +1,4 @@
-"""What a user can set of the relaxation, and what it reports."""
+"""Options and reports of the relaxation."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class SwitchedOff:
 
 @dataclasses.dataclass(frozen=True)
 class RelaxationReport(Report):
-    """What a relaxation did."""
+    """Result of a relaxation."""
 
     num_loop_closures: int = 0  # used as constraints
     num_switched_off: int = 0  # of those, given less than half their weight in the end

@@ -61,7 +61,7 @@ of them: right where false ones would turn the graph inside out."""
 _TRUSTED = 0.5  # weight
 _MAX_TESTS = 8
 _SUM_SIGMAS = 3.0
-"""How far above its expectation the sum of squared errors of a graph without false closures may lie."""
+"""Factor by which the sum of squared errors of a graph without false closures may exceed its expectation."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def optimize_robustly(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Graph:
-    """What all ways of optimising a graph need."""
+    """Data that all ways of optimising a graph need."""
 
     T_G_I: F64
     problem: PoseGraphProblem

@@ -16,7 +16,7 @@ STATES = (
     "time_offset",
     "line_delay",
 )
-"""What can be estimated."""
+"""Parameters that can be estimated."""
 
 GROUPS = ("imu", "camera", "extrinsics")
 """Parameter groups, each with its own table of segments; time offset and line delay are extrinsic."""
@@ -41,7 +41,7 @@ _MINIMUM = {
 
 @dataclasses.dataclass(frozen=True)
 class SelfCalibrationOptions:
-    """What to estimate, from which data, and the priors.
+    """Estimated parameters, data and priors.
 
     The prior deviations say how far a device may be from its nominal calibration. A direction that
     the data do not determine better counts as unobservable, stays at its prior, and adds nothing to

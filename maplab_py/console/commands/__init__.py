@@ -1,1 +1,1 @@
-"""What commands are: flags, help, registry, schemas of reports, and the words of a typed line."""
+"""Commands: flags, help, registry, schemas of reports, and the words of a typed line."""

@@ -1,4 +1,4 @@
-"""What a command's docstring says: the summary, the description, and its `Args:`."""
+"""Parser of a command's docstring: the summary, the description, and its `Args:`."""
 
 from __future__ import annotations
 

@@ -16,13 +16,13 @@ from maplab_py.console.commands.suggest import did_you_mean
 
 _TRUE = ("true", "1", "yes", "on", "t", "y")
 _PATH_BYTES, _NAME_BYTES = 4095, 255
-"""What file systems take; no call to one is needed to refuse more."""
+"""Longest path that file systems take; no call to one is needed to refuse more."""
 _FALSE = ("false", "0", "no", "off", "f", "n")
 
 
 @dataclasses.dataclass(frozen=True)
 class FlagType:
-    """How one kind of flag value is named, read and checked.
+    """Name, parser and check of one kind of flag value.
 
     `parse` raises ValueError whose text completes "--flag=value: ...". `accepts` tells whether a
     value that comes from Python needs no conversion.

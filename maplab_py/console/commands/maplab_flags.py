@@ -10,7 +10,7 @@ TABLE = "maplab_flags.tsv"
 
 
 class Fate(enum.Enum):
-    """What became of a flag of maplab."""
+    """Fate of a flag of maplab."""
 
     RENAMED = "renamed"
     DROPPED = "dropped"

@@ -1,4 +1,4 @@
-"""How well a name fits what was typed: prefixes first, then letters in order."""
+"""Ranking of names by the typed text: prefixes first, then letters in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can stand behind a flag: names of maps, missions, snapshots, jobs, and paths."""
+"""Values that complete a flag: names of maps, missions, snapshots, jobs, and paths."""
 
 from __future__ import annotations
 

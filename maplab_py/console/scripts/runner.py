@@ -28,7 +28,7 @@ from maplab_py.report import Report
 LEAVE = ("q", "quit", "exit")
 _MAX_ALIAS_DEPTH = 8
 _INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
-"""How a shell command ends by Ctrl-C: by the signal, or by a shell that says so."""
+"""Exit codes of a shell command after Ctrl-C: by the signal, or by a shell that reports it."""
 
 logger = logging.getLogger(__name__)
 

@@ -1,1 +1,1 @@
-"""What a session holds and how a command runs in it: maps, lasting flags, transactions, jobs."""
+"""Sessions and the execution of commands in them: maps, lasting flags, transactions, jobs."""

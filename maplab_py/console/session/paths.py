@@ -1,4 +1,4 @@
-"""Where the console keeps the user's files: never in the current folder."""
+"""Paths of the user's files: never in the current folder."""
 
 from __future__ import annotations
 

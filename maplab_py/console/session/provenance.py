@@ -1,4 +1,4 @@
-"""Which commands led to a value of a map, so that they can be written as a script.
+"""Provenance of maps: the commands that led to a value, so that they can be written as a script.
 
 Maps are values: undo, redo and restore return to a value whose commands are known. A command that
 makes a new value follows the commands of the maps that it read.

@@ -10,7 +10,7 @@ from maplab_py.errors import Cancelled, MaplabError, UserError
 
 
 class Status(IntEnum):
-    """How a command, a script or the whole console ended."""
+    """Exit status of a command, a script or the whole console."""
 
     OK = 0
     FAILED = 1

@@ -1,4 +1,4 @@
-"""How much memory the former values of maps may take."""
+"""Memory limit of the former values of maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a page looks from at first, and by the panel's buttons."""
+"""Camera of a page at first, and by the panel's buttons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ELEVATIONS_DEG = {"overview": 38.0, "top": 89.9, "side": 8.0}
 VIEWS = tuple(_ELEVATIONS_DEG)
 FREE, BEHIND, INSIDE = "free", "ride behind", "through the camera"
 RIDES = (FREE, BEHIND, INSIDE)
-"""How a page looks at a mission that is played."""
+"""Camera mode of a page for a mission that is played."""
 _ASPECT = 1.35
 """Width by height that a view of everything is sure to fit."""
 _MARGIN = 1.08

@@ -32,7 +32,7 @@ _HINT = "Click a vertex, a landmark or a loop closure."
 
 
 class Actions(Protocol):
-    """What the panel can ask for. It changes the view and never the map."""
+    """Requests of the panel. They change the view and never the map."""
 
     def set_layer(self, name: str, is_visible: bool) -> None:
         """Show or hide a layer."""

@@ -34,7 +34,7 @@ class Played(Protocol):
 
     @property
     def subject(self) -> Subject | None:
-        """What is shown."""
+        """Shown view."""
 
     @property
     def visible_missions(self) -> set[str]:
@@ -45,7 +45,7 @@ class Played(Protocol):
 
 
 class Playback:
-    """What is played, if anything.
+    """Playback, if there is one.
 
     Attributes:
         player: The nodes of the steps; None while the whole map is shown.

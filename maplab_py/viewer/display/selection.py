@@ -1,4 +1,4 @@
-"""What was clicked: its facts, its frusta and rays, and the distance between two picks."""
+"""Selected entities: their facts, frusta and rays, and the distance between two picks."""
 
 from __future__ import annotations
 

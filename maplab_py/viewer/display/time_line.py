@@ -18,7 +18,7 @@ _HINT = "Move the slider to play the missions: plots of the first one appear her
 
 
 class Playing(Protocol):
-    """What the time line can ask for."""
+    """Requests of the time line."""
 
     def set_step(self, step: int) -> None:
         """Show the map as it was after a step."""

@@ -115,7 +115,7 @@ class Viewer:
 
     @property
     def wanted(self) -> Subject | None:
-        """What is shown, or soon will be."""
+        """Subject that is shown, or soon will be."""
         with self._lock:
             return self._pending or self._building or self.subject
 
@@ -280,7 +280,7 @@ class Viewer:
 
     @property
     def selection(self) -> Selection:
-        """What is picked."""
+        """Picked entities."""
         return self._selection
 
     def set_layer(self, name: str, is_visible: bool) -> None:
@@ -353,7 +353,7 @@ class Viewer:
 
     @property
     def player(self) -> Player | None:
-        """What is played; None while the whole map is shown."""
+        """Playback; None while the whole map is shown."""
         return self._playback.player
 
     def set_step(self, step: int) -> None:

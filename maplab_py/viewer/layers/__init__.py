@@ -1,1 +1,1 @@
-"""What is drawn, one module per family of layers; each builds plain arrays from a map."""
+"""Layers of the scene, one module per family; each builds plain arrays from a map."""

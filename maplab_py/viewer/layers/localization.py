@@ -19,7 +19,7 @@ _POINT_SIZE = 0.005
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalizedRun:
-    """Where a run is in the map in which it is localised."""
+    """Poses of a run in the map in which it is localised."""
 
     p_G: F64  # (L, 3) landmarks of the map
     p_G_I: F64  # (N, 3) positions, as estimated at their time

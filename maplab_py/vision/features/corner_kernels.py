@@ -16,7 +16,7 @@ _CLIMB_PX = 3
 
 
 class Selection(NamedTuple):
-    """What a choice of corners has to keep to; changed by `select_corners`."""
+    """Constraints on a choice of corners; changed by `select_corners`."""
 
     free: U8  # (H, W) not zero where a corner may be
     cell_count: I64  # (rows, columns) keypoints of each cell

@@ -14,7 +14,7 @@ DESCRIPTORS = ("brisk",)
 
 @dataclasses.dataclass(frozen=True)
 class FeatureOptions:
-    """How images are prepared, and keypoints detected and described."""
+    """Preparation of images, and detection and description of keypoints."""
 
     flag_prefix: ClassVar[str] = "feature_tracking_"
 

@@ -20,7 +20,7 @@ _MIN_TURN_TRACKS = 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageMotion:
-    """What K tracks say about the motion of their camera since the previous image."""
+    """Motion of a camera since the previous image, estimated from K tracks."""
 
     is_inlier: Mask  # (K,) agrees with the turn, with or without translation
     is_still: Mask  # (I,) of the inliers: agrees with the turn alone

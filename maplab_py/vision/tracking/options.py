@@ -15,7 +15,7 @@ _HALF_A_DEGREE = 1.0 - math.cos(math.radians(0.5))
 
 @dataclasses.dataclass(frozen=True)
 class TrackingOptions(FeatureOptions):
-    """How keypoints are detected, followed from image to image, and found again in other cameras."""
+    """Detection of keypoints, tracking from image to image, and matching between cameras."""
 
     flag_prefix: ClassVar[str] = "feature_tracking_"
 

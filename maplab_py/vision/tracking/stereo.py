@@ -29,7 +29,7 @@ class StereoOptions:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StereoMatches:
-    """What another camera sees of K tracks."""
+    """Observations of K tracks by another camera."""
 
     uv: F64  # (K, 2) of its prepared image
     ray: F64  # (K, 3)

@@ -35,7 +35,7 @@ class CameraTracks:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TrackedImages:
-    """What the tracker says about a frame set."""
+    """Tracker's statistics of a frame set."""
 
     time_ns: int
     cameras: tuple[CameraTracks, ...]

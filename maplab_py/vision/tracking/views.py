@@ -1,4 +1,4 @@
-"""What tracking needs to know of each camera of a rig: prepared pixels, rays, and who overlaps whom."""
+"""Views of the cameras of a rig for tracking: prepared pixels, rays, and overlaps."""
 
 from __future__ import annotations
 

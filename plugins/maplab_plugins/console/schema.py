@@ -1,4 +1,4 @@
-"""What --json prints, as a JSON schema."""
+"""JSON schema of the output of --json."""
 
 from __future__ import annotations
 

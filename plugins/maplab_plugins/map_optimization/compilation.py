@@ -25,7 +25,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class WarmupReport(Report):
-    """Which kernels are ready, and where."""
+    """Compiled kernels and their cache."""
 
     kernels: list[str]
     seconds: float

@@ -45,7 +45,7 @@ class LoadedMap:
 
 @dataclasses.dataclass(frozen=True)
 class LoadedMaps(Report):
-    """What was loaded, each map under its key."""
+    """Loaded maps, each under its key."""
 
     maps: tuple[LoadedMap, ...]
     details: tuple[Report, ...]
@@ -67,7 +67,7 @@ class LoadedMaps(Report):
 
 @dataclasses.dataclass(frozen=True)
 class LoadedMapsTable:
-    """What is shown of several loaded maps."""
+    """Displayed results of several loaded maps."""
 
     maps: tuple[LoadedMap, ...] = dataclasses.field(metadata={"title": ""})
     notes: tuple[str, ...]
@@ -75,7 +75,7 @@ class LoadedMapsTable:
 
 @dataclasses.dataclass(frozen=True)
 class MergedMaps(Report):
-    """What was loaded and merged into one map."""
+    """Maps loaded and merged into one."""
 
     map_key: str
     missions: int
@@ -99,7 +99,7 @@ class MergedMaps(Report):
 
 @dataclasses.dataclass(frozen=True)
 class MergedMapsTable:
-    """What is shown of merged maps."""
+    """Displayed results of merged maps."""
 
     map_key: str
     missions: int
@@ -111,7 +111,7 @@ class MergedMapsTable:
 
 @dataclasses.dataclass(frozen=True)
 class ReadingOptions(CacheOptions, SizeOptions):
-    """How map files are read."""
+    """Reading of map files."""
 
     repair: bool = option(
         False,

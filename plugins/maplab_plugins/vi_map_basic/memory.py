@@ -46,7 +46,7 @@ class MapList(Report):
 
 @dataclasses.dataclass(frozen=True)
 class MapTable:
-    """What is shown of the maps in memory."""
+    """Displayed results of the maps in memory."""
 
     maps: tuple[MapLine, ...] = dataclasses.field(metadata={"title": ""})
 

@@ -1,4 +1,4 @@
-"""What maps, their former values and the cache of maps take."""
+"""Memory of maps, their former values and the cache of maps."""
 
 from __future__ import annotations
 

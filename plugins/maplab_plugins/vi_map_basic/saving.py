@@ -56,7 +56,7 @@ class SavedMapLine:
 
 @dataclasses.dataclass(frozen=True)
 class SavedMapTable:
-    """What is shown of the saved maps."""
+    """Displayed results of the saved maps."""
 
     maps: tuple[SavedMapLine, ...] = dataclasses.field(metadata={"title": ""})
 
@@ -84,7 +84,7 @@ class SavePlan(Report):
 
 @dataclasses.dataclass(frozen=True)
 class SaveOptions:
-    """What a save may replace, and the layout of descriptors."""
+    """Files that a save may replace, and the layout of descriptors."""
 
     overwrite: bool = option(
         False,

@@ -1,4 +1,4 @@
-"""Why closures were refused, missions are not joined, and landmarks are bad."""
+"""Explanations of refused closures, unjoined missions and bad landmarks."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ NAME = "viewer"
 
 @dataclasses.dataclass(frozen=True)
 class ViewerOptions:
-    """Where the page is served and how it looks."""
+    """Address and appearance of the page."""
 
     flag_prefix: ClassVar[str] = "viewer_"
 
@@ -49,7 +49,7 @@ class LayerLine:
 
 @dataclasses.dataclass(frozen=True)
 class ViewReport(Report):
-    """What is shown, and where."""
+    """Shown page and its address."""
 
     url: str
     map: str

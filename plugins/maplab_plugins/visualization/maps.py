@@ -22,7 +22,7 @@ _PLAYBACK = PlaybackOptions()
 
 @dataclasses.dataclass(frozen=True)
 class DifferenceReport(Report):
-    """How far vertices are from where they are in the other state."""
+    """Distances of vertices between two states."""
 
     compared_with: str
     vertices: int

@@ -11,7 +11,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class DistanceOptions:
-    """How far distances reach, and what counts as free near the robot."""
+    """Reach of distances, and free space near the robot."""
 
     flag_prefix: ClassVar[str] = "dense_esdf_"
 

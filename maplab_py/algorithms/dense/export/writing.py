@@ -35,7 +35,7 @@ _IMAGE_SUFFIXES = (".ppm", ".jpg")
 
 @dataclasses.dataclass(frozen=True)
 class MvsExport(Report):
-    """What was written for multi-view stereo."""
+    """Files written for multi-view stereo."""
 
     folder: Path
     images: int

@@ -1,4 +1,4 @@
-"""What is fused into grids: the depth of missions in a common frame, in one grid each."""
+"""Inputs of fusion: the depth of missions in a common frame, in one grid each."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ _LIMIT = 1 << 20
 
 @dataclasses.dataclass(frozen=True)
 class GridSettings:
-    """What the numbers of a grid depend on."""
+    """Settings on which the numbers of a grid depend."""
 
     voxel_size_m: float
     truncation_m: float

@@ -39,7 +39,7 @@ class SegmentRecord:
 
     @property
     def key(self) -> Key:
-        """What identifies the segment."""
+        """Key of the segment."""
         return self.first_vertex, self.last_vertex
 
 

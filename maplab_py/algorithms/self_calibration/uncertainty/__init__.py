@@ -1,1 +1,1 @@
-"""How certain a calibration is, and how much a segment contributes to it."""
+"""Uncertainty of a calibration, and the contribution of a segment to it."""

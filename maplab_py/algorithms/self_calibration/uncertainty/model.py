@@ -17,7 +17,7 @@ _MAX_SPREAD = 2.0
 
 
 class Verdict(Enum):
-    """What a deviation says about a parameter; values are the texts of reports."""
+    """Meaning of a parameter's deviation; values are the texts of reports."""
 
     WELL_DETERMINED = "well determined"
     WEAKLY_DETERMINED = "weakly determined"

@@ -30,7 +30,7 @@ from maplab_py.vimap import VIMap
 
 @dataclasses.dataclass(frozen=True)
 class SegmentTest:
-    """How well a segment agrees with a calibration."""
+    """Agreement of a segment with a calibration."""
 
     distance: float  # squared Mahalanobis distance of the segment's own estimate
     limit: float  # of the distance, at the chosen probability
