@@ -20,6 +20,7 @@ from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
+_ID = re.compile(r"(^|[-_. ])id$")
 _TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$")
 
 
@@ -84,7 +85,7 @@ def parse_text_table(
     if not lines:
         raise MapError(f"{source}: there are no rows in the file: write or copy it again")
     has_commas = "," in lines[0]
-    rows = [line.replace(",", " ").split() for line in lines]
+    header, time_name, rows = _named_cells(others, lines)
     widths = np.array([len(row) for row in rows])
     wrong = np.flatnonzero(widths != widths[0])
     if len(wrong):
@@ -93,9 +94,12 @@ def parse_text_table(
             f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}: correct or "
             "remove the row"
         )
-    if widths[0] < 2:
+    kept = _numeric(header, rows[0])
+    if len(kept) < len(rows[0]):
+        header = tuple(header[k] for k in kept)
+        rows = [[row[k] for k in kept] for row in rows]
+    if len(kept) < 2:
         raise MapError(f"{source}:{numbers[0]}: a time stamp and values are expected")
-    header, time_name = _header(others, int(widths[0]))
     stamps = parse_stamps(
         [row[0] for row in rows],
         kind,
@@ -154,8 +158,7 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
         line = raw.strip()
         if not line:
             continue
-        is_comment = line.startswith(("#", "%"))
-        if is_comment or (not lines and not others and not _starts_with_number(line)):
+        if line.startswith(("#", "%")) or (not lines and not _is_number(_split(line)[0])):
             others.append(line)
             continue
         lines.append(line)
@@ -163,30 +166,56 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
     return lines, numbers, others
 
 
-def _starts_with_number(line: str) -> bool:
-    first = line.replace(",", " ").split()[0]
-    try:
-        float(first)
-    except ValueError:
-        return False
-    return True
+def _named_cells(
+    others: list[str], lines: list[str]
+) -> tuple[tuple[str, ...], str, list[list[str]]]:
+    """Return the names of the columns, what tells the unit of the stamps, and the cells of the rows.
 
-
-def _header(others: list[str], width: int) -> tuple[tuple[str, ...], str]:
-    """Return the names of the columns, units removed, and what tells the unit of the stamps.
-
-    Of several lines with as many words as the rows, the last one that begins with a time counts.
+    The names are in the line that has as many as the rows have cells, wherever it stands: of several the
+    last that begins with a time stamp.
     """
-    lines = [_words(line) for line in others]
-    fitting = [words for words in lines if len(words) == width]
-    timed = [words for words in fitting if _TIME_NAME.search(words[0].lower())]
-    chosen = (timed or fitting or lines or [[]])[-1]
+    named = [_words(line) for line in others]
+    for cells in [_cells, _split] if "," in lines[0] else [_split]:
+        width = len(cells(lines[0]))
+        fitting = [words for words in named if len(words) == width]
+        if fitting:
+            break
+    timed = [words for words in fitting if is_time_name(words[0].lower())]
+    chosen = (timed or fitting or named or [[]])[-1]
     # as in "# time stamps in microseconds"
     about = [line for line in others if re.search(r"time|stamp", line.lower())]
     telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
-    time_name = telling[0] if telling else ""
-    names = [re.sub(r"[\[(].*?[\])]", "", word).strip().lower() for word in chosen]
-    return tuple(names), time_name
+    names = (re.sub(r"[\[(].*?[\])]", "", word).strip(" \t\"'").lower() for word in chosen)
+    return tuple(names), telling[0] if telling else "", [cells(line) for line in lines]
+
+
+def _numeric(header: tuple[str, ...], first: list[str]) -> list[int]:
+    """Return the columns without those that names and first row say to be text."""
+    if len(header) != len(first):
+        return list(range(len(first)))
+    named = enumerate(zip(header, first, strict=True))
+    return [k for k, (name, cell) in named if k == 0 or (_is_number(cell) and not _ID.search(name))]
+
+
+def is_time_name(name: str) -> bool:
+    """Return whether a column of this name has time stamps."""
+    return _TIME_NAME.search(name) is not None
+
+
+def _split(line: str) -> list[str]:
+    return line.replace(",", " ").split() or [""]
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split(",")]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _words(line: str) -> list[str]:

@@ -13,35 +13,42 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
-from maplab_py.geometry import se3
+from maplab_py.geometry import se3, so3
 from maplab_py.input_files import read_text
 from maplab_py.interop.stamps import POSES, read_stamps
 from maplab_py.interop.text_table import (
     TextTable,
     format_rows,
+    is_time_name,
     read_text_table,
     seconds_text,
 )
 from maplab_py.output_files import write_text
+from maplab_py.report import counted
 
 _MAX_BYTES = 500_000_000
+_ROUNDING = ((1e-4, 1e-2), (1e-4, 2e-2))
+"""Least and largest difference [m], [rad] that rounded numbers make between rows of one pose; between
+them half of what the body moves from row to row."""
 _UNIT_TOLERANCE = 0.02
 """Largest deviation of a quaternion's norm from 1; accepts files with three digits."""
 _KINDS = {
-    "p": "p", "t": "p", "pos": "p", "position": "p", "": "p",
-    "q": "q", "quat": "q", "quaternion": "q", "orientation": "q",
+    "p": "p", "t": "p", "pos": "p", "position": "p", "translation": "p", "": "p",
+    "q": "q", "quat": "q", "quaternion": "q", "orientation": "q", "rotation": "q",
     "v": "v", "vel": "v", "velocity": "v",
     "bw": "b_g", "bg": "b_g", "b_w": "b_g", "b_g": "b_g", "gyro bias": "b_g",
     "ba": "b_a", "b_a": "b_a", "acc bias": "b_a", "accel bias": "b_a",
 }  # fmt: skip
 _NAME = re.compile(
-    r"(gyro bias|acc(?:el)? bias|orientation quaternion|position|pos|quaternion|quat|orientation"
-    r"|velocity|vel|b_?[wga]|[ptqv])?(?:_[a-z0-9_]*?)?[_ ]?([wxyz])"
+    r"(?:.*?\.)?(gyro bias|acc(?:el)? bias|orientation quaternion|position|pos|quaternion|quat|orientation"
+    r"|rotation|translation|velocity|vel|b_?[wga]|[ptqv])?(?:_[a-z0-9_]*?)?[_. ]?([wxyz])"
 )
+_TURN = re.compile(r"^q|quat|orient|rotation")
 _EUROC_ORDER = ("px", "py", "pz", "qw", "qx", "qy", "qz")
 _EUROC_STATE = ("vx", "vy", "vz", *(f"b_g{i}" for i in "xyz"), *(f"b_a{i}" for i in "xyz"))
+_M_AND_G = frozenset(f"{kind}_{frame}_i{axis}" for kind in "pq" for frame in "mg" for axis in "xyz")
 _TUM_ORDER = ("px", "py", "pz", "qx", "qy", "qz", "qw")
 _EUROC_HEADER = (
     "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
@@ -65,47 +72,113 @@ class Trajectory:
     accel_bias: F64 | None = None  # (N, 3) [m/s^2]
     source: str = ""
     note: str = ""  # one line on the unit of the stamps, where it was concluded
+    has_orientation: bool = True  # else the quaternions are the identity
 
     def __len__(self) -> int:
         return len(self.times_ns)
 
+    def take(self, rows: I64) -> Trajectory:
+        """Return the poses of some rows."""
+        fields = ("times_ns", "T_R_B", "v_R", "gyro_bias", "accel_bias")
+        values = {name: getattr(self, name) for name in fields}
+        kept = {name: v[rows] for name, v in values.items() if v is not None}
+        return dataclasses.replace(self, **kept)
 
-def read_trajectory(path: Path, time_unit: str = "") -> Trajectory:
+
+def read_trajectory(
+    path: Path,
+    time_unit: str = "",
+    *,
+    needs_orientation: bool = True,
+    keep_repeated: bool = False,
+) -> Trajectory:
     """Read a trajectory; the format is detected from the content.
 
     Columns are identified by the names in the header if there is one; without names, eight columns
-    are TUM (quaternion w last), whole nanoseconds with commas are EuRoC (w first).
+    are TUM (quaternion w last), whole nanoseconds with commas are EuRoC (w first), and four are stamps
+    and positions. Rows that repeat a pose are read once, unless `keep_repeated` is set: then every row is
+    read, also those that contradict each other.
 
     Args:
         path: File.
         time_unit: Unit of the time stamps; empty = see `stamps`.
 
     Raises:
-        MapError: The file cannot be read or is not a trajectory; names file and line.
+        MapError: The file cannot be read or is not a trajectory, two rows contradict each other, or there
+            are positions only and `needs_orientation` is set; names file and line.
     """
     table = read_text_table(path, POSES, unit=time_unit)
-    names = _columns(table)
-    missing = [name for name in _TUM_ORDER if name not in names]
-    if missing:
+    trajectory = trajectory_of_table(table, keep_repeated=keep_repeated)[0]
+    if needs_orientation and not trajectory.has_orientation:
         raise MapError(
-            f"{path}: no trajectory: there is no column for {', '.join(missing)}; TUM (t x y z qx "
-            "qy qz qw), EuRoC (t, p, q wxyz) or a header with such names is expected"
+            f"{path}: has positions without orientations, which are needed here: give qx, qy, qz and qw, too"
         )
-    q = table.values[:, [names[f"q{i}"] for i in "xyzw"]]
-    norm = np.linalg.norm(q, axis=1)
-    _refuse(table, np.abs(norm - 1.0) > _UNIT_TOLERANCE, "the quaternion is not of unit length")
-    backwards = np.diff(table.times_ns, prepend=table.times_ns[0]) < 0
-    _refuse(table, backwards, "the time stamp lies before that of the row above")
+    return trajectory
+
+
+def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tuple[Trajectory, I64]:
+    """Return the trajectory of a table, and the row of the table of each pose.
+
+    Raises:
+        MapError: As in `read_trajectory`.
+    """
+    names = _columns(table)
     p = table.values[:, [names[f"p{i}"] for i in "xyz"]]
-    return Trajectory(
-        times_ns=table.times_ns,
-        T_R_B=np.concatenate([q / norm[:, None], p], axis=1),
-        v_R=_optional(table, names, "v"),
-        gyro_bias=_optional(table, names, "b_g"),
-        accel_bias=_optional(table, names, "b_a"),
-        source=str(path),
-        note=table.note,
+    q = np.tile(so3.identity(), (len(p), 1))
+    if "qw" in names:
+        q = table.values[:, [names[f"q{i}"] for i in "xyzw"]]
+        norm = np.linalg.norm(q, axis=1)
+        _refuse(table, np.abs(norm - 1.0) > _UNIT_TOLERANCE, "the quaternion is not of unit length")
+        q = q / norm[:, None]
+    rows = np.arange(len(p))
+    v_R = _optional(table, names, "v")
+    if set(table.header) >= _M_AND_G:  # the program's own table of missions one after the other
+        rows = np.argsort(table.times_ns, kind="stable")
+        q_M = table.values[:, [table.header.index(f"q_m_i{i}") - 1 for i in "xyzw"]]
+        v_R = None if v_R is None else so3.rotate(so3.multiply(q, so3.inverse(q_M)), v_R)
+    backwards = np.diff(table.times_ns[rows], prepend=table.times_ns[rows[0]]) < 0
+    _refuse(table, backwards, "the time stamp lies before that of the row above")
+    trajectory = Trajectory(
+        table.times_ns,
+        np.concatenate([q, p], axis=1),
+        v_R,
+        _optional(table, names, "b_g"),
+        _optional(table, names, "b_a"),
+        table.source,
+        table.note,
+        "qw" in names,
     )
+    if not keep_repeated:
+        rows = rows[_distinct(trajectory, rows, table.line_numbers)]
+    return trajectory.take(rows), rows
+
+
+def _distinct(trajectory: Trajectory, rows: I64, lines: I64) -> Mask:
+    """Return which rows (N,), in the order of time, begin a new stamp; the others repeat a pose."""
+    stamps, T = trajectory.times_ns[rows], trajectory.T_R_B[rows]
+    is_new = np.append(True, np.diff(stamps) != 0)
+    first = np.maximum.accumulate(np.where(is_new, np.arange(len(rows)), 0))
+    if is_new.all():
+        return is_new
+    apart, step = se3.local(T[first], T), se3.local(T[:-1], T[1:])
+    wrong = np.zeros(len(rows), dtype=np.bool_)
+    for k, bounds in zip((0, 3), _ROUNDING, strict=True):
+        usual = (
+            np.median(np.linalg.norm(step[is_new[1:], k : k + 3], axis=1)) if any(is_new[1:]) else 0
+        )
+        wrong |= np.linalg.norm(apart[:, k : k + 3], axis=1) > np.clip(0.5 * usual, *bounds)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        apart_m, apart_deg = (
+            np.linalg.norm(apart[row, :3]),
+            np.degrees(np.linalg.norm(apart[row, 3:])),
+        )
+        raise MapError(
+            f"{trajectory.source}:{lines[rows[row]]}: has the time stamp of line {lines[rows[first[row]]]}, "
+            f"but another pose, {apart_m:.3g} m and {apart_deg:.3g} deg away: remove one of the two "
+            f"({counted(int(wrong.sum()), 'such row')})"
+        )
+    return is_new
 
 
 def read_kitti(path: Path, times_file: Path, time_unit: str = "") -> Trajectory:
@@ -185,27 +258,46 @@ def write_euroc(trajectory: Trajectory, path: Path, *, overwrite: bool = False) 
 
 
 def _columns(table: TextTable) -> dict[str, int]:
-    """Return the place of each quantity ("px", "qw", "b_gx", ...) among the value columns."""
-    if len(table.header) == table.values.shape[1] + 1:
-        if not re.search(r"time|stamp|^t$|sec|^ns$", table.header[0]):
-            raise MapError(
-                f"{table.source}: the first column must be the time stamp, not '{table.header[0]}'"
-            )
-        named: dict[str, int] = {}
-        for place, name in enumerate(table.header[1:]):
-            match = _NAME.fullmatch(name)
-            if match is not None:
-                prefix = (match[1] or "").replace("orientation quaternion", "q")
-                named.setdefault(_KINDS[prefix] + match[2], place)
-        if all(name in named for name in _TUM_ORDER):
-            return named
+    """Return the place of each quantity ("px", "qw", "b_gx", ...) among the value columns.
+
+    Raises:
+        MapError: There is no position, or some of the columns of an orientation.
+    """
     width = table.values.shape[1]
-    if table.has_commas and table.is_nanoseconds and width >= 7:
-        order = _EUROC_ORDER + (_EUROC_STATE if width >= 16 else ())
-        return {name: place for place, name in enumerate(order)}
-    if width == 7:
-        return {name: place for place, name in enumerate(_TUM_ORDER)}
-    return {}
+    names = _named_columns(table)
+    if not names:
+        order: tuple[str, ...] = ()
+        if table.has_commas and table.unit == "ns" and width >= 7:
+            order = _EUROC_ORDER + (_EUROC_STATE if width >= 16 else ())
+        elif width in (3, 7):
+            order = _TUM_ORDER[:width]
+        names = {name: place for place, name in enumerate(order)}
+    turns = any(name[0] == "q" for name in names) or any(map(_TURN.search, table.header))
+    wanted = _TUM_ORDER if turns else _TUM_ORDER[:3]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise MapError(
+            f"{table.source}: no trajectory: there is no column for {', '.join(missing)}; TUM (t x y z qx "
+            "qy qz qw), EuRoC (t, p, q wxyz), positions (t x y z) or a header with such names is expected"
+        )
+    return names
+
+
+def _named_columns(table: TextTable) -> dict[str, int]:
+    """Return the columns that the header names; nothing without one."""
+    names: dict[str, int] = {}
+    if len(table.header) != table.values.shape[1] + 1:
+        return names
+    for place, name in enumerate(table.header[1:]):
+        match = _NAME.fullmatch(name)
+        if match is not None:
+            prefix = (match[1] or "").replace("orientation quaternion", "q")
+            names.setdefault(_KINDS[prefix] + match[2], place)
+    if names and not is_time_name(table.header[0]):
+        raise MapError(
+            f"{table.source}: the first column must be the time stamp, not '{table.header[0]}'"
+        )
+    return names
 
 
 def _optional(table: TextTable, names: dict[str, int], kind: str) -> F64 | None:

@@ -39,6 +39,8 @@ def errors_over_time(
     rows, T_R_B = _with_truth(vi_map, ground_truth, options, missions)
     T_R_I, _ = pose_errors.align(T_R_B, vi_map.T_G_I[rows], options.alignment)
     error_m, error_deg = pose_errors.absolute_errors(T_R_B, T_R_I)
+    if not ground_truth.has_orientation:
+        error_deg = np.full(len(error_deg), np.nan)
     offset_m = T_R_I[:, 4:] - T_R_B[:, 4:]
     time_ns, mission = vi_map.vertices.timestamp_ns[rows], vi_map.vertices.mission[rows]
     figure = new_figure(9.0, 7.0)

@@ -38,7 +38,7 @@ def evaluate_trajectory(
     the same options, is subtracted.
 
     Args:
-        ground_truth: TUM, EuRoC or CSV file with stamped poses, or the truth.npz of `simulate`.
+        ground_truth: TUM, EuRoC or CSV file with stamped poses or positions, or the truth.npz of `simulate`.
         baseline: Snapshot of the map to subtract the errors of; empty = the last evaluation.
     """
     from maplab_py.algorithms.evaluation import trajectory_evaluation
@@ -50,7 +50,7 @@ def evaluate_trajectory(
 
         truth = Truth.load(ground_truth).trajectory(str(ground_truth))
     else:
-        truth = read_trajectory(ground_truth, options.time_unit)
+        truth = read_trajectory(ground_truth, options.time_unit, needs_orientation=False)
         if truth.note:
             context.terminal.note(truth.note)
 
@@ -136,10 +136,14 @@ def evaluate_localization(
     names = [name.strip() for name in localization_csv.split(",") if name.strip()]
     if not names:
         raise UserError("no poses: give --localization_csv=FILE, the file of rovioli")
-    truth = read_trajectory(ground_truth)
+    truth = read_trajectory(ground_truth, needs_orientation=False)
     T_R_G, alignment = se3.identity(), "none: the map has the frame of the ground truth"
     if map_folder is not None:
-        of_map = truth if map_ground_truth is None else read_trajectory(map_ground_truth)
+        of_map = (
+            truth
+            if map_ground_truth is None
+            else read_trajectory(map_ground_truth, needs_orientation=False)
+        )
         vi_map, _ = load_map(map_folder, progress=context.progress)
         T_R_G, alignment = evaluation.alignment_of_map(vi_map, of_map), "vertices of the map"
     files = tuple(

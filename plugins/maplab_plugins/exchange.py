@@ -183,7 +183,7 @@ def import_trajectory(
 
     options.check()
     if options.times_file is None:
-        trajectory = read_trajectory(trajectory_file, options.time_unit)
+        trajectory = read_trajectory(trajectory_file, options.time_unit, needs_orientation=False)
     else:
         trajectory = read_kitti(trajectory_file, options.times_file, options.time_unit)
     if trajectory.note:
@@ -198,19 +198,25 @@ def _measurements(
     context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, mission: int
 ) -> TrajectoryImport:
     from maplab_py.algorithms.external_poses.reports import TrajectoryImport
-    from maplab_py.algorithms.external_poses.trajectories import as_absolute_poses, as_odometry
+    from maplab_py.algorithms.external_poses.trajectories import (
+        as_absolute_poses,
+        as_odometry,
+        clock_note,
+    )
     from maplab_py.vimap.queries import mission_labels
 
     before = context.vi_map
     moved_m, turned_deg = 0.0, 0.0
+    notes: list[str] = []
     count = int(before.vertex_start[mission + 1] - before.vertex_start[mission])
     if options.kind == "absolute":
         after, missing, movement = as_absolute_poses(before, mission, trajectory, options)
         moved_m, turned_deg = movement
         added = count - missing
     else:
-        after, missing = as_odometry(before, mission, trajectory, options)
+        after, missing, notes = as_odometry(before, mission, trajectory, options)
         added = count - 1 - missing
+    notes.append(clock_note(before, mission, trajectory, options))
     context.commit(after)
     return TrajectoryImport(
         file=Path(trajectory.source),
@@ -221,6 +227,7 @@ def _measurements(
         without_pose=missing,
         moved_m=moved_m,
         turned_deg=turned_deg,
+        notes=tuple(note for note in notes if note),
     )
 
 

@@ -52,7 +52,8 @@ def plot_trajectory(
         from maplab_py.interop.trajectories import read_trajectory
         from maplab_py.plotting.time_series import truth_in_global_frame
 
-        truth = truth_in_global_frame(context.vi_map, read_trajectory(ground_truth), missions)
+        recorded = read_trajectory(ground_truth, needs_orientation=False)
+        truth = truth_in_global_frame(context.vi_map, recorded, missions)
     drawn = maps.trajectories(context.vi_map, missions, landmarks=plot_landmarks, p_G_truth=truth)
     figure.write_figure(drawn, plot_file)
     return Plot(plot_file, "trajectories from above")
@@ -87,7 +88,7 @@ def plot_errors(
     figure.check_plot_file(plot_file, overwrite=overwrite)
     drawn, rmse_m = time_series.errors_over_time(
         context.vi_map,
-        read_trajectory(ground_truth, options.time_unit),
+        read_trajectory(ground_truth, options.time_unit, needs_orientation=False),
         options,
         context.mission_rows("", map_mission_list),
     )

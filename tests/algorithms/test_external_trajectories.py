@@ -159,7 +159,11 @@ def test_kitti(tmp_path: Path) -> None:
         ("", {}, "no rows"),
         ("1.0 2 3\n", {}, "no trajectory"),
         ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", {}, "before that of the row above"),
-        ("1.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", {}, "two poses have the time stamp"),
+        (
+            "1.0 0 0 0 0 0 0 1\n1.0 1 0 0 0 0 0 1\n",
+            {},
+            ":2: has the time stamp of line 1, but another",
+        ),
         ("1.0 0 0 0 0 0 0 2\n", {}, "unit length"),
         ("1.0 0 0 0 0 0 0 1\n", {"position_sigma_m": 0.0}, "position_sigma_m"),
         ("1.0 0 0 0 0 0 0 1\n", {"sensor_id": "f" * 32}, "poses from"),
@@ -176,6 +180,37 @@ def test_wrong_files(
         session.run("import_trajectory", trajectory_file=path, map_mission=mission, **flags)
     assert "\n" not in str(error.value)
     assert session.vi_map is before
+
+
+@pytest.mark.parametrize("kind", ["absolute", "odometry"])
+def test_another_order_of_quaternions_is_refused(
+    kind: str, session: Session, tmp_path: Path
+) -> None:
+    poses, path = truth(session.vi_map), tmp_path / "poses.txt"
+    wrong = se3.make(np.roll(poses.T_R_B[:, :4], 1, axis=1), poses.T_R_B[:, 4:])
+    write_tum(Trajectory(poses.times_ns, wrong), path)
+    flags = {"map_mission": session.vi_map.mission(0).id[:8], "as": kind}
+    with pytest.raises(EstimationError, match=r"deg, qw first would give [\d.e-]+ deg"):
+        session.run("import_trajectory", trajectory_file=path, **flags)
+    text = "# timestamp tx ty tz qw qx qy qz\n# a further comment\n" + path.read_text()
+    path.write_text(text)
+    report: Any = session.run("import_trajectory", trajectory_file=path, **flags)
+    assert report.added > 1
+    assert report.notes == ()
+
+
+def test_positions_become_absolute_positions(session: Session, tmp_path: Path) -> None:
+    poses, path = truth(session.vi_map), tmp_path / "positions.txt"
+    rows = zip(poses.times_ns.tolist(), poses.T_R_B[:, 4:].tolist(), strict=True)
+    path.write_text("".join(f"{t} {p[0]:.17g} {p[1]:.17g} {p[2]:.17g}\n" for t, p in rows))
+    flags = {"trajectory_file": path, "map_mission": session.vi_map.mission(0).id[:8]}
+    with pytest.raises(UserError, match="positions only"):
+        session.run("import_trajectory", **flags, **{"as": "odometry"})
+    report: Any = session.run("import_trajectory", **flags)
+    assert report.added == VERTICES
+    measured = session.vi_map.absolute_poses
+    np.testing.assert_allclose(measured.T_G_S, session.vi_map.T_G_I[measured.vertex], atol=1e-6)
+    assert np.sqrt(measured.covariance[0, 5, 5]) == pytest.approx(1e3)
 
 
 def test_a_trajectory_that_lies_on_its_side_is_refused(session: Session, tmp_path: Path) -> None:

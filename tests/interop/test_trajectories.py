@@ -89,7 +89,8 @@ def test_formats_are_told_from_content(tmp_path: Path, text: str, pose: list[flo
         ("1 2 3 4 0 0 0 1\nlater 2 3 4 0 0 0 1\n", r":2: 'later' is not a time stamp"),
         ("1 2 3 4 0 0 0 2\n", r":1: the quaternion is not of unit length"),
         ("2 2 3 4 0 0 0 1\n1 2 3 4 0 0 0 1\n", r":2: the time stamp lies before"),
-        ("1 2 3\n", "there is no column for px, py, pz, qx"),
+        ("1 2 3\n", "there is no column for px, py, pz;"),
+        ("t,x,y,z,q0,q1,q2,q3\n1,0,0,0,1,0,0,0\n", "no column for qx"),
         ("vertex index,px,py,pz,qw,qx,qy,qz\n1,2,3,4,1,0,0,0\n", "must be the time stamp"),
         ("5\n", "a time stamp and values are expected"),
     ],
@@ -99,6 +100,60 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
         read_trajectory(written(tmp_path, text))
     assert "trajectory.txt" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+ROW = "0.5 1 2 3 0.8 0.6 0 0\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# timestamp tx ty tz qw qx qy qz\n# another comment line\n" + ROW,
+        "# made by a program\n# timestamp tx ty tz qw qx qy qz\n# and eight more words of a comment\n"
+        + ROW,
+        "# a comment\ntimestamp tx ty tz qw qx qy qz\n" + ROW,
+        ROW + "# timestamp tx ty tz qw qx qy qz\n",
+        "# timestamp [s] tx [m] ty [m] tz [m] qw qx qy qz\n" + ROW,
+        '"time","x","y","z","q_w","q_x","q_y","q_z"\n0.5,1,2,3,0.8,0.6,0,0\n',
+        "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+        "field.pose.orientation.w,field.pose.orientation.x,field.pose.orientation.y,"
+        "field.pose.orientation.z\n0.5,1,2,3,0.8,0.6,0,0\n",
+        "time,frame_id,x,y,z,qw,qx,qy,qz\n0.5,odom,1,2,3,0.8,0.6,0,0\n",
+        "time,frame_id,x,y,z,qw,qx,qy,qz,note\n0.5,,1,2,3,0.8,0.6,0,0,fast turn\n",
+        "time,mission-id,x,y,z,qw,qx,qy,qz\n0.5,12345678,1,2,3,0.8,0.6,0,0\n",
+    ],
+)
+def test_names_hold_wherever_they_stand(tmp_path: Path, text: str) -> None:
+    read = read_trajectory(written(tmp_path, text))
+    assert read.times_ns.tolist() == [500_000_000]
+    assert read.T_R_B[0] == pytest.approx([0.6, 0, 0, 0.8, 1, 2, 3], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0 1 2 3\n1 2 3 4\n",
+        "# t x y z\n0 1 2 3\n1 2 3 4\n",
+        "time,x,y,z,speed\n0,1,2,3,9\n1,2,3,4,9\n",
+    ],
+)
+def test_positions_are_read_where_they_suffice(tmp_path: Path, text: str) -> None:
+    path = written(tmp_path, text)
+    read = read_trajectory(path, needs_orientation=False)
+    assert not read.has_orientation
+    assert read.T_R_B[1].tolist() == [0, 0, 0, 1, 2, 3, 4]
+    with pytest.raises(MapError, match="positions without orientations"):
+        read_trajectory(path)
+
+
+def test_rows_of_one_stamp_agree_or_are_both_named(tmp_path: Path) -> None:
+    rows = "".join(f"{t} {0.1 * t} 0 0 0 0 0 1\n" for t in range(5))
+    same = written(tmp_path, rows + "4 0.40004 0 0 0 0 0 1\n5 0.5 0 0 0 0 0 1\n")
+    assert len(read_trajectory(same)) == 6
+    assert len(read_trajectory(same, keep_repeated=True)) == 7
+    for other in ("4 2.4 0 0 0 0 0 1\n", "4 0.4 0 0 0 0 1 0\n"):
+        with pytest.raises(MapError, match=r":6: has the time stamp of line 5, but another pose"):
+            read_trajectory(written(tmp_path, rows + other))
 
 
 def test_missing_and_binary_files(tmp_path: Path) -> None:
@@ -155,7 +210,7 @@ def test_imu_bad_files(tmp_path: Path) -> None:
     ],
 )
 def test_real_trajectories(relative: str, count: int, has_state: bool) -> None:
-    trajectory = read_trajectory(shared_data(relative))
+    trajectory = read_trajectory(shared_data(relative), keep_repeated=True)
     assert len(trajectory) == count
     assert np.all(np.diff(trajectory.times_ns) >= 0)
     assert (trajectory.accel_bias is not None) == has_state

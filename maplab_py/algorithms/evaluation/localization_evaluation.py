@@ -14,7 +14,7 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.text_table import read_text_table
-from maplab_py.interop.trajectories import Trajectory, read_trajectory
+from maplab_py.interop.trajectories import Trajectory, trajectory_of_table
 from maplab_py.vimap import VIMap
 
 _MAX_GAP_NS = 500_000_000
@@ -30,6 +30,7 @@ class LocalizedTrajectory:
     times_ns: I64  # (N,)
     T_G_I: F64  # (N, 7)
     is_localized: np.ndarray  # (N,)
+    has_orientation: bool = True
 
 
 def read_localized(path: Path) -> LocalizedTrajectory:
@@ -38,12 +39,18 @@ def read_localized(path: Path) -> LocalizedTrajectory:
     Raises:
         MapError: The file cannot be read or is not a trajectory.
     """
-    trajectory = read_trajectory(path)
-    is_localized = np.ones(len(trajectory), dtype=np.bool_)
     table = read_text_table(path)
+    trajectory, rows = trajectory_of_table(table)
+    is_localized = np.ones(len(trajectory), dtype=np.bool_)
     if _FLAG_COLUMN in table.header:
-        is_localized = table.values[:, table.header.index(_FLAG_COLUMN) - 1] > 0.0
-    return LocalizedTrajectory(str(path), trajectory.times_ns, trajectory.T_R_B, is_localized)
+        is_localized = table.values[rows, table.header.index(_FLAG_COLUMN) - 1] > 0.0
+    return LocalizedTrajectory(
+        str(path),
+        trajectory.times_ns,
+        trajectory.T_R_B,
+        is_localized,
+        trajectory.has_orientation,
+    )
 
 
 def alignment_of_map(vi_map: VIMap, truth: Trajectory) -> F64:
@@ -99,7 +106,9 @@ def localization_errors(
         std_m=float(np.std(error)),
         rmse_m=float(np.sqrt(np.mean(error**2))),
         largest_m=float(error.max()),
-        median_deg=float(np.degrees(np.median(np.linalg.norm(delta[:, 3:], axis=1)))),
+        median_deg=float(np.degrees(np.median(np.linalg.norm(delta[:, 3:], axis=1))))
+        if truth.has_orientation and localized.has_orientation
+        else None,
         largest_step_m=float(step.max()) if len(step) else None,
         median_step_m=float(np.median(step)) if len(step) else None,
     )

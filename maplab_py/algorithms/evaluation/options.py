@@ -32,6 +32,9 @@ class TrajectoryEvaluationOptions:
         help="Largest distance in time between a vertex and the nearest ground-truth pose",
         unit="s",
     )
+    time_offset_s: float = option(
+        0.0, help="Added to the time stamps of the ground truth", unit="s"
+    )
     rpe_delta: float = option(1.0, help="Length of the segments of the relative pose error")
     rpe_delta_unit: str = option(
         "m",

@@ -38,7 +38,7 @@ class BaselineErrors:
 
     name: str
     ape_m: float
-    ape_deg: float
+    ape_deg: float | None
     ape_sim3_m: float | None
     rpe_m: float | None
     rpe_deg: float | None
@@ -85,22 +85,25 @@ class TrajectoryEvaluationReport(Report):
     matched: int
     without_ground_truth: int  # outside its span, or in one of its gaps
     ape_m: ErrorStatistics
-    ape_deg: ErrorStatistics
+    ape_deg: ErrorStatistics | None  # None, like rpe: the ground truth has positions only
     ape_sim3_m: ErrorStatistics | None  # None: the scale cannot be determined
     scale: float | None  # ground truth / map
-    body_rotation_deg: float  # constant rotation between ground truth's body frame and the IMU
+    body_rotation_deg: (
+        float | None
+    )  # constant rotation between ground truth's body frame and the IMU
     rpe_m: ErrorStatistics | None  # None: no segment of the wanted length
     rpe_deg: ErrorStatistics | None
     rpe_pieces: str  # description of the segments
     missions: tuple[MissionEvaluation, ...]
     baseline: BaselineErrors | None = None
+    notes: tuple[str, ...] = ()  # other readings of the ground truth that fit much better
 
     def as_baseline(self, name: str) -> BaselineErrors:
         """Return the errors that a later evaluation is compared with."""
         return BaselineErrors(
             name,
             self.ape_m.rmse,
-            self.ape_deg.rmse,
+            None if self.ape_deg is None else self.ape_deg.rmse,
             None if self.ape_sim3_m is None else self.ape_sim3_m.rmse,
             None if self.rpe_m is None else self.rpe_m.rmse,
             None if self.rpe_deg is None else self.rpe_deg.rmse,
@@ -128,11 +131,16 @@ class TrajectoryEvaluationReport(Report):
         outside = self.without_ground_truth
         left_out = f" ({outside} of the map have none)" if outside else ""
         scale = "" if self.scale is None else f", scale {self.scale:.5f}"
+        turned = "positions only"
+        if self.body_rotation_deg is not None:
+            turned = (
+                f"RPE over {self.rpe_pieces}, body frames {self.body_rotation_deg:.2f} deg apart"
+            )
         sentences = [
             f"{self.matched} vertices with ground truth{left_out}, "
-            f"alignment {self.alignment}{scale}, RPE over {self.rpe_pieces}, "
-            f"body frames {self.body_rotation_deg:.2f} deg apart."
+            f"alignment {self.alignment}{scale}, {turned}."
         ]
+        sentences += [f"{note[0].upper()}{note[1:]}." for note in self.notes]
         if self.baseline is not None:
             sentences.append(f"Change of the RMSE since {self.baseline.name}.")
         return sentences

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.evaluation import pose_errors
 from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.plausibility import clock_offset_ns, orientation_hint
 from maplab_py.algorithms.evaluation.reports import (
     ErrorStatistics,
     MissionEvaluation,
@@ -22,6 +25,12 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ids
 
 _MIN_MATCHED = 3
+_LEAST_CLOCK_S = 0.005
+"""Errors that the usual motion makes in less time are not searched for a wrong clock."""
+_CLEARLY, _LITTLE, _LARGEST_SHARE = 0.5, 0.9, 0.2
+"""Another clock leaves half of the error, or little less of it but half of that of turning, and at most this
+share of the spread of the positions."""
+_MIN_SHARE = 0.3
 _GAP_STEPS = 3
 
 
@@ -54,18 +63,28 @@ def evaluate_trajectory(
     T_R_B, matched = match(ground_truth, vi_map.vertices.timestamp_ns[rows], options)
     if np.count_nonzero(matched) < _MIN_MATCHED:
         message = _no_match_message(vi_map, rows, ground_truth, matched)
+        hint = clock_hint(vi_map, rows, ground_truth, options)
         raise EstimationError(
             f"{message} (max_time_difference_s {options.max_time_difference_s:g})"
+            + (f"; {hint}" if hint else "")
         )
-    rows, T_R_B = rows[matched], T_R_B[matched]
+    every, rows, T_R_B = rows, rows[matched], T_R_B[matched]
     T_G_I = vi_map.T_G_I[rows]
     T_R_I, scale = pose_errors.align(T_R_B, T_G_I, options.alignment)
-    q_B_I = pose_errors.mean_rotation(so3.multiply(so3.inverse(T_R_B[:, :4]), T_R_I[:, :4]))
-    if options.align_body_frame:
-        T_R_B = se3.compose(T_R_B, se3.make(q_B_I, np.zeros(3)))
-    ape_m, ape_deg = pose_errors.absolute_errors(T_R_B, T_R_I)
+    hint, body_rotation_deg = clock_hint(vi_map, every, ground_truth, options), None
+    if ground_truth.has_orientation:
+        hint = hint or orientation_hint(T_R_B[:, :4], T_R_I[:, :4])
+        q_B_I = pose_errors.mean_rotation(so3.multiply(so3.inverse(T_R_B[:, :4]), T_R_I[:, :4]))
+        body_rotation_deg = float(np.degrees(np.linalg.norm(so3.log(q_B_I))))
+        if options.align_body_frame:
+            T_R_B = se3.compose(T_R_B, se3.make(q_B_I, np.zeros(3)))
+    ape_m, ape_deg = (
+        pose_errors.statistics(error) for error in pose_errors.absolute_errors(T_R_B, T_R_I)
+    )
     sim3, sim3_scale = _similarity(T_R_B, T_G_I)
-    rpe_m, rpe_deg = _relative(vi_map, rows, T_R_B, T_R_I, options)
+    rpe_m, rpe_deg = None, None
+    if ground_truth.has_orientation:
+        rpe_m, rpe_deg = _relative(vi_map, rows, T_R_B, T_R_I, options)
     kind = "all pairs" if options.rpe_all_pairs else "consecutive"
     return TrajectoryEvaluationReport(
         ground_truth=ground_truth.source,
@@ -73,15 +92,88 @@ def evaluate_trajectory(
         vertices=len(matched),
         matched=len(rows),
         without_ground_truth=len(matched) - len(rows),
-        ape_m=pose_errors.statistics(ape_m),
-        ape_deg=pose_errors.statistics(ape_deg),
+        ape_m=ape_m,
+        ape_deg=ape_deg if ground_truth.has_orientation else None,
         ape_sim3_m=sim3,
         scale=scale if options.alignment == "sim3" else sim3_scale,
-        body_rotation_deg=float(np.degrees(np.linalg.norm(so3.log(q_B_I)))),
+        body_rotation_deg=body_rotation_deg,
         rpe_m=rpe_m,
         rpe_deg=rpe_deg,
         rpe_pieces=f"{options.rpe_delta:g} {options.rpe_delta_unit}, {kind}",
         missions=_by_mission(vi_map, rows, T_R_B, options),
+        notes=(hint,) if hint else (),
+    )
+
+
+def clock_hint(
+    vi_map: VIMap,
+    rows: I64,
+    ground_truth: Trajectory,
+    options: TrajectoryEvaluationOptions,
+) -> str:
+    """Return a clause on the offset of the clocks that leaves a much smaller error; empty without one.
+
+    Args:
+        vi_map: Map.
+        rows: Vertices; of several missions the longest is compared.
+        ground_truth: Poses or positions in the order of time.
+        options: What to compare and how.
+    """
+    if len(ground_truth) < _MIN_MATCHED or len(rows) < _MIN_MATCHED:
+        return ""
+    stamps, T_G_I = vi_map.vertices.timestamp_ns, vi_map.T_G_I
+    seconds = float(ground_truth.times_ns[-1] - ground_truth.times_ns[0]) * 1e-9
+    spread_m = np.sqrt(np.sum(np.var(ground_truth.T_R_B[:, 4:], axis=0)))
+    path_m = np.sum(np.linalg.norm(np.diff(ground_truth.T_R_B[:, 4:], axis=0), axis=1))
+    mission = vi_map.vertices.mission[rows]
+    longest = rows[max(_groups(mission), key=len)]
+    given_s = options.time_offset_s
+
+    def truth_at(offset_ns: int) -> tuple[F64, NDArray[np.bool_]]:
+        shifted = dataclasses.replace(options, time_offset_s=given_s + offset_ns * 1e-9)
+        return match(ground_truth, stamps[longest], shifted)
+
+    def turning_error_at(offset_ns: int) -> float:
+        """Compare how far both turn from vertex to vertex, which no frame and no order changes."""
+        T_R_B, matched = truth_at(offset_ns)
+        both = matched[:-1] & matched[1:]
+        angles = [
+            np.linalg.norm(so3.log(so3.multiply(so3.inverse(T[:-1, :4]), T[1:, :4])), axis=1)[both]
+            for T in (T_R_B, T_G_I[longest])
+        ]
+        return float(np.sqrt(np.mean((angles[0] - angles[1]) ** 2))) if both.any() else np.inf
+
+    def error_at(offset_ns: int) -> float:
+        T_R_B, matched = truth_at(offset_ns)
+        if np.count_nonzero(matched) < max(_MIN_MATCHED, _MIN_SHARE * len(longest)):
+            return np.inf
+        try:
+            T_R_I, _ = pose_errors.align(T_R_B[matched], T_G_I[longest][matched], options.alignment)
+        except EstimationError:
+            return np.inf
+        return float(np.sqrt(np.mean(np.sum((T_R_I - T_R_B[matched])[:, 4:] ** 2, axis=1))))
+
+    error_m = error_at(0)
+    if error_m * seconds < _LEAST_CLOCK_S * path_m:
+        return ""
+    result = clock_offset_ns(
+        ground_truth.times_ns + round(given_s * 1e9),
+        ground_truth.T_R_B,
+        stamps[longest],
+        T_G_I[longest],
+        error_at,
+        has_orientation=ground_truth.has_orientation,
+    )
+    if result is None or result[1] > min(_LITTLE * error_m, _LARGEST_SHARE * spread_m):
+        return ""
+    if result[1] > _CLEARLY * error_m and not (
+        ground_truth.has_orientation
+        and turning_error_at(result[0]) < _CLEARLY * turning_error_at(0)
+    ):
+        return ""
+    return (
+        f"the clocks seem to differ: --time_offset_s={given_s + result[0] * 1e-9:.4f} would leave an APE of "
+        f"{result[1]:.3g} m"
     )
 
 
@@ -97,6 +189,7 @@ def match(
         return se3.identity(len(times_ns)), np.zeros(len(times_ns), dtype=np.bool_)
     # of several poses at one instant the first
     stamps, first = np.unique(ground_truth.times_ns, return_index=True)
+    stamps = stamps + round(options.time_offset_s * 1e9)
     poses = ground_truth.T_R_B[first]
     nearest = nearest_rows(stamps, times_ns)
     tolerance_ns = round(options.max_time_difference_s * 1e9)

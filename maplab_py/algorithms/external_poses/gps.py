@@ -16,7 +16,11 @@ from maplab_py.algorithms.external_poses.alignment import (
     with_aligned_base_frame,
 )
 from maplab_py.algorithms.external_poses.options import GpsOptions
-from maplab_py.algorithms.external_poses.sensors import content_words, with_sensor
+from maplab_py.algorithms.external_poses.sensors import (
+    UNKNOWN_SIGMA_RAD,
+    content_words,
+    with_sensor,
+)
 from maplab_py.algorithms.external_poses.trajectories import nearest, without_absolute_poses
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
@@ -31,7 +35,6 @@ from maplab_py.vimap.tables import AbsolutePoses
 ORIGIN = "enu_origin"
 """Key of the origin in the sensor's entry of sensors.yaml."""
 _ORIGIN_KEYS = ("latitude_deg", "longitude_deg", "altitude_m")
-_ORIENTATION_SIGMA_RAD = 1e3
 
 Origin = tuple[float, float, float]
 """Latitude, longitude [deg] and ellipsoidal altitude [m] of the origin of G."""
@@ -164,4 +167,4 @@ def _matches(stamps: I64, times: I64, options: GpsOptions, source: str) -> tuple
 
 def _variance(options: GpsOptions) -> F64:
     horizontal, vertical = options.sigma_m, options.sigma_vertical_m or 2.0 * options.sigma_m
-    return np.array([horizontal, horizontal, vertical, *[_ORIENTATION_SIGMA_RAD] * 3]) ** 2
+    return np.array([horizontal, horizontal, vertical, *[UNKNOWN_SIGMA_RAD] * 3]) ** 2

@@ -16,6 +16,9 @@ from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.queries import mission_sensor_id
 
+UNKNOWN_SIGMA_RAD = 1e3
+"""Deviation of orientations that were not measured: they weigh nothing."""
+
 
 def content_words(vi_map: VIMap, mission: int, kind: str, times_ns: I64, values: F64) -> U64:
     """Return an id (2,) that follows from measurements and the mission that gets them."""

@@ -6,6 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.plausibility import motion_hint, orientation_hint
+from maplab_py.algorithms.evaluation.trajectory_evaluation import clock_hint
 from maplab_py.algorithms.external_poses.alignment import (
     Movement,
     check_vertical,
@@ -14,13 +17,14 @@ from maplab_py.algorithms.external_poses.alignment import (
 )
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
 from maplab_py.algorithms.external_poses.sensors import (
+    UNKNOWN_SIGMA_RAD,
     content_words,
     mounting,
     with_sensor,
     without_sensors,
 )
 from maplab_py.array_types import F64, I64, U64, Mask
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
@@ -36,20 +40,12 @@ from maplab_py.vimap.tables import (
 )
 
 _ALONG = "odometry of a trajectory"
+_MOTION_DEG = 20.0
+"""Difference of rotations that is noted; drift stays below."""
 
 
 def shifted(trajectory: Trajectory, time_offset_s: float) -> Trajectory:
-    """Return a trajectory with another clock.
-
-    Raises:
-        MapError: Two poses have the same time.
-    """
-    same = np.flatnonzero(np.diff(trajectory.times_ns) == 0)
-    if len(same):
-        raise MapError(
-            f"{trajectory.source}: two poses have the time stamp {trajectory.times_ns[same[0]]} ns: "
-            "leave one of them"
-        )
+    """Return a trajectory with another clock."""
     return dataclasses.replace(
         trajectory, times_ns=trajectory.times_ns + round(time_offset_s * 1e9)
     )
@@ -68,7 +64,8 @@ def as_absolute_poses(
     Raises:
         UserError: Nothing of the trajectory is at the time of the mission, or the mission has absolute
             poses and `options.replace` is not set.
-        EstimationError: The vertical of the trajectory is not that of the mission.
+        EstimationError: The vertical of the trajectory is not that of the mission, or another order of the
+            quaternions fits clearly better.
     """
     vi_map = without_absolute_poses(vi_map, mission, trajectory.source, replace=options.replace)
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
@@ -78,19 +75,27 @@ def as_absolute_poses(
     chosen[nearest(stamps, trajectory.times_ns)] = True
     chosen &= covered
     if not chosen.any():
-        raise _no_overlap(trajectory, stamps)
+        raise _no_overlap(vi_map, rows, trajectory, options)
+    missing = int(np.count_nonzero(~chosen))
     rows, T_G_S = rows[chosen], T_G_S[chosen]
     T_I_S = mounting(vi_map, mission, options.sensor_id)
     words = content_words(vi_map, mission, "absolute", trajectory.times_ns, trajectory.T_R_B)
     keys = {"topic": "", "description": "trajectory of another program"}
     vi_map = with_sensor(vi_map, mission, MissionSensor.ABSOLUTE_6DOF, words, T_I_S, keys)
     T_M_S = se3.compose(vi_map.vertices.T_M_I[rows], T_I_S)
-    check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
-    movement = Movement(0.0, 0.0)
-    if options.align and len(rows) > 1:
+    movement, T_G_M, sigma = Movement(0.0, 0.0), vi_map.T_G_M[mission], _sigma(options)
+    if len(rows) > 1:
         T_G_M = robust_yaw_position(T_G_S[:, 4:], T_M_S[:, 4:])
+    T_G_S_map = se3.compose(T_G_M, T_M_S)
+    if trajectory.has_orientation:
+        hint = orientation_hint(T_G_S[:, :4], T_G_S_map[:, :4], is_mounted=True)
+        if hint and not clock_note(vi_map, mission, trajectory, options):
+            raise EstimationError(f"{trajectory.source}: {hint}")
+        check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
+    else:  # the estimated orientation, which weighs nothing
+        T_G_S, sigma[3:] = se3.make(T_G_S_map[:, :4], T_G_S[:, 4:]), UNKNOWN_SIGMA_RAD
+    if options.align and len(rows) > 1:
         vi_map, movement = with_aligned_base_frame(vi_map, mission, T_G_M)
-    sigma = _sigma(options)
     added = AbsolutePoses.filled(
         len(rows),
         vertex=rows,
@@ -100,21 +105,23 @@ def as_absolute_poses(
         covariance=np.tile(np.diag(sigma**2), (len(rows), 1, 1)),
     )
     table = AbsolutePoses.concatenate([vi_map.absolute_poses, added])
-    return vi_map.replace(absolute_poses=table), int(np.count_nonzero(~chosen)), movement
+    return vi_map.replace(absolute_poses=table), missing, movement
 
 
 def as_odometry(
     vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
-) -> tuple[VIMap, int]:
+) -> tuple[VIMap, int, list[str]]:
     """Join neighbouring vertices of a mission (row) by the motion of a trajectory.
 
     Returns:
-        The map, and the number of pairs of neighbours that the trajectory does not cover.
+        The map, the number of pairs of neighbours that the trajectory does not cover, and notes.
 
     Raises:
-        UserError: Nothing of the trajectory is at the time of the mission, or the mission has odometry
-            edges and `options.replace` is not set.
+        UserError: Nothing of the trajectory is at the time of the mission, the mission has odometry edges
+            and `options.replace` is not set, or the trajectory has positions only.
+        EstimationError: Another order of the quaternions fits clearly better.
     """
+    _check_orientation(trajectory)
     kind = TransformationKind.ODOMETRY
     vi_map = without_edges(vi_map, mission, kind, trajectory.source, replace=options.replace)
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
@@ -122,14 +129,24 @@ def as_odometry(
     T_R_S, covered = _at(trajectory, stamps, options)
     first = np.flatnonzero(covered[:-1] & covered[1:])
     if not len(first):
-        raise _no_overlap(trajectory, stamps)
+        raise _no_overlap(vi_map, rows, trajectory, options)
     words = content_words(vi_map, mission, "odometry", trajectory.times_ns, trajectory.T_R_B)
     T_I_S = mounting(vi_map, mission, options.sensor_id)
+    q_M_S = se3.compose(vi_map.vertices.T_M_I[rows[covered]], T_I_S)[:, :4]
+    apart_deg, hint = motion_hint(T_R_S[covered, :4], q_M_S)
+    if hint and not clock_note(vi_map, mission, trajectory, options):
+        raise EstimationError(f"{trajectory.source}: {hint}")
+    notes = []
+    if apart_deg > _MOTION_DEG:
+        notes.append(
+            f"its rotations differ from those of the mission by {apart_deg:.0f} deg (median over a quarter "
+            "of the path): name the sensor with --sensor_id"
+        )
     keys = {"topic": "", "description": "trajectory of another program"}
     vi_map = with_sensor(vi_map, mission, MissionSensor.ODOMETRY_6DOF, words, T_I_S, keys)
     edges = _edges(rows[first], stamps, first, T_R_S, words, options)
     table = TransformationEdges.concatenate([vi_map.transformation_edges, edges])
-    return vi_map.replace(transformation_edges=table), len(rows) - 1 - len(first)
+    return vi_map.replace(transformation_edges=table), len(rows) - 1 - len(first), notes
 
 
 def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
@@ -138,8 +155,9 @@ def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
     The frame of the trajectory becomes the mission's; velocities are those of the file, or of the motion.
 
     Raises:
-        UserError: There are fewer than two poses.
+        UserError: There are fewer than two poses, or positions only.
     """
+    _check_orientation(trajectory)
     count = len(trajectory)
     if count < 2:
         raise UserError(f"{trajectory.source}: a mission needs two poses, and there is {count}")
@@ -173,6 +191,16 @@ def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
     first = np.arange(count - 1)
     edges = _edges(first, times, first, trajectory.T_R_B, words, options)
     return vi_map.replace(transformation_edges=edges)
+
+
+def clock_note(
+    vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
+) -> str:
+    """Return a clause on the offset that makes a shifted trajectory fit a mission (row) much better."""
+    rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
+    as_read = shifted(trajectory, -options.time_offset_s)
+    evaluation = TrajectoryEvaluationOptions(time_offset_s=options.time_offset_s)
+    return clock_hint(vi_map, rows, as_read, evaluation)
 
 
 def nearest(stamps: I64, times: I64) -> I64:
@@ -296,12 +324,25 @@ def _without_unused(vi_map: VIMap, mission: int, removed: U64, measured: U64) ->
     return without_sensors(vi_map, np.array(unused, dtype=np.uint64).reshape(-1, 2))
 
 
-def _no_overlap(trajectory: Trajectory, stamps: I64) -> UserError:
+def _check_orientation(trajectory: Trajectory) -> None:
+    if not trajectory.has_orientation:
+        raise UserError(f"{trajectory.source}: has positions only: --as=absolute uses them")
+
+
+def _no_overlap(
+    vi_map: VIMap, rows: I64, trajectory: Trajectory, options: TrajectoryOptions
+) -> UserError:
+    stamps = vi_map.vertices.timestamp_ns[rows]
     spans = [
         f"{times[0] * 1e-9:.3f} to {times[-1] * 1e-9:.3f} s" if len(times) else "nothing"
         for times in (trajectory.times_ns, stamps)
     ]
+    hint = (
+        clock_note(vi_map, int(vi_map.vertices.mission[rows[0]]), trajectory, options)
+        if len(rows)
+        else ""
+    )
+    remedy = hint or "give --time_offset_s, or a larger --max_gap_s"
     return UserError(
-        f"{trajectory.source}: has poses from {spans[0]}, the mission vertices from {spans[1]}: give "
-        "--time_offset_s, or a larger --max_gap_s"
+        f"{trajectory.source}: has poses from {spans[0]}, the mission vertices from {spans[1]}: {remedy}"
     )

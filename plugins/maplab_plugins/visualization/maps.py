@@ -64,7 +64,7 @@ def visualize(
     if ground_truth is not None:
         from maplab_py.interop.trajectories import read_trajectory
 
-        subject = subject.replace(truth=read_trajectory(ground_truth))
+        subject = subject.replace(truth=read_trajectory(ground_truth, needs_orientation=False))
     if informative_segments is not None:
         from maplab_py.viewer.segment_file import read_segments
 

@@ -20,7 +20,9 @@ FILES = {
 
 
 def matched(name: str) -> tuple[np.ndarray, np.ndarray]:
-    truth, estimate = (read_trajectory(shared_data(f"trajectories/{f}")) for f in FILES[name])
+    truth, estimate = (
+        read_trajectory(shared_data(f"trajectories/{f}"), keep_repeated=True) for f in FILES[name]
+    )
     i, j = associate(truth.times_ns, estimate.times_ns, 10_000_000, one_to_one=False)
     return truth.T_R_B[i], estimate.T_R_B[j]
 
