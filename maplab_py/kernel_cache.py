@@ -19,6 +19,9 @@ from pathlib import Path
 from maplab_py.errors import UserError
 
 VARIABLE = "MAPLAB_CACHE_DIR"
+PACKAGED = Path(__file__).resolve().parent / "_kernels"
+"""Kernels that the wheel brings; trusted as the package is, and never written at run time."""
+
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _logger = logging.getLogger(__name__)
 
@@ -99,7 +102,7 @@ def _temporary(folder: Path, error: OSError) -> Path:
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     copy = root / folder.name
     try:
-        shutil.copytree(folder, copy)  # times of change are kept: numba compares them
+        shutil.copytree(folder, copy)
     except (OSError, shutil.Error):
         shutil.rmtree(copy, ignore_errors=True)
         copy.mkdir()

@@ -37,7 +37,7 @@ HEAVY = (
 
 HOMES = {
     "casadi": ("estimation",),
-    "numba": ("compilation.py", "estimation"),
+    "numba": ("compilation.py",),
     "pycolmap": ("interop",),
     "viser": ("viewer",),
     "prompt_toolkit": ("console",),

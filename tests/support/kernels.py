@@ -7,7 +7,8 @@ import time
 
 from maplab_py.algorithms.warmup import compile_kernels
 from maplab_py.compilation import is_missing_on_disk
-from maplab_py.estimation.codegen.modules import cache_folder
+from maplab_py.estimation.codegen.kernels import visual_module_name
+from maplab_py.estimation.codegen.modules import is_generated
 from maplab_py.estimation.terms import visual
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Projection
@@ -22,8 +23,7 @@ TWO_MODELS = ((Projection.PINHOLE, Distortion.FOV), (Projection.PINHOLE, Distort
 def compiled_ahead() -> str:
     """Compile the kernels if some are missing on the disk; say how long it took, else nothing."""
     written_by_hand = (search_poses, search_cells)
-    generated = [file.name for file in (cache_folder() / "__pycache__").glob("*.nbi")]
-    has_rig = any("visual_pinhole_fov__pinhole_none" in name for name in generated)
+    has_rig = is_generated(visual_module_name(TWO_MODELS))
     if has_rig and not any(is_missing_on_disk(kernel) for kernel in written_by_hand):
         return ""
     began = time.perf_counter()

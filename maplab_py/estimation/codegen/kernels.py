@@ -20,7 +20,7 @@ CameraModel = tuple[Projection, Distortion]
 
 _HEADER = (
     '"""Generated; do not edit."""\n\n'
-    "import math\n\nimport numpy as np\nfrom numba import njit, prange\n\n"
+    "import math\n\nimport numpy as np\nfrom maplab_py.compilation import njit, prange\n\n"
     "from maplab_py.estimation.kernels.loss import rho_and_weight\n\n"
 )
 _FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)\n'

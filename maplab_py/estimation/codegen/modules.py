@@ -1,9 +1,9 @@
 """Generated modules: written once, cached on disk, imported like any other module.
 
 A module's folder is named by a hash over everything that could change what is in it: the sources of
-residuals, templates, generator and losses, and the versions of casadi, numba, numpy and Python.
-numba keeps its compiled code beside the module. So an edit anywhere gives a new folder, and a warm
-start imports neither casadi nor the compiler's front end.
+residuals, templates, generator and losses, and casadi's version. So an edit anywhere gives a new
+folder, and a warm start does not import casadi. The modules that a wheel brings are used with every
+version of casadi.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def cache_folder() -> Path:
     Raises:
         UserError: Somebody else owns the folder or may write to it.
     """
-    return kernel_cache.cache_folder(f"kernels-{_source_hash()}")
+    return kernel_cache.cache_folder(f"kernels-{source_hash()}-casadi-{version('casadi')}")
 
 
 def generated_module(
@@ -58,7 +58,7 @@ def generated_module(
     qualified = f"{_PREFIX}{name}"
     if qualified in sys.modules:
         return sys.modules[qualified]
-    path = cache_folder() / f"{qualified}.py"
+    path = _path(name)
     if not path.exists():
         progress.line(f"compiling kernels '{name}' (once per machine) ...")
         write_file(path, [make_source().encode()], durable=False)
@@ -73,7 +73,12 @@ def generated_module(
 
 def is_generated(name: str) -> bool:
     """Tell whether the cache has the source of a module; its functions may still be uncompiled."""
-    return (cache_folder() / f"{_PREFIX}{name}.py").exists()
+    return _path(name).exists()
+
+
+def _path(name: str) -> Path:
+    packaged = kernel_cache.PACKAGED / f"kernels-{source_hash()}" / f"{_PREFIX}{name}.py"
+    return packaged if packaged.exists() else cache_folder() / packaged.name
 
 
 def template_source(name: str) -> str:
@@ -82,12 +87,11 @@ def template_source(name: str) -> str:
     return text.split("# --- kernels ---\n", 1)[1]
 
 
-def _source_hash() -> str:
+@cache
+def source_hash() -> str:
+    """Return a hash of everything in this package that decides what is in a generated module."""
     digest = hashlib.sha256()
     for file in _SOURCES:
         digest.update(file.name.encode())
         digest.update(file.read_bytes())
-    for package in ("casadi", "numba", "numpy"):
-        digest.update(f"{package} {version(package)}".encode())
-    digest.update(sys.version.encode())
     return digest.hexdigest()[:16]

@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.compilation import compiled
+from maplab_py.compilation import compiled, prange
 
 
 class EdgeSamples(NamedTuple):
@@ -374,7 +373,7 @@ def preintegrate(data: EdgeSamples, R_A_I: F64, noise: F64, result: EdgeMotion) 
         noise: Squared densities (K, 2) of gyroscope and accelerometer.
         result: Filled in.
     """
-    for edge in numba.prange(len(data.start) - 1):
+    for edge in prange(len(data.start) - 1):
         imu = data.imu_of_edge[edge]
         _preintegrate_edge(
             _edge(data, edge),
@@ -399,7 +398,7 @@ def propagate(data: EdgeSamples, gravity: F64, rotation: F64, velocity: F64, pos
         velocity: (N, 3), likewise.
         position: (N, 3), likewise.
     """
-    for edge in numba.prange(len(data.start) - 1):
+    for edge in prange(len(data.start) - 1):
         first, end = data.start[edge], data.start[edge + 1]
         _propagate_edge(
             _edge(data, edge),

@@ -10,8 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import llvmlite.binding as llvm
-from numba import types
-from numba.extending import get_cython_function_address
+
+from maplab_py.compilation import numba
+
+types = numba.types
 
 _CHAR = types.CPointer(types.int8)
 _INT = types.CPointer(types.int32)
@@ -20,7 +22,9 @@ _REAL = types.CPointer(types.float64)
 
 def _routine(module: str, name: str, *arguments: Any) -> Any:
     symbol = "maplab_py_" + name
-    llvm.add_symbol(symbol, get_cython_function_address("scipy.linalg." + module, name))
+    llvm.add_symbol(
+        symbol, numba.extending.get_cython_function_address("scipy.linalg." + module, name)
+    )
     return types.ExternalFunction(symbol, types.void(*arguments))
 
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
-import numba
+from maplab_py.compilation import numba
 
 
 @cache

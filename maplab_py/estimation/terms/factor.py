@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import numba
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.compilation import compiled
+from maplab_py.compilation import compiled, prange
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.states import States
@@ -93,7 +92,7 @@ def normal_equations(
         gradient: Result (N, n, 3).
         diagonal: Result (N, n, 3).
     """
-    for factor in numba.prange(len(residual)):
+    for factor in prange(len(residual)):
         pair = 0
         for b in range(nodes.shape[1]):
             for i in range(3):
