@@ -27,7 +27,18 @@ from maplab_py.interop.calibrations.kalibr import (
     read_camera_chain,
     read_kalibr_imu,
 )
-from maplab_py.interop.calibrations.parts import Parts, read_entry, read_json_entry
+from maplab_py.interop.calibrations.okvis import is_okvis, is_svo, read_okvis, read_svo
+from maplab_py.interop.calibrations.orb_slam import is_orb_slam, read_orb_slam
+from maplab_py.interop.calibrations.parts import Parts, read_entry, read_json_entry, with_imu
+from maplab_py.interop.calibrations.realsense import is_realsense, read_realsense
+from maplab_py.interop.calibrations.single_cameras import (
+    is_camera_info,
+    is_dso_camera,
+    read_camera_info,
+    read_dm_vio,
+    read_dso_camera,
+)
+from maplab_py.interop.calibrations.vins import is_vins, read_vins
 from maplab_py.interop.colmap.calibration import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.sensors import CameraRig, Extrinsics, Imu, SensorSet
@@ -37,7 +48,8 @@ from maplab_py.sensors.yaml_entry import Entry
 
 ANY_DEVICE = DeviceOptions()
 KNOWN_FORMATS = (
-    "files of kalibr, EuRoC, OpenVINS, Basalt, COLMAP and maplab are read (docs/other_programs.md)"
+    "files of kalibr, EuRoC, OpenVINS, Basalt, COLMAP, maplab, VINS, ORB-SLAM, stella_vslam, Kimera, OKVIS, "
+    "SVO, DM-VIO, ROS and RealSense are read (docs/other_programs.md)"
 )
 _OPENVINS = "estimator_config.yaml"
 _SAME_POSE = 1e-9
@@ -150,8 +162,7 @@ def _joined(cameras: Parts, imu: Parts, imu_file: Path) -> Parts:
         )
     if cameras.why_not_on_imu:
         raise MapError(cameras.why_not_on_imu)
-    notes = [*cameras.notes, *imu.notes]
-    return dataclasses.replace(cameras, imu=imu.imu, T_B_I=imu.T_B_I, notes=notes)
+    return with_imu(cameras, imu)
 
 
 def _imu_notes(path: Path, imu: Imu) -> list[str]:
@@ -281,17 +292,35 @@ def _read(path: Path) -> Parts | SensorSet:
         return Parts("COLMAP", cameras, T_B_C, why_not_on_imu=why)
     if path.is_dir():
         return _read_folder(path)
+    if is_dso_camera(path):
+        return read_dso_camera(path)
     if path.suffix.lower() == ".json":
-        return read_basalt(read_json_entry(path))
+        return _read_json(path)
     entry = read_entry(path)
     if "relative_config_imucam" in entry:
         return _read_openvins(entry, path.parent)
+    if is_camera_chain(entry) and "cam0" in entry and "intrinsics" not in entry.child("cam0"):
+        return read_dm_vio(entry, path)
+    if is_vins(entry):
+        return read_vins(entry, path.parent)
     for is_format, read in _FORMATS:
         if is_format(entry):
             return read(entry)
     if _is_maplab(entry):
         return read_sensors(path)
     raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
+
+
+def _read_json(path: Path) -> Parts:
+    entry = read_json_entry(path)
+    if "value0" in entry or "T_imu_cam" in entry:
+        return read_basalt(entry)
+    if is_realsense(entry):
+        return read_realsense(entry)
+    for key, program in _REFUSED_JSON.items():
+        if key in entry:
+            raise UserError(f"{path}: calibrations of {program} are not read: {KNOWN_FORMATS}")
+    return read_basalt(entry)
 
 
 def _read_folder(path: Path) -> Parts:
@@ -318,10 +347,18 @@ def _has_imu_noise(entry: Entry) -> bool:
     return "accelerometer_noise_density" in entry or "gyroscope_noise_density" in entry
 
 
+_REFUSED_JSON = {
+    "CalibrationInformation": "Windows Mixed Reality",
+    "CameraCalibrations": "Project Aria",
+}
 _FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] = (
     (is_camera_chain, read_camera_chain),
     (lambda entry: _has_imu_noise(entry) and "T_BS" in entry, read_imu_file),
     (lambda entry: _has_imu_noise(entry) or "imu0" in entry, read_kalibr_imu),
     (lambda entry: "T_BS" in entry, read_camera_file),
+    (is_orb_slam, read_orb_slam),
+    (is_okvis, read_okvis),
+    (is_svo, read_svo),
+    (is_camera_info, read_camera_info),
 )
 """How a file is recognised, and its reader."""

@@ -20,9 +20,14 @@ _SIMILAR = 0.8
 
 def similar_key(key: str, names: Iterable[Any]) -> str:
     """Return the name that a misspelt key probably stands for, "" if none is similar."""
-    known = {str(name).lower(): str(name) for name in sorted(map(str, names))}
-    matches = difflib.get_close_matches(key.lower(), known, n=1, cutoff=_SIMILAR)
+    known = {_letters(name): str(name) for name in sorted(map(str, names))}
+    matches = difflib.get_close_matches(_letters(key), known, n=1, cutoff=_SIMILAR)
     return known[matches[0]] if matches else ""
+
+
+def _letters(key: Any) -> str:
+    """Return a key without the signs and cases in which programs differ."""
+    return "".join(character for character in str(key).lower() if character.isalnum())
 
 
 class Entry:

@@ -18,7 +18,7 @@ from maplab_py.interop.calibrations.models import (
     read_imu_noise,
     read_time_shift_ns,
 )
-from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry
+from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry, with_imu
 from maplab_py.sensors.yaml_entry import Entry
 
 HOW_TO_CALIBRATE = "give --sensor_calibration_file=FILE (docs/recordings.md lists the formats)"
@@ -61,8 +61,10 @@ def read_imu_file(entry: Entry) -> Parts:
     if "n_gravity" in entry:
         gravity = float(np.linalg.norm(entry.vector("n_gravity", 3)))
         imu = dataclasses.replace(imu, gravity_magnitude_mps2=gravity or imu.gravity_magnitude_mps2)
+    shift_ns = read_time_shift_ns(entry, "imu_time_shift")
     notes = note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION, settings=is_kimera)
-    return Parts("Kimera" if is_kimera else "EuRoC", imu=imu, T_B_I=T_B_I, notes=notes)
+    form = "Kimera" if is_kimera else "EuRoC"
+    return Parts(form, imu=imu, T_B_I=T_B_I, time_shift_ns=shift_ns, notes=notes)
 
 
 def read_kimera_folder(folder: Path) -> Parts:
@@ -72,30 +74,16 @@ def read_kimera_folder(folder: Path) -> Parts:
         MapError: A file cannot be read, a key is missing or wrong, or a model is not supported.
     """
     files = [folder / name for name in _KIMERA_CAMERAS if (folder / name).is_file()]
-    parts = [read_camera_file(read_entry(path)) for path in files]
-    imu = None
-    if (folder / _KIMERA_IMU).is_file():
-        entry = read_entry(folder / _KIMERA_IMU)
-        shift_ns = read_time_shift_ns(entry, "imu_time_shift")
-        imu = read_imu_file(entry)
-        parts = [_shifted(part, shift_ns) for part in parts]
-    return dataclasses.replace(_joined(parts, imu), format="Kimera")
+    cameras = _joined([read_camera_file(read_entry(path)) for path in files])
+    path = folder / _KIMERA_IMU
+    joined = with_imu(cameras, read_imu_file(read_entry(path))) if path.is_file() else cameras
+    return dataclasses.replace(joined, format="Kimera")
 
 
-def _shifted(part: Parts, shift_ns: int) -> Parts:
-    cameras = [
-        dataclasses.replace(camera, time_offset_ns=camera.time_offset_ns + shift_ns)
-        for camera in part.cameras
-    ]
-    return dataclasses.replace(part, cameras=cameras)
-
-
-def _joined(cameras: list[Parts], imu: Parts | None) -> Parts:
+def _joined(cameras: list[Parts]) -> Parts:
     every = [camera for part in cameras for camera in part.cameras]
-    T_B_C = np.concatenate([part.T_B_C for part in cameras])
-    notes = [note for part in [*cameras, *([imu] if imu else [])] for note in part.notes]
-    joined = Parts("EuRoC", every, T_B_C, notes=notes)
-    return joined if imu is None else dataclasses.replace(joined, imu=imu.imu, T_B_I=imu.T_B_I)
+    notes = [note for part in cameras for note in part.notes]
+    return Parts("EuRoC", every, np.concatenate([part.T_B_C for part in cameras]), notes=notes)
 
 
 def read_folder(folder: Path) -> Parts:
@@ -118,9 +106,7 @@ def read_folder(folder: Path) -> Parts:
         return cameras
     if cameras.why_not_on_imu:
         raise MapError(cameras.why_not_on_imu)
-    imu = read_kalibr_imu(read_entry(imu_file))
-    notes = [*cameras.notes, *imu.notes]
-    return dataclasses.replace(cameras, imu=imu.imu, T_B_I=imu.T_B_I, notes=notes)
+    return with_imu(cameras, read_kalibr_imu(read_entry(imu_file)))
 
 
 def _read_sensor_files(folder: Path) -> Parts:
@@ -130,9 +116,9 @@ def _read_sensor_files(folder: Path) -> Parts:
         path = folder / f"cam{len(cameras)}" / "sensor.yaml"
         cameras.append(read_camera_file(read_entry(path)))
     if not (folder / "imu0").is_dir():
-        return _joined(cameras, None)
+        return _joined(cameras)
     if not (folder / "imu0" / "sensor.yaml").exists():
         raise MapError(
             f"{folder}: there is no calibration of the IMU (imu0/sensor.yaml): {HOW_TO_CALIBRATE}"
         )
-    return _joined(cameras, read_imu_file(read_entry(folder / "imu0" / "sensor.yaml")))
+    return with_imu(_joined(cameras), read_imu_file(read_entry(folder / "imu0" / "sensor.yaml")))

@@ -22,6 +22,8 @@ from maplab_py.sensors.yaml_text import parse_yaml
 _MAX_BYTES = 16_000_000
 _OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.\d.*\n?")
 _OPENCV_TAG = re.compile(r"!!opencv-(?:matrix|nd-matrix)\b|!<tag:yaml\.org,2002:opencv-matrix>")
+_DOCUMENT_END = re.compile(r"^(?:---|\.\.\.)[ \t]*$", re.MULTILINE)
+_CONTENT = re.compile(r"^[ \t]*[^#\s]", re.MULTILINE)
 _LARGEST_DIFFERENCE_M = 1e-4
 _LARGEST_DIFFERENCE_DEG = 0.01
 """Poses that a program prints twice agree to its rounding."""
@@ -36,6 +38,7 @@ class Parts:
     T_B_C: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))
     imu: Imu | None = None
     T_B_I: F64 = dataclasses.field(default_factory=se3.identity)
+    time_shift_ns: int = 0  # of the file of an IMU: t_imu = t_camera + shift
     why_not_on_imu: str = ""  # where B is not fixed to an IMU: key and remedy
     notes: Sequence[str] = ()
 
@@ -61,6 +64,8 @@ def read_entry(path: Path) -> Entry:
         MapError: It cannot be read or is no such file.
     """
     text = _OPENCV_TAG.sub("", _OPENCV_HEAD.sub("", read_calibration_text(path)))
+    documents = [part for part in _DOCUMENT_END.split(text) if part.strip()]
+    text = next((part for part in documents if _CONTENT.search(part)), "")  # messages repeat
     return Entry(parse_yaml(text, str(path), _MAX_BYTES * 10), str(path))
 
 
@@ -115,3 +120,13 @@ def note_unknown_keys(
         f" and {len(unknown) - 12} more" if len(unknown) > 12 else ""
     )
     return [f"{entry.where}: keys that are not understood: {shown}"]
+
+
+def with_imu(cameras: Parts, imu: Parts) -> Parts:
+    """Return cameras with the IMU of another file."""
+    shifted = [
+        dataclasses.replace(camera, time_offset_ns=camera.time_offset_ns + imu.time_shift_ns)
+        for camera in cameras.cameras
+    ]
+    notes = [*cameras.notes, *imu.notes]
+    return dataclasses.replace(cameras, cameras=shifted, imu=imu.imu, T_B_I=imu.T_B_I, notes=notes)
