@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.array_types import F64
+from maplab_py.geometry import symmetric
 
 _MIN_RELATIVE_EIGENVALUE = 1e-12
 """Two rays 2e-6 rad apart have this ratio of the smallest eigenvalue to the number of rays."""
@@ -37,17 +38,17 @@ def triangulate(
     o, d = np.asarray(origins, dtype=np.float64), np.asarray(directions, dtype=np.float64)
     start = np.asarray(start, dtype=np.int64)
     counts = np.diff(start)
-    d = d / np.linalg.norm(d, axis=1, keepdims=True)
+    d = _unit(d)
     centre = _sum_groups(o, start) / np.maximum(counts, 1)[:, None]
     relative = o - np.repeat(centre, counts, axis=0)
     # sum (I - d d^T) p = sum (I - d d^T) o, about the mean origin so that nothing cancels
     outer = _sum_groups((d[:, :, None] * d[:, None, :]).reshape(-1, 9), start).reshape(-1, 3, 3)
     A = counts[:, None, None] * np.eye(3) - outer
     b = _sum_groups(relative - d * np.sum(d * relative, axis=1, keepdims=True), start)
-    smallest = np.linalg.eigvalsh(A)[:, 0] if len(A) else np.zeros(0)
-    ok = (counts >= 2) & (smallest > _MIN_RELATIVE_EIGENVALUE * counts)
-    A = np.where(ok[:, None, None], A, np.eye(3))
-    points = np.linalg.solve(A, b[:, :, None])[:, :, 0] + centre
+    value, axis = symmetric.eigen(A)
+    ok = (counts >= 2) & (value[:, 0] > _MIN_RELATIVE_EIGENVALUE * counts)
+    along = np.einsum("lji,lj->li", axis, b) / np.where(ok[:, None], value, 1.0)
+    points = np.einsum("lij,lj->li", axis, along) + centre
     ok &= np.all(np.isfinite(points), axis=1)
     points[~ok] = 0.0
     return points, ok, largest_ray_angle(d, start)
@@ -65,7 +66,7 @@ def largest_ray_angle(directions: ArrayLike, start: ArrayLike) -> F64:
     """
     d = np.asarray(directions, dtype=np.float64)
     start = np.asarray(start, dtype=np.int64)
-    d = d / np.linalg.norm(d, axis=1, keepdims=True)
+    d = _unit(d)
     counts = np.diff(start)
     angles = np.zeros(len(counts))
     if len(counts) == 0:
@@ -81,6 +82,12 @@ def largest_ray_angle(directions: ArrayLike, start: ArrayLike) -> F64:
             rays = d[start[part][:, None] + np.arange(size)]
             angles[part] = _widest_pair(rays)
     return angles
+
+
+def _unit(directions: F64) -> F64:
+    """Return directions (O, 3) of length one; those of 1e160 m too, whose squares overflow."""
+    scaled = directions / np.abs(directions).max(axis=1, keepdims=True, initial=0.0)
+    return np.asarray(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
 
 
 def _widest_pair(rays: F64) -> F64:

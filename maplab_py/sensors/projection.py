@@ -49,7 +49,8 @@ def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F6
     x = np.where(visible[..., None], x, 0.0)
     x_d, dx_d_dx, dx_d_dk = distortion.distort(camera.distortion, camera.distortion_parameters, x)
 
-    slope, dD_dmirror = _denominator_slopes(camera.projection, mirror, p)
+    near = np.where(visible[..., None], p, [0.0, 0.0, 1.0])
+    slope, dD_dmirror = _denominator_slopes(camera.projection, mirror, near)
     dx_dp = (np.eye(2, 3) - x[..., :, None] * slope[..., None, :]) / denominator[..., None, None]
     duv_dx = focal[:, None] * dx_d_dx
     columns = [focal[:, None] * dx_d_dk]
@@ -106,13 +107,14 @@ def _intrinsics(camera: Camera) -> tuple[tuple[float, ...], F64, F64]:
 
 def _normalise(camera: Camera, p: F64) -> tuple[F64, F64, Mask]:
     """Return x (..., 2), D(p) (...,), 1 where it is not positive, and which points are visible."""
-    length = np.linalg.norm(p, axis=-1)
-    denominator = _denominator(camera.projection, _intrinsics(camera)[0], p, length)
-    visible = (denominator > _MIN_DENOMINATOR) & (p[..., 2] > -_cone(camera) * length)
-    denominator = np.where(visible, denominator, 1.0)
-    x = p[..., :2] / denominator[..., None]
     limit = distortion.largest_radius(camera.distortion, camera.distortion_parameters)
-    return x, denominator, visible & (np.linalg.norm(x, axis=-1) < limit)
+    with np.errstate(over="ignore", invalid="ignore"):  # no camera sees points beyond 1e154 m
+        length = np.linalg.norm(p, axis=-1)
+        denominator = _denominator(camera.projection, _intrinsics(camera)[0], p, length)
+        visible = (denominator > _MIN_DENOMINATOR) & (p[..., 2] > -_cone(camera) * length)
+        denominator = np.where(visible, denominator, 1.0)
+        x = p[..., :2] / denominator[..., None]
+        return x, denominator, visible & (np.linalg.norm(x, axis=-1) < limit)
 
 
 def _denominator(projection: Projection, mirror: tuple[float, ...], p: F64, length: F64) -> F64:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 
 HYPOTHESES = ("gravity", "three_point")
 """Minimal solvers and their sample sizes."""
@@ -185,10 +185,9 @@ def _covariances(H: F64, q_W_I: F64) -> F64:
     H = 0.5 * (H + np.swapaxes(H, 1, 2))
     scale = np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
     scaled = H / (scale[:, :, None] * scale[:, None, :])
-    determined = np.all(np.isfinite(scaled), axis=(1, 2))
-    determined &= np.linalg.eigvalsh(np.where(determined[:, None, None], scaled, 0.0))[:, 0] > 1e-10
+    determined = symmetric.eigen(scaled)[0][:, 0] > 1e-10  # false where an entry is no number
     scaled = np.where(determined[:, None, None], scaled, np.eye(6))
-    covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    covariance = symmetric.inverse(scaled) / (scale[:, :, None] * scale[:, None, :])
     turn = np.zeros_like(H)
     turn[:, :3, :3] = np.eye(3)
     turn[:, 3:, 3:] = so3.to_matrix(so3.inverse(q_W_I))

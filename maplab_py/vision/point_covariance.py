@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled
+from maplab_py.geometry import symmetric
 
 _FARTHEST_M = 100.0
 """Standard deviation of an unknown point."""
@@ -54,7 +55,7 @@ def covariance_by_rays(
     """
     information = np.tile(np.eye(3) / _FARTHEST_M**2, (points, 1, 1))
     _add_rays(to_point, sigma_rad, seen, owner, information)
-    return np.asarray(np.linalg.inv(information))
+    return symmetric.inverse(information, 1.0 / _FARTHEST_M**2)
 
 
 @compiled()
@@ -63,7 +64,7 @@ def _add_rays(to_point, sigma_rad, seen, owner, information):  # type: ignore[no
     for ray in range(len(owner)):
         x = to_point[ray]
         square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
-        if not seen[ray] or square == 0.0:
+        if not seen[ray] or not 0.0 < square < np.inf:  # at the camera, at infinity, or no number
             continue
         weight = 1.0 / (sigma_rad[ray] * sigma_rad[ray] * max(square, _NEAREST_M * _NEAREST_M))
         for i in range(3):

@@ -21,11 +21,14 @@ UNKNOWN_SIGMA_RAD = 1e3
 
 
 def content_words(vi_map: VIMap, mission: int, kind: str, times_ns: I64, values: F64) -> U64:
-    """Return an id (2,) that follows from measurements and the mission that gets them."""
+    """Return an id (2,) that follows from measurements and the mission that gets them.
+
+    Six decimals of the values count: their last digits differ between processors.
+    """
     content = hashlib.blake2b(kind.encode(), digest_size=16)
     content.update(vi_map.missions.id[mission].tobytes())
     content.update(np.ascontiguousarray(times_ns).tobytes())
-    content.update(np.ascontiguousarray(values).tobytes())
+    content.update(np.ascontiguousarray(values.round(6) + 0.0).tobytes())  # + 0: no negative zero
     rng = np.random.default_rng(int.from_bytes(content.digest(), "little"))
     return np.asarray(random_ids(1, rng)[0], dtype=np.uint64)
 

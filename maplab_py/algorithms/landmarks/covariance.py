@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.array_types import F64, I64
-from maplab_py.geometry import se3
+from maplab_py.geometry import se3, symmetric
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.point_covariance import covariance_by_rays
@@ -37,4 +37,4 @@ def largest_sigma(covariance: F64) -> F64:
     """Return the standard deviation (N,) along the worst axis of covariances (N, 3, 3)."""
     if not len(covariance):
         return np.zeros(0)
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0)))
+    return np.asarray(np.sqrt(np.maximum(symmetric.eigen(covariance)[0][:, -1], 0.0)))

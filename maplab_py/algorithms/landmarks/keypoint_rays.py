@@ -18,6 +18,7 @@ from maplab_py.vimap.ids import to_hex
 _TILE_PX = 4.0
 _TILES = 1 << 20  # larger than the height of an image
 _TILES_PER_KEYPOINT = 4
+_FARTHEST_PX = 1e6  # no image is larger: tiles keep within `_TILES`
 """With more keypoints all tiles of an image are computed, and kept for the next time."""
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 _SENSORS = [MissionSensor.IMU, MissionSensor.NCAMERA]
@@ -51,7 +52,8 @@ def bearings(camera: Camera, uv: F64) -> tuple[F64, F64, Mask]:
 
     The angle hardly changes from pixel to pixel: it is that of the middle of a small tile.
     """
-    tile = np.floor(np.nan_to_num(uv) / _TILE_PX).astype(np.int64)
+    near = np.clip(np.nan_to_num(uv), -_FARTHEST_PX, _FARTHEST_PX)
+    tile = np.floor(near / _TILE_PX).astype(np.int64)
     shape = (np.array([camera.width_px, camera.height_px]) / _TILE_PX).astype(np.int64) + 1
     rays, is_ray = back_project(camera, uv)
     if _TILES_PER_KEYPOINT * len(uv) >= shape.prod() and ((tile >= 0) & (tile < shape)).all():

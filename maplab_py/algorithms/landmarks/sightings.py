@@ -104,7 +104,8 @@ def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
         error = np.linalg.norm(uv - table.uv_px[camera_keypoints], axis=1)
         error_px[rows] = np.where(visible, error, np.inf)
         in_front = p_C[:, 2] > 0.0 if camera.projection is Projection.PINHOLE else visible
-        distance[rows] = np.where(in_front, 1.0, -1.0) * np.linalg.norm(p_C, axis=1)
+        with np.errstate(over="ignore"):  # infinite beyond 1e154 m
+            distance[rows] = np.where(in_front, 1.0, -1.0) * np.linalg.norm(p_C, axis=1)
         points = rows[lidar[rows]]
         if len(points):
             measured = table.position_3d[keypoints[points]]

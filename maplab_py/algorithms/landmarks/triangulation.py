@@ -48,7 +48,8 @@ def retriangulate(
     p_G, determined, in_front = triangulate_keypoints(vi_map, keypoints, start)
     placed = determined & in_front
     enough = np.diff(start) >= 2
-    shift = np.linalg.norm(p_G[placed] - vi_map.p_G[rows[placed]], axis=1)
+    with np.errstate(over="ignore"):  # from beyond 1e154 m
+        shift = np.linalg.norm(p_G[placed] - vi_map.p_G[rows[placed]], axis=1)
     progress.check()
     moved = with_p_G(vi_map, rows[placed], p_G[placed])
     judged, quality = evaluate_quality(moved, options, missions=missions, progress=progress)

@@ -38,7 +38,7 @@ from maplab_py.algorithms.loop_closure.repeated_places import with_places_that_l
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.stretches import trajectory_stretches
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.geometry import se3
+from maplab_py.geometry import se3, symmetric
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.absolute_pose import PoseSolutions
@@ -161,7 +161,7 @@ def _rotation_sigma_deg(covariance: F64) -> F64:
     """Return the deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta]."""
     known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
     sigma_rad = np.full(len(covariance), np.nan)
-    largest = np.linalg.eigvalsh(covariance[known, 3:, 3:])[:, -1]
+    largest = symmetric.eigen(covariance[known, 3:, 3:])[0][:, -1]
     sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
     return np.asarray(np.degrees(sigma_rad))
 

@@ -23,7 +23,7 @@ from maplab_py.algorithms.loop_closure.features import (
 )
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import differences
@@ -231,7 +231,7 @@ def _squared_sigmas(offset: F64, ray: F64, covariance: F64, sigma_m: F64) -> F64
     error = np.einsum("nij,nj->ni", across, offset)
     S = across @ covariance @ across.transpose(0, 2, 1)
     S += np.square(sigma_m)[:, None, None] * np.eye(2)
-    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(S, error[:, :, None])[:, :, 0]))
+    return np.asarray(np.einsum("ni,nij,nj->n", error, symmetric.inverse(S), error))
 
 
 def _observations(vi_map: VIMap) -> Any:

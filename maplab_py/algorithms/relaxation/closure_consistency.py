@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, Mask
+from maplab_py.geometry import symmetric
 
 _SMALLEST_FACTOR, _LARGEST_FACTOR = 1e-6, 4.0
 _MEDIAN = 5.348  # of chi-squared with six degrees of freedom
@@ -55,7 +56,7 @@ def independent_errors(error: F64, uncertainty: F64, counts: Mask) -> F64:
     """
     sign = np.where(counts, -1.0, 1.0)[:, None, None]
     covariance = np.eye(6) + sign * uncertainty
-    value, vector = np.linalg.eigh(0.5 * (covariance + np.swapaxes(covariance, 1, 2)))
+    value, vector = symmetric.eigen(covariance)
     along = np.einsum("eij,ei->ej", vector, error)
     return np.asarray(np.sum(along**2 / np.maximum(value, _NOTHING_ELSE), axis=1))
 

@@ -10,7 +10,7 @@ import numpy as np
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.estimation.terms.pose_graph import RelativePoses
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.report import counted
 from maplab_py.vimap import Backbone, TransformationKind, VIMap
 from maplab_py.vimap.tables import LoopClosureEdges
@@ -59,22 +59,22 @@ def _with_odometry(vi_map: VIMap, edges: RelativePoses) -> RelativePoses:
     chosen &= odometry.to_vertex == odometry.from_vertex + 1
     chosen &= odometry.kind != TransformationKind.WHEEL_ODOMETRY
     covariance = _symmetric(odometry.covariance)
-    chosen &= np.linalg.eigvalsh(covariance).min(axis=1, initial=np.inf) > 0.0
+    chosen &= symmetric.is_positive_definite(covariance)
     rows = np.flatnonzero(chosen)
     edge_of_vertex = np.full(len(vi_map.vertices), -1, dtype=np.int64)
     edge_of_vertex[edges.from_vertex] = np.arange(len(edges))
     edge = edge_of_vertex[odometry.from_vertex[rows]]
     T_A_B, W = edges.T_A_B.copy(), edges.sqrt_information.copy()
     T_A_B[edge] = odometry.T_A_B[rows]
-    W[edge] = np.linalg.inv(np.linalg.cholesky(covariance[rows]))
+    W[edge] = symmetric.lower_whitening(covariance[rows])
     return RelativePoses(edges.from_vertex, edges.to_vertex, T_A_B, W)
 
 
 def _symmetric(covariance: F64) -> F64:
     """Return symmetric matrices (N, 6, 6), zero where there is something that is no number."""
-    symmetric = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    symmetric[~np.isfinite(symmetric).all(axis=(1, 2))] = 0.0
-    return np.asarray(symmetric)
+    result = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    result[~np.isfinite(result).all(axis=(1, 2))] = 0.0
+    return np.asarray(result)
 
 
 def loop_edges(
@@ -94,12 +94,11 @@ def loop_edges(
         as_given: Edges (E,) whose covariance is not to be widened.
     """
     fallback = np.repeat([options.loop_sigma_m, np.deg2rad(options.loop_sigma_deg)], 3) ** 2
-    symmetric = _symmetric(np.array(edges.covariance))
-    positive = np.linalg.eigvalsh(symmetric).min(axis=1, initial=np.inf) > 0.0
-    symmetric[~positive] = np.diag(fallback)
+    covariance = _symmetric(np.array(edges.covariance))
+    covariance[~symmetric.is_positive_definite(covariance)] = np.diag(fallback)
     widen = np.ones(len(edges)) if as_given is None else ~as_given * 1.0
-    widened = symmetric + widen[:, None, None] * np.diag(_LOOP_FLOOR)
-    W = np.linalg.inv(np.linalg.cholesky(widened))  # covariance = L L^T, so L^-1 whitens
+    widened = covariance + widen[:, None, None] * np.diag(_LOOP_FLOOR)
+    W = symmetric.lower_whitening(widened)
     return RelativePoses(
         edges.from_vertex.astype(np.int64), edges.to_vertex.astype(np.int64), edges.T_A_B, W
     )

@@ -12,7 +12,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.array_types import F32, F64, I64
 from maplab_py.errors import EstimationError
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
@@ -145,7 +145,8 @@ def landmark_covariances(vi_map: VIMap, features: MapFeatures) -> F64:
             information[:, i, j] = np.bincount(
                 landmark, weight * across[:, i, j], minlength=len(information)
             )
-    return np.asarray(np.linalg.inv(information + np.eye(3) / _FLAT_DIRECTION_SIGMA_M**2))
+    least = 1.0 / _FLAT_DIRECTION_SIGMA_M**2
+    return symmetric.inverse(information + least * np.eye(3), least)
 
 
 def _spread(rows: I64, features: MapFeatures, most: int) -> I64:

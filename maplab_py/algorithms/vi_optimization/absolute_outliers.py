@@ -10,12 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.geometry import se3
+from maplab_py.geometry import se3, symmetric
 from maplab_py.vimap import VIMap
 
 _WINDOW = 31
 """Neighbouring measurements whose median counts; up to half of them may be wrong."""
 _MIN_MEASUREMENTS = 5
+_LEAST_VARIANCE_M2 = 1e-12
 _MEDIAN_CHI = 1.538
 """Median of the norm of three standard normal variables."""
 
@@ -58,6 +59,6 @@ def _deviations(difference_m: F64, covariance: F64) -> F64:
     # mirrored, the first and the last measurement count once among their neighbours
     away = difference_m - median_filter(difference_m, size=(window, 1), mode="mirror")
     usable = np.isfinite(covariance).all(axis=(1, 2), keepdims=True)
-    C = np.where(usable, covariance, np.eye(3)) + 1e-12 * np.eye(3)
-    squared = np.einsum("ni,ni->n", away, np.linalg.solve(C, away[:, :, None])[:, :, 0])
+    information = symmetric.inverse(np.where(usable, covariance, np.eye(3)), _LEAST_VARIANCE_M2)
+    squared = np.einsum("ni,nij,nj->n", away, information, away)
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))

@@ -20,6 +20,7 @@ from maplab_py.estimation.states import (
     States,
 )
 from maplab_py.estimation.terms.protocol import FixedMeasurements, evaluated
+from maplab_py.geometry import symmetric
 
 FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
 """Added to covariances: edges of a few microseconds stay finite (1 um, 0.1 urad, 1 um/s)."""
@@ -174,7 +175,7 @@ def _effect(gyro_radps: F64, accel_mps2: F64, duration_s: F64) -> F64:
 
 def whitening(measured: Preintegrated) -> F64:
     """Return square roots (E, 9, 9) of the information of preintegrated edges."""
-    return np.linalg.inv(np.linalg.cholesky(measured.covariance + FLOOR))
+    return symmetric.lower_whitening(measured.covariance + FLOOR)
 
 
 def column_major(matrices: F64) -> F64:

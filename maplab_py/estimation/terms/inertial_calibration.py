@@ -13,7 +13,7 @@ from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.inertial import FLOOR, InertialTerm, column_major
-from maplab_py.geometry import so3
+from maplab_py.geometry import so3, symmetric
 from maplab_py.sensors import Imu
 from maplab_py.sensors.imu import ImuIntrinsics
 
@@ -76,7 +76,7 @@ class CalibratingInertialTerm(InertialTerm):
         """Integrate at the present biases and intrinsics, and weigh accordingly."""
         self._biases = states.gyro_bias[self._a], states.accel_bias[self._a]
         covariance = self._integrate_at(states)
-        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance + FLOOR))
+        self._whitening = symmetric.lower_whitening(covariance + FLOOR)
         return True
 
     def evaluate(self, states: States) -> tuple[F64, F64]:

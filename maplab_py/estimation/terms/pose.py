@@ -12,6 +12,7 @@ from maplab_py.estimation.blocks import Manifold, ParameterBlock
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import States, pose_nodes
 from maplab_py.estimation.terms.protocol import FixedMeasurements, evaluated
+from maplab_py.geometry import symmetric
 
 MOUNTING, SWITCH = "sensor extrinsics", "loop closure switch"
 
@@ -25,9 +26,7 @@ def whitening(covariance: F64) -> F64:
     """
     usable = np.isfinite(covariance).all(axis=(1, 2), keepdims=True)
     clean = np.where(usable, covariance, np.eye(6))
-    values, vectors = np.linalg.eigh(0.5 * (clean + clean.transpose(0, 2, 1)))
-    scale = 1.0 / np.sqrt(np.maximum(values, _SMALLEST_VARIANCE))
-    return np.asarray(scale[:, :, None] * vectors.transpose(0, 2, 1))
+    return symmetric.whitening(clean, _SMALLEST_VARIANCE)
 
 
 def mounting_block(T_I_S: F64, name: str = MOUNTING) -> ParameterBlock:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments
 from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Part, Segments
@@ -75,7 +75,7 @@ def ellipsoids(centre: F64, covariance: F64, colour: U8, rows: I64, scale: float
         rows: Rows (N,) of the map's table.
         scale: Half axes in standard deviations.
     """
-    variance, axes = np.linalg.eigh(0.5 * (covariance + np.swapaxes(covariance, 1, 2)))
+    variance, axes = symmetric.eigen(covariance)
     half_axes = scale * np.sqrt(np.maximum(variance, 0.0))[:, None, :] * axes  # columns (N, 3, 3)
     points = centre[:, None, None, :] + np.einsum("nij,ckj->ncki", half_axes, _unit_circles())
     start, end = points, np.roll(points, -1, axis=2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from maplab_py.algorithms.landmarks.quality import (
     predicted_sigma,
     reset_quality,
 )
+from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
@@ -48,6 +51,24 @@ def test_two_observers_at_a_wide_angle_are_enough():
     assert np.all(np.diff(vi_map.observation_start)[landmarks] == 2)
     assert len(landmarks) > 100
     assert np.mean(judge(vi_map, landmarks, DEFAULT).is_good) > 0.9
+
+
+@pytest.mark.parametrize("coordinate", [1e12, 1e160, -1e300])
+def test_landmarks_at_infinity_are_bad(coordinate):
+    vi_map, landmarks = with_two_observers(make_map(TWICE)[0], far_apart=True)
+    far = with_p_G(vi_map, landmarks, np.full((len(landmarks), 3), coordinate))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not judge(far, landmarks, DEFAULT).is_good.any()
+
+
+def test_a_landmark_at_its_camera_is_bad():
+    vi_map, landmarks = with_two_observers(make_map(TWICE)[0], far_apart=True)
+    keypoints = vi_map.observations[vi_map.observation_start[landmarks]]
+    origins = rays_in_G(vi_map, keypoints)[0]
+    for offset_m in (0.0, 1e-9, 1e-160):
+        near = with_p_G(vi_map, landmarks, origins + offset_m)
+        assert not judge(near, landmarks, DEFAULT).is_good.any()
 
 
 def test_two_observers_side_by_side_are_not():

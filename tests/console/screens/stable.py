@@ -6,6 +6,8 @@ import os
 import re
 from pathlib import Path
 
+from maplab_py.kernel_cache import cache_root
+
 _FRACTION = re.compile(r"-?\d+(?:\.\d+(?:e[+-]\d+)?|e[+-]\d+)|\bnan\b")
 _NUMBER = re.compile(r"(?<![\w.#-])-?\d+(?:\.\d+)?(?:e[+-]\d+)?(?![\w.#])")
 _ID = re.compile(r"\b[0-9a-f]{8}\b")
@@ -78,7 +80,7 @@ class Stable:
         self._is_estimate = command in ESTIMATES
         folders = {
             str(Path.cwd()): "/work",
-            os.environ.get("MAPLAB_CACHE_DIR", ""): "/cache",
+            str(cache_root()): "/cache",
             os.environ.get("XDG_STATE_HOME", ""): "/state",
             os.environ.get("XDG_CONFIG_HOME", ""): "/config",
         }
