@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.images import as_8_bits, as_grey, bits_of, sampled
 from maplab_py.sensors import Camera, CameraRig
 from maplab_py.storage.resources import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
@@ -126,13 +127,23 @@ class FrameImages:
         return frame in self._row
 
     def image(self, frame: int) -> U8 | None:
-        """Return the image (H, W) or (H, W, 3) BGR of a frame (row), None when it has none.
+        """Return the image (H, W) or (H, W, 3) BGR of 8 bits of a frame (row), None when it has none.
 
         Raises:
             MapError: The file is missing or no image.
         """
         row = self._row.get(frame)
-        return None if row is None else np.asarray(self._store.load(row))
+        if row is None:
+            return None
+        image = np.asarray(self._store.load(row))
+        return image if image.dtype == np.uint8 else as_8_bits(image, self._bits)
+
+    @cached_property
+    def _bits(self) -> int:
+        """Bits of the cameras whose images are stored with 16."""
+        rows = list(self._row.values())
+        images = (np.asarray(self._store.load(rows[k])) for k in sampled(len(rows)))
+        return bits_of(image for image in images if image.dtype == np.uint16)
 
     def grey(self, frame: int, camera: Camera) -> U8:
         """Return the image (H, W) of 8 bits of a frame that has one.
@@ -140,15 +151,9 @@ class FrameImages:
         Raises:
             MapError: The file is missing, no image, or of another size than the camera's images.
         """
-        import cv2
-
         image: Any = self.image(frame)
         check_size("an image", image, camera)
-        if image.ndim == 3:
-            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if image.dtype == np.uint16:
-            image = image >> 8
-        return np.asarray(image, dtype=np.uint8)
+        return as_grey(image, 8)
 
 
 def chosen_missions(vi_map: VIMap, missions: Any) -> list[int]:

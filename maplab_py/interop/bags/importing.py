@@ -15,6 +15,7 @@ from maplab_py.interop.bags.camera_info import check_camera_info
 from maplab_py.interop.bags.options import BagImportOptions
 from maplab_py.interop.bags.reports import BagImport
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
+from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.ply import encode_ply
 from maplab_py.interop.recordings.bag_files import (
     all_messages,
@@ -24,7 +25,12 @@ from maplab_py.interop.recordings.bag_files import (
     opened_bag,
     topic_types,
 )
-from maplab_py.interop.recordings.images import EncodedImage, RawImage, check_size
+from maplab_py.interop.recordings.images import (
+    EncodedImage,
+    check_size,
+    found_bits,
+    image_of_message,
+)
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
@@ -187,13 +193,16 @@ def _import_images(
             f"of a frame of camera {index}: check --resource_time_offset_ns and --map_mission"
         )
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
+    bits = CONTAINER_BITS if is_depth else _bits(topic, camera, numbers)
     for done, (number, message) in enumerate(topic.chosen(numbers)):
         progress.step(done, len(numbers), "images")
         name = f"{topic.name} at {topic.stamps_ns[number]}"
         if is_depth:
             new.add(RAW_DEPTH_MAPS, encoded_depth(_depth_m(message, name, camera)))
         else:
-            add_image(new, _image(message, name, camera, int(topic.stamps_ns[number])), link=False)
+            stamp_ns = int(topic.stamps_ns[number])
+            data = image_of_message(message, name, camera)
+            add_image(new, CameraImage(0, stamp_ns, stamp_ns, data, bits), link=False)
     attached = new.attached(vi_map, np.arange(len(owners)), owners) if len(owners) else vi_map
     return attached, BagImport(
         mission=mission_labels(vi_map)[mission],
@@ -246,23 +255,15 @@ def _is_depth(message: Any) -> bool:
     return "compressedDepth" in message.format
 
 
-def _image(message: Any, name: str, camera: Camera, stamp_ns: int) -> CameraImage:
-    data = _raw(message, name, camera) if hasattr(message, "encoding") else None
-    encoded = data or EncodedImage(name, camera, message.data.tobytes)
-    return CameraImage(0, stamp_ns, stamp_ns, encoded)
-
-
-def _raw(message: Any, name: str, camera: Camera) -> RawImage:
-    return RawImage(
-        name,
-        camera,
-        message.encoding,
-        int(message.width),
-        int(message.height),
-        int(message.step),
-        bool(message.is_bigendian),
-        message.data,
-    )
+def _bits(topic: _Topic, camera: Camera, numbers: I64) -> int:
+    """Return the bits of the camera's values, sought in some of its messages (numbers, sorted)."""
+    images = []
+    for _, message in topic.chosen(numbers[sampled(len(numbers))]):
+        data = image_of_message(message, topic.name, camera)
+        images.append(CameraImage(0, 0, 0, data))
+        if data.bits:
+            break
+    return found_bits(images)
 
 
 def _depth_m(message: Any, name: str, camera: Camera) -> F32:
@@ -274,7 +275,7 @@ def _depth_m(message: Any, name: str, camera: Camera) -> F32:
         pixels = EncodedImage(name, camera, lambda: data).decode()
         return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
     if message.encoding == "16UC1":
-        pixels = _raw(message, name, camera).decode()
+        pixels = image_of_message(message, name, camera).decode()
         return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
     if message.encoding != "32FC1":
         raise MapError(f"{name}: encoding '{message.encoding}' in a topic of depth: record 16UC1")

@@ -6,6 +6,7 @@ headers' stamps, as messages of one topic are. So some seconds of messages are k
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import heapq
 import itertools
@@ -17,6 +18,7 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
 from maplab_py.interop.recordings.bag_files import (
     header_stamp_ns,
     imu_sample,
@@ -24,10 +26,9 @@ from maplab_py.interop.recordings.bag_files import (
     opened_bag,
     topic_types,
 )
-from maplab_py.interop.recordings.images import EncodedImage, RawImage
+from maplab_py.interop.recordings.images import bits_note, found_bits, image_of_message
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
-    ImageData,
     ImuBatch,
     Item,
     RecordedSensors,
@@ -66,6 +67,7 @@ class BagRecording:
         *,
         imu_topic: str = "",
         camera_topics: Sequence[str] = (),
+        image_bits: int = 0,
     ) -> None:
         """Open a bag.
 
@@ -74,12 +76,14 @@ class BagRecording:
             device: Sensors.
             imu_topic: Topic of the IMU; empty = as the sensor says.
             camera_topics: Topic of each camera; () = as the cameras say.
+            image_bits: Bits of values that are stored in 16; 0 = found.
 
         Raises:
             UserError: The library is missing, or a topic is unknown, of another type, or not given.
             MapError: The bag is damaged, or a topic has no messages.
         """
         self.name, self.device, self._path = str(path), device, path
+        self._given_bits, self._bits = image_bits, [CONTAINER_BITS] * len(device.cameras)
         topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
         if len(topics) != len(device.cameras):
             raise UserError(
@@ -98,13 +102,16 @@ class BagRecording:
             self._streams = [self._examined(reader, stream) for stream in streams]
         if len({stream.topic for stream in self._streams}) < len(self._streams):
             raise UserError(f"{path}: two sensors have the same topic: give --camera_topics")
-        self.notes = (
-            ()
-            if device.imu_id
-            else (
-                "no IMU is read: the calibration has none, --imu_calibration_file names its file",
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Parts of the recording that are not read, and how the others are."""
+        notes = [bits_note(c, bits) for c, bits in enumerate(self._bits) if bits < CONTAINER_BITS]
+        if not self.device.imu_id:
+            notes.append(
+                "no IMU is read: the calibration has none, --imu_calibration_file names its file"
             )
-        )
+        return tuple(notes)
 
     @property
     def start_ns(self) -> int:
@@ -113,6 +120,7 @@ class BagRecording:
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
+        read_bits = self._read_bits(start_ns, end_ns)
         times_ns: list[int] = []
         samples: list[tuple[float, ...]] = []
         for time_ns, stream, message in self._in_order(start_ns, end_ns):
@@ -123,9 +131,35 @@ class BagRecording:
                 yield self._batch(times_ns, samples)
                 times_ns, samples = [], []
             if stream.camera != _IMU:
-                yield self._image(stream, time_ns, message)
+                yield self._image(stream, time_ns, message, read_bits[stream.camera])
         if times_ns:
             yield self._batch(times_ns, samples)
+
+    def _read_bits(self, start_ns: int | None, end_ns: int | None) -> list[int]:
+        """Return the bits of each camera, sought in messages that are spread over a time."""
+        cameras = [stream for stream in self._streams if stream.camera != _IMU]
+        read: list[int] = []
+        with opened_bag(self._path) as reader:
+            first_ns = reader.start_time if start_ns is None else start_ns
+            last_ns = reader.end_time if end_ns is None else min(end_ns, reader.end_time)
+            for stream in cameras:
+                connections = [c for c in reader.connections if c.topic == stream.topic]
+                images: list[CameraImage] = []
+                for place_ns in np.linspace(first_ns, last_ns, SAMPLES, endpoint=False).tolist():
+                    message = next(reader.messages(connections, int(place_ns)), None)
+                    if message is None or self._given_bits:
+                        break
+                    content = reader.deserialize(message[2], message[0].msgtype)
+                    images.append(self._image(stream, int(place_ns), content, CONTAINER_BITS))
+                    with contextlib.suppress(MapError):
+                        if images[0].data.bits:
+                            break
+                bits = self._given_bits or found_bits(images)
+                self._bits[stream.camera] = (
+                    CONTAINER_BITS if bits == 8 or self._given_bits else bits
+                )
+                read.append(bits)
+        return read
 
     def _in_order(
         self, start_ns: int | None, end_ns: int | None
@@ -224,22 +258,9 @@ class BagRecording:
             )
         return ImuBatch.of(self.device.imu, np.array(times_ns, dtype=np.int64), values)
 
-    def _image(self, stream: _Stream, time_ns: int, message: Any) -> CameraImage:
+    def _image(self, stream: _Stream, time_ns: int, message: Any, bits: int) -> CameraImage:
         stamp_ns = time_ns - stream.time_offset_ns
         camera = self.device.cameras[stream.camera]
         name = f"{self._path}: {stream.topic} at {stamp_ns}"
-        data: ImageData
-        if hasattr(message, "encoding"):
-            data = RawImage(
-                name,
-                camera,
-                message.encoding,
-                int(message.width),
-                int(message.height),
-                int(message.step),
-                bool(message.is_bigendian),
-                message.data,
-            )
-        else:
-            data = EncodedImage(name, camera, message.data.tobytes)
-        return CameraImage(stream.camera, time_ns, stamp_ns, data)
+        data = image_of_message(message, name, camera)
+        return CameraImage(stream.camera, time_ns, stamp_ns, data, bits)

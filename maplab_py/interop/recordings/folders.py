@@ -16,8 +16,9 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
+from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import ImuRecording, read_imu_csv
-from maplab_py.interop.recordings.images import image_file
+from maplab_py.interop.recordings.images import bits_note, found_bits, image_file
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Item, RecordedSensors
 from maplab_py.sensors import Camera
 
@@ -39,7 +40,12 @@ class FolderRecording:
     kind = "EuRoC folder"
 
     def __init__(
-        self, root: Path, device: RecordedSensors, camera_folders: tuple[int, ...] = ()
+        self,
+        root: Path,
+        device: RecordedSensors,
+        camera_folders: tuple[int, ...] = (),
+        *,
+        image_bits: int = 0,
     ) -> None:
         """Open a recording.
 
@@ -47,25 +53,28 @@ class FolderRecording:
             root: Folder with cam0.
             device: Sensors.
             camera_folders: Number of the folder cam<number> of each camera; () = 0, 1, ...
+            image_bits: Bits of values that are stored in 16; 0 = found.
 
         Raises:
             MapError: A table is missing, empty or wrong, or names an image that is not there.
         """
         self.name, self.device, self._root = str(root), device, root
+        self._given_bits, self._bits = image_bits, [CONTAINER_BITS] * len(device.cameras)
         numbers = camera_folders or tuple(range(len(device.cameras)))
         self._cameras = [
             _ImageList(root / f"cam{number}", camera)
             for number, camera in zip(numbers, device.cameras, strict=True)
         ]
 
-    @cached_property
+    @property
     def notes(self) -> tuple[str, ...]:
-        """Parts of the recording that are not read."""
+        """Parts of the recording that are not read, and how the others are."""
+        notes = [bits_note(c, bits) for c, bits in enumerate(self._bits) if bits < CONTAINER_BITS]
         if not self.device.imu_id and (self._root / "imu0").is_dir():
-            return (
-                "imu0 is not read: the calibration has no IMU, --imu_calibration_file names its file",
+            notes.append(
+                "imu0 is not read: the calibration has no IMU, --imu_calibration_file names its file"
             )
-        return ()
+        return tuple(notes)
 
     @cached_property
     def _imu(self) -> ImuRecording | None:
@@ -89,7 +98,13 @@ class FolderRecording:
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
-        streams = [camera.images(row, start_ns, end_ns) for row, camera in enumerate(self._cameras)]
+        streams = []
+        for row, camera in enumerate(self._cameras):
+            first, end = _range(camera.times_ns, start_ns, end_ns)
+            samples = [camera.image(row, first + k) for k in sampled(end - first)]
+            bits = self._given_bits or found_bits(samples)
+            self._bits[row] = CONTAINER_BITS if bits == 8 or self._given_bits else bits
+            streams.append(camera.images(row, range(first, end), bits))
         images = heapq.merge(*streams, key=lambda image: (image.time_ns, image.camera))
         imu, table = self.device.imu, self._imu
         if imu is None or table is None:
@@ -123,12 +138,16 @@ class _ImageList:
         self.times_ns = self._stamps_ns + camera.time_offset_ns
         self._check_files(table)
 
-    def images(self, row: int, start_ns: int | None, end_ns: int | None) -> Iterator[CameraImage]:
-        """Yield the images of a time as those of the camera with this row."""
-        first, end = _range(self.times_ns, start_ns, end_ns)
-        for index in range(first, end):
-            data = image_file(self._folder / self._files[index], self._camera)
-            yield CameraImage(row, int(self.times_ns[index]), int(self._stamps_ns[index]), data)
+    def images(self, row: int, indices: range, bits: int) -> Iterator[CameraImage]:
+        """Yield images as those of the camera with this row."""
+        for index in indices:
+            yield self.image(row, index, bits)
+
+    def image(self, row: int, index: int, bits: int = CONTAINER_BITS) -> CameraImage:
+        """Return an image as that of the camera with this row."""
+        data = image_file(self._folder / self._files[index], self._camera)
+        times_ns = int(self.times_ns[index]), int(self._stamps_ns[index])
+        return CameraImage(row, *times_ns, data, bits)
 
     def _check_files(self, table: Path) -> None:
         try:

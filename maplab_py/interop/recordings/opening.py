@@ -23,6 +23,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
         MapError: A file of it is missing or damaged.
     """
     options = options or SourceOptions()
+    options.check()
     root = image_root(path)
     if root is not None:
         if options.imu_topic or options.camera_topics:
@@ -31,7 +32,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             )
         active = options.active_cameras
         device = _chosen(_calibration(options) or import_calibration(root), options)
-        return FolderRecording(root, device, active)
+        return FolderRecording(root, device, active, image_bits=options.image_bits)
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
     if not is_bag(path):
@@ -47,6 +48,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
         _chosen(given, options),
         imu_topic=options.imu_topic,
         camera_topics=options.topics_of_cameras,
+        image_bits=options.image_bits,
     )
 
 

@@ -40,6 +40,20 @@ class SourceOptions:
         "calibration; empty = as it says",
     )
 
+    image_bits: int = option(
+        0,
+        help="Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording",
+    )
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of range.
+        """
+        if self.image_bits and not 8 <= self.image_bits <= 16:
+            raise FlagError(f"--image_bits={self.image_bits}: wants 8 to 16, or 0")
+
     @property
     def active_cameras(self) -> tuple[int, ...]:
         """Indices of the cameras to read; empty = all.

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64, U8, Mask
 from maplab_py.interop.device import RecordedSensors as RecordedSensors
+from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_8_bits, as_grey
 from maplab_py.sensors import Imu
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,6 +47,14 @@ class ImuBatch:
 class ImageData(Protocol):
     """The content of an image before it is decoded."""
 
+    @property
+    def encoding(self) -> str:
+        """Name of the encoding."""
+
+    @property
+    def bits(self) -> int:
+        """Bits of a value; 0 = only the values tell."""
+
     def check(self) -> None:
         """Check size and completeness without decoding.
 
@@ -72,21 +78,19 @@ class CameraImage:
     time_ns: int  # in the clock of the IMU
     stamp_ns: int  # as recorded, in the clock of the camera
     data: ImageData
+    bits: int = CONTAINER_BITS  # of the camera's values, where they are stored in 16
 
     def decode(self) -> Pixels:
         """Return the pixels as recorded; see `ImageData.decode`."""
         return self.data.decode()
 
     def grey(self) -> U8:
-        """Return 8-bit grey values (H, W); of 16 bits the upper eight, of colours the luminance."""
-        import cv2
+        """Return 8-bit grey values (H, W); of more bits the upper eight, of colours the luminance."""
+        return as_grey(self.decode(), self.bits)
 
-        pixels: Any = self.decode()
-        if pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-        if pixels.dtype == np.uint16:
-            pixels = (pixels >> 8).astype(np.uint8)
-        return np.asarray(pixels, dtype=np.uint8)
+    def eight_bits(self) -> U8:
+        """Return the pixels (H, W) or (H, W, 3) BGR of 8 bits."""
+        return as_8_bits(self.decode(), self.bits)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.errors import UserError
+from maplab_py.interop.images import as_8_bits
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
 from maplab_py.interop.recordings.images import EncodedImage
 from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors
@@ -110,7 +111,7 @@ def import_images(
 
 
 def add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
-    """Add an image of a recording to the new resources, of 16 bits the upper eight; return its row.
+    """Add an image of a recording to the new resources, of more bits the upper eight; return its row.
 
     Raises:
         MapError: The image is missing, damaged, or of another size than the camera's.
@@ -119,9 +120,7 @@ def add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
     kind = RAW_GREY if pixels.ndim == 2 else RAW_COLOUR
     if link and isinstance(image.data, EncodedImage):
         return new.add_link(kind, image.data.read(), Path(image.data.name))
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    return new.add_image(np.asarray(pixels, dtype=np.uint8), kind)
+    return new.add_image(as_8_bits(pixels, image.bits), kind)
 
 
 def export_images(

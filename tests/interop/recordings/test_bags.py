@@ -312,8 +312,8 @@ def test_bad_messages(tmp_path: Path, calibrated: SourceOptions) -> None:
         image = first_image(messages)
         image.data = image.data[:-100]
 
-    def bayer(messages: list[tuple[int, str, Any]]) -> None:
-        first_image(messages).encoding = "bayer_rggb8"
+    def depths(messages: list[tuple[int, str, Any]]) -> None:
+        first_image(messages).encoding = "32FC1"
 
     def narrow(messages: list[tuple[int, str, Any]]) -> None:
         first_image(messages).width = 60
@@ -323,7 +323,7 @@ def test_bad_messages(tmp_path: Path, calibrated: SourceOptions) -> None:
 
     for harm, message in (
         (cut, "the image is truncated"),
-        (bayer, "encoding 'bayer_rggb8' is not supported: record one of mono8"),
+        (depths, "the encoding '32FC1' are depths or measurements: record mono8"),
         (narrow, "the image is 60 x 48, the calibration is of 64 x 48"),
         (not_a_number, "the sample at .* is not a number"),
     ):

@@ -104,8 +104,6 @@ class UndistortedViews:
         image: Any = self._images.image(frame)
         name = f"the image of frame {to_hex(self.vi_map.frames.id[frame])}"
         check_size(name, image, self.cameras[camera])
-        if image.dtype == np.uint16:
-            image = (image >> 8).astype(np.uint8)
         return self._maps[camera].image(image)
 
     def tracks(self, *, only_good: bool = True, progress: Progress = SILENT) -> PointTracks:

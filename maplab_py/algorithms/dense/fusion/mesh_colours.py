@@ -88,8 +88,6 @@ def _seen(resources: FrameResources, frame: int, p_C: F64, depth: F32) -> tuple[
 
 
 def _as_rgb(image: U8) -> F64:
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
     if image.ndim == 2:
         image = np.repeat(image[:, :, None], 3, axis=2)
     return np.asarray(image[:, :, ::-1], dtype=np.float64)

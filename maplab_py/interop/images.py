@@ -1,0 +1,303 @@
+"""Pixels of images as cameras and drivers store them, converted to grey or BGR of 8 or 16 bits.
+
+Sources: ROS, sensor_msgs/image_encodings.hpp and compressed_image_transport (the text of `format`); OpenCV,
+"Color conversions" (its Bayer names begin with the second row: RGGB is BayerBG); PNG, ISO/IEC 15948; JPEG,
+ITU-T T.81.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import struct
+import zlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maplab_py.array_types import U8
+from maplab_py.errors import MapError
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+REMEDY = "leave it out with --vio_rosbag_start_s and --vio_rosbag_end_s, or copy it again"
+CONTAINER_BITS = 16
+"""Bits of the words in which cameras of 10, 12 and 14 bits store their values."""
+SAMPLES = 8
+"""Images of a camera in which the range of its values is sought."""
+_CAMERA_BITS = (8, 10, 12, 14, 16)
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG_BIT_DEPTH = 24  # place of the byte in the file
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_TAIL = 64
+"""Bytes at the end of a file in which the end marker must be; some writers pad."""
+_JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_OTHER_FORMATS = {
+    b"RIFF": "WebP",
+    b"BM": "BMP",
+    b"II*\x00": "TIFF",
+    b"MM\x00*": "TIFF",
+    b"P5": "PGM",
+}
+_VIDEO = re.compile(r"h\.?26[3-6]|hevc|avc|av1|vp[89]|mpeg-?[124]|theora|video", re.IGNORECASE)
+_VIDEO_START = (b"\x00\x00\x00\x01", b"\x00\x00\x01")  # Annex B of H.264 and H.265
+_BAYER_CODES = {"rggb": "BayerBG", "bggr": "BayerRG", "gbrg": "BayerGR", "grbg": "BayerGB"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Encoding:
+    """Layout of the pixels of a raw image."""
+
+    type: type[Any]
+    channels: int  # numbers per pixel in a row
+    code: str = ""  # conversion of OpenCV; empty = none
+    planes: float = 1.0  # rows of the data per row of the image
+    bits: int = 0  # of a value, where the name tells them
+
+
+_YUYV, _UYVY = (Encoding(np.uint8, 2, f"YUV2BGR_{name}") for name in ("YUY2", "UYVY"))
+ENCODINGS = {
+    "mono8": Encoding(np.uint8, 1),
+    "mono16": Encoding(np.uint16, 1),
+    "bgr8": Encoding(np.uint8, 3),
+    "rgb8": Encoding(np.uint8, 3, "RGB2BGR"),
+    "bgra8": Encoding(np.uint8, 4, "BGRA2BGR"),
+    "rgba8": Encoding(np.uint8, 4, "RGBA2BGR"),
+    "bgr16": Encoding(np.uint16, 3),
+    "rgb16": Encoding(np.uint16, 3, "RGB2BGR"),
+    "bgra16": Encoding(np.uint16, 4, "BGRA2BGR"),
+    "rgba16": Encoding(np.uint16, 4, "RGBA2BGR"),
+    "8uc1": Encoding(np.uint8, 1),
+    "8uc3": Encoding(np.uint8, 3),
+    "8uc4": Encoding(np.uint8, 4, "BGRA2BGR"),
+    "16uc1": Encoding(np.uint16, 1),
+    "16uc3": Encoding(np.uint16, 3),
+    "16uc4": Encoding(np.uint16, 4, "BGRA2BGR"),
+    **{f"mono{bits}": Encoding(np.uint16, 1, bits=bits) for bits in (10, 12, 14)},
+    **{
+        f"bayer_{pattern}{bits}": Encoding(
+            np.uint8 if bits == 8 else np.uint16, 1, f"{code}2BGR", bits=bits % CONTAINER_BITS
+        )
+        for pattern, code in _BAYER_CODES.items()
+        for bits in _CAMERA_BITS
+    },
+    **dict.fromkeys(("yuv422_yuy2", "yuyv", "yuy2"), _YUYV),
+    **dict.fromkeys(("yuv422", "uyvy"), _UYVY),
+    "nv12": Encoding(np.uint8, 1, "YUV2BGR_NV12", planes=1.5),
+    "nv21": Encoding(np.uint8, 1, "YUV2BGR_NV21", planes=1.5),
+    "i420": Encoding(np.uint8, 1, "YUV2BGR_I420", planes=1.5),
+    "nv24": Encoding(np.uint8, 1),  # the plane of luminance
+}
+"""Encodings of raw images, in lower case."""
+
+
+def encoding_of(name: str, image: str) -> Encoding:
+    """Return a raw encoding by its ROS name.
+
+    Raises:
+        MapError: It is unknown, or no picture; names the image.
+    """
+    encoding = ENCODINGS.get(name.lower())
+    if encoding is None:
+        kind = "are depths or measurements" if re.search(r"[FS]C\d|32|64", name) else "are unknown"
+        raise MapError(
+            f"{image}: pixels of the encoding '{name}' {kind}: record mono8, bgr8, a Bayer pattern or YUV, "
+            "or name another topic"
+        )
+    return encoding
+
+
+def check_raw(
+    name: str, encoding: str, width_px: int, height_px: int, step: int, size: int
+) -> Encoding:
+    """Return the encoding of a raw image whose data are complete.
+
+    Raises:
+        MapError: It is unknown, or rows or data (size [bytes]) are too short.
+    """
+    described = encoding_of(encoding, name)
+    row_bytes = width_px * described.channels * np.dtype(described.type).itemsize
+    rows = round(height_px * described.planes)
+    if step < row_bytes or size < step * rows:
+        raise MapError(
+            f"{name}: the image is truncated: {size} bytes in rows of {step}, {row_bytes * rows} are needed; "
+            f"{REMEDY}"
+        )
+    return described
+
+
+def raw_pixels(
+    name: str,
+    encoding: str,
+    width_px: int,
+    height_px: int,
+    step: int,
+    data: Any,
+    *,
+    is_big_endian: bool = False,
+) -> Pixels:
+    """Return the pixels of a raw image: (H, W) grey or (H, W, 3) BGR, 8 or 16 bits.
+
+    Args:
+        name: Of the image, for messages.
+        encoding: Name in ROS.
+        width_px: Width.
+        height_px: Height.
+        step: Bytes of a row.
+        data: Buffer.
+        is_big_endian: Words of 16 bits begin with the upper byte.
+
+    Raises:
+        MapError: As `check_raw`.
+    """
+    described = check_raw(name, encoding, width_px, height_px, step, len(data))
+    rows = round(height_px * described.planes)
+    stored = np.frombuffer(data, dtype=np.uint8, count=step * rows).reshape(rows, step)
+    dtype = np.dtype(described.type).newbyteorder(">" if is_big_endian else "<")
+    stored = np.ascontiguousarray(stored[:, : width_px * described.channels * dtype.itemsize])
+    pixels: Any = stored.view(dtype).astype(described.type, copy=False)
+    if described.channels > 1:
+        pixels = pixels.reshape(rows, width_px, described.channels)
+    return _converted(pixels, described.code, name)
+
+
+def _converted(pixels: Any, code: str, name: str) -> Pixels:
+    """Return pixels after a colour conversion of OpenCV."""
+    import cv2
+
+    if not code:
+        unchanged: Pixels = pixels
+        return unchanged
+    try:
+        converted: Pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{code}"))
+    except cv2.error as error:
+        raise MapError(
+            f"{name}: an image of this size cannot be in {code.split('2', maxsplit=1)[0]}"
+        ) from error
+    return converted
+
+
+def encoded_pixels(name: str, data: bytes, form: str = "") -> Pixels:
+    """Return the pixels of a PNG or JPEG image; see `raw_pixels`.
+
+    Args:
+        name: Of the image, for messages.
+        data: The file.
+        form: `format` of a CompressedImage, as in "bayer_rggb8; png compressed".
+
+    Raises:
+        MapError: The image is damaged, or is a video, depths or of 32 bits.
+    """
+    import cv2
+
+    encoded_size(name, data, form)
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    if pixels is None:
+        raise MapError(f"{name}: the image is damaged; {REMEDY}")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise MapError(f"{name}: pixels of type {pixels.dtype} are not supported: use 8 or 16 bits")
+    source = form.split(";", maxsplit=1)[0].strip().lower()
+    if pixels.ndim == 2 and source.startswith("bayer_"):  # the transport stores the mosaic
+        return _converted(pixels, encoding_of(source, name).code, name)
+    checked: Pixels = pixels
+    return checked
+
+
+def encoded_size(name: str, data: bytes, form: str = "") -> tuple[int, int]:
+    """Return width and height of a PNG or JPEG image from its header; its end is checked.
+
+    Raises:
+        MapError: It is neither, it is truncated, or a checksum is wrong.
+    """
+    if data.startswith(_PNG):
+        _check_png(data, name)
+        width, height = struct.unpack(">II", data[16:24])
+        return int(width), int(height)
+    if data.startswith(_JPEG):
+        size = _jpeg_size(data)
+        if size is None or _JPEG_END not in data[-_TAIL:]:
+            raise MapError(f"{name}: the image is truncated; {REMEDY}")
+        return size
+    if not data:
+        raise MapError(f"{name}: the image is empty; {REMEDY}")
+    if _VIDEO.search(form) or data.startswith(_VIDEO_START):
+        what = f"'{form}'" if _VIDEO.search(form) else "H.264 or H.265"
+        raise MapError(
+            f"{name}: {what} is a video, of which single messages are no images: decode it to PNG, JPEG or "
+            "raw images first, as with ROS' `image_transport republish`"
+        )
+    if "compressedDepth" in form:
+        raise MapError(f"{name}: '{form}' are depths: name the topic of a camera's images")
+    other = next((kind for start, kind in _OTHER_FORMATS.items() if data.startswith(start)), "")
+    if other:
+        raise MapError(f"{name}: {other} images are not read: convert them to PNG")
+    raise MapError(f"{name}: it is neither a PNG nor a JPEG image; {REMEDY}")
+
+
+def has_16_bits(data: bytes) -> bool:
+    """Return whether the first bytes of a file are those of a PNG image of 16 bits."""
+    return data.startswith(_PNG) and data[_PNG_BIT_DEPTH : _PNG_BIT_DEPTH + 1] == b"\x10"
+
+
+def sampled(count: int) -> list[int]:
+    """Return up to `SAMPLES` of so many numbers, evenly spread."""
+    return sorted({int(k) for k in np.linspace(0, count - 1, min(SAMPLES, count))})
+
+
+def bits_of(images: Iterable[Pixels]) -> int:
+    """Return the bits of the camera whose images of 16 bits these are: 8, 10, 12, 14 or 16."""
+    largest = max((int(image.max(initial=0)) for image in images), default=0)
+    return next(bits for bits in _CAMERA_BITS if largest < 1 << bits)
+
+
+def as_8_bits(pixels: Any, bits: int) -> U8:
+    """Return pixels of a camera of so many bits as 8 bits; values beyond its range become white."""
+    if pixels.dtype != np.uint16:
+        return np.asarray(pixels, dtype=np.uint8)
+    shift = max(bits - 8, 0)
+    return np.asarray(np.minimum(pixels >> shift, 255), dtype=np.uint8)
+
+
+def as_grey(pixels: Any, bits: int) -> U8:
+    """Return 8-bit grey values (H, W) of an image (H, W) or (H, W, 3) BGR."""
+    import cv2
+
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    return as_8_bits(pixels, bits)
+
+
+def _check_png(data: bytes, name: str) -> None:
+    """Check that all chunks of a PNG image are there, with their checksums."""
+    place, kind = len(_PNG), b""
+    while kind != _PNG_END:
+        if place + 12 > len(data):
+            raise MapError(f"{name}: the image is truncated; {REMEDY}")
+        size, kind = struct.unpack(">I4s", data[place : place + 8])
+        end = place + 8 + size
+        if end + 4 > len(data):
+            raise MapError(f"{name}: the image is truncated; {REMEDY}")
+        is_first = place == len(_PNG)
+        checksum = struct.unpack(">I", data[end : end + 4])[0]
+        if zlib.crc32(memoryview(data)[place + 4 : end]) != checksum or (
+            is_first and (kind, size) != (b"IHDR", 13)
+        ):
+            raise MapError(f"{name}: the image is damaged; {REMEDY}")
+        place = end + 4
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height from the frame header, None when it is not there."""
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:  # fill byte
+            place += 1
+            continue
+        if marker in _JPEG_FRAME_MARKERS:
+            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
+            return int(width), int(height)
+        place += 2 + int(struct.unpack(">H", data[place + 2 : place + 4])[0])
+    return None
