@@ -1,7 +1,8 @@
 """Positions of satellite receivers: CSV with time, latitude, longitude and altitude, and NMEA 0183.
 
 NMEA: sentences GGA of any talker have the fixes, RMC the date (NMEA 0183, v4.11). Altitudes are
-made ellipsoidal: GGA's altitude above the geoid plus its separation.
+made ellipsoidal: GGA's altitude above the geoid plus its separation. Rows that are no fixes are left out
+and counted by reason.
 """
 
 from __future__ import annotations
@@ -12,24 +13,37 @@ import functools
 import operator
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.input_files import read_text
+from maplab_py.input_files import read_bytes
 from maplab_py.interop.stamps import FIXES
 from maplab_py.interop.text_table import TextTable, parse_text_table
 
 _MAX_BYTES = 500_000_000
 _NAMES = (
-    re.compile(r"lat(itude)?(_?deg)?"),
-    re.compile(r"(lon|lng|long)(gitude|itude)?(_?deg)?"),
-    re.compile(r"(alt(itude)?|height|ele(vation)?|h)(_?m)?"),
+    re.compile(r"(.*\.)?lat(itude)?(_?deg)?"),
+    re.compile(r"(.*\.)?(lon|lng|long)(gitude|itude)?(_?deg)?"),
+    re.compile(r"(.*\.)?(alt(itude)?|height|ele(vation)?|h)(_?m)?"),
 )
+_STATUS = re.compile(r"(.*\.)?(nav_?sat_?)?status(\.status)?")
+_QUALITY = re.compile(r"(gps_?|fix_?)?(quality|fix_?type)")
 _SENTENCE = re.compile(
-    r"\$(?P<body>[A-Z]{2}(?P<kind>GGA|RMC)),(?P<fields>[^*]*)\*(?P<sum>[0-9A-F]{2})"
+    r"\$(?P<body>[A-Z]{2}(?P<kind>GGA|RMC)),(?P<fields>[^*$]*)(\*(?P<sum>[0-9A-F]{2}))?",
+    re.IGNORECASE,
 )
+_NMEA = re.compile(r"^[^,;]{0,80}[$!][A-Z]{2}[A-Z]{3},", re.IGNORECASE | re.MULTILINE)
+_LEAST_FIELDS = {"GGA": 14, "RMC": 9}
+"""Fields of a whole sentence, which is told by them where nothing has a check sum."""
+_REASON = "<U40"
+NO_FIX, ZERO, BEYOND = "without a fix", "latitude 0, longitude 0", "beyond 90 or 180 deg"
+NO_NUMBER, DAMAGED, REPEATED = "not a finite number", "damaged", "repeated"
+_MOST = 0.5
+"""Share of fixes beyond all degrees from which the file has another unit or order."""
 _DAY_NS = 86_400_000_000_000
 
 
@@ -42,8 +56,7 @@ class GpsTrack:
     longitude_deg: F64  # (N,) -180 .. 180
     altitude_m: F64  # (N,) above the ellipsoid
     source: str
-    without_fix: int = 0  # sentences of a receiver that knew no position
-    damaged: int = 0  # sentences with a wrong check sum
+    left_out: tuple[tuple[str, int], ...] = ()  # reasons and their numbers of rows
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -63,39 +76,106 @@ def read_gps(path: Path, date: str = "", time_unit: str = "") -> GpsTrack:
         UserError: NMEA has no date and none is given, or it is none.
     """
     try:
-        text = read_text(
-            path, _MAX_BYTES, remedy="split it into parts", error=MapError, encoding="utf-8-sig"
-        )
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
-    is_nmea = text.lstrip().startswith(("$", "!"))
-    track = _from_nmea(text, str(path), date) if is_nmea else _from_csv(text, str(path), time_unit)
-    return check_track(track)
+        content = read_bytes(path, _MAX_BYTES, remedy="split it into parts", error=MapError)
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        text = content.decode("latin-1")  # receivers mix sentences with binary messages
+        if not _SENTENCE.search(text):
+            raise MapError(f"cannot read {path}: it is not UTF-8 text") from error
+        return _from_nmea(text, str(path), date)
+    if _NMEA.search(text):
+        return _from_nmea(text, str(path), date)
+    return _from_csv(text, str(path), time_unit)
 
 
-def check_track(track: GpsTrack) -> GpsTrack:
-    """Return a track whose stamps increase.
+def gps_track(
+    times_ns: I64, fixes: F64, source: str, reasons: NDArray[np.str_], lines: I64 | None = None
+) -> GpsTrack:
+    """Return the fixes of a receiver without those that are none, in the order of time.
+
+    Args:
+        times_ns: Stamps (N,).
+        fixes: Latitude, longitude [deg] and altitude [m] (N, 3).
+        source: Name of the file.
+        reasons: Why each row (N,) is known to be no fix; empty = it may be one.
+        lines: Line of each row, for messages.
 
     Raises:
-        MapError: They do not.
+        MapError: None is left, angles are no degrees, or stamps go back.
     """
-    backwards = np.flatnonzero(np.diff(track.times_ns) <= 0)
-    if len(backwards):
-        row = int(backwards[0]) + 1
+    reasons = reasons.astype(_REASON)
+    known = reasons == ""
+    degrees = fixes[:, :2]
+    with np.errstate(invalid="ignore"):
+        beyond = (np.abs(degrees) > (90.0, 180.0)).any(axis=1)
+    reasons[known & beyond] = BEYOND
+    reasons[known & (degrees == 0.0).all(axis=1)] = ZERO
+    reasons[known & ~np.isfinite(fixes).all(axis=1)] = NO_NUMBER
+    places = (
+        [f": fix {row + 1}" for row in range(len(fixes))]
+        if lines is None
+        else [f":{n}" for n in lines]
+    )
+    given = np.count_nonzero(known & ~np.isin(reasons, (ZERO, NO_NUMBER)))
+    if np.count_nonzero(reasons == BEYOND) > _MOST * given:
+        row = int(np.argmax(reasons == BEYOND))
         raise MapError(
-            f"{track.source}: fix {row + 1} is not after the one before it ({track.times_ns[row]} ns): sort "
-            "the file by time"
+            f"{source}{places[row]}: latitude {degrees[row, 0]:g}, longitude {degrees[row, 1]:g}: wants "
+            "degrees, latitude first"
         )
-    return track
+    _check_order(times_ns, fixes, np.flatnonzero(reasons == ""), source, places)
+    kept = np.flatnonzero(reasons == "")
+    reasons[kept[1:][np.diff(times_ns[kept]) == 0]] = REPEATED
+    kept = np.flatnonzero(reasons == "")
+    counts = zip(*np.unique(reasons[reasons != ""], return_counts=True), strict=True)
+    left_out = sorted(
+        ((str(name), int(count)) for name, count in counts), key=lambda item: -item[1]
+    )
+    if not len(kept):
+        said = ", ".join(f"{count} {reason}" for reason, count in left_out) or "no GGA sentences"
+        raise MapError(f"{source}: there are no fixes: {said}")
+    lat, lon, alt = fixes[kept].T
+    # a rectangle in the ocean off Africa
+    if np.abs(lat).max() <= 0.5 * np.pi and np.abs(lon).max() <= np.pi:
+        raise MapError(f"{source}: latitude and longitude look like radians: degrees are wanted")
+    return GpsTrack(times_ns[kept], lat, lon, alt, source, tuple(left_out))
+
+
+def _check_order(times_ns: I64, fixes: F64, kept: I64, source: str, places: list[str]) -> None:
+    """Check that stamps do not go back, and that fixes of one stamp are equal.
+
+    Raises:
+        MapError: They are not.
+    """
+    steps = np.diff(times_ns[kept])
+    differ = np.any(fixes[kept][1:] != fixes[kept][:-1], axis=1)
+    wrong = np.flatnonzero((steps < 0) | ((steps == 0) & differ))
+    if not len(wrong):
+        return
+    before, row = kept[wrong[0]], kept[wrong[0] + 1]
+    if steps[wrong[0]] == 0:
+        raise MapError(
+            f"{source}{places[row]}: has the stamp {times_ns[row]} ns of the fix before it "
+            f"({places[before][1:].strip()}) and another position: remove one of them"
+        )
+    raise MapError(
+        f"{source}{places[row]}: is not after the one before it ({times_ns[row]} ns): sort the file by time"
+    )
 
 
 def _from_csv(text: str, source: str, time_unit: str) -> GpsTrack:
-    table = parse_text_table(text, source, FIXES, unit=time_unit)
-    columns = _columns(table)
-    lat, lon, alt = (table.values[:, column] for column in columns)
-    _check_degrees(lat, lon, source, table.line_numbers)
-    return GpsTrack(table.times_ns, lat, lon, alt, source)
+    table = parse_text_table(text, source, FIXES, unit=time_unit, allow_nan=True)
+    reasons = np.full(len(table.times_ns), "", dtype=_REASON)
+    if len(table.header) == table.values.shape[1] + 1:
+        for place, name in enumerate(table.header[1:]):
+            if _STATUS.fullmatch(name):
+                reasons[table.values[:, place] < 0.0] = f"{NO_FIX} (status -1)"
+            elif _QUALITY.fullmatch(name):
+                reasons[table.values[:, place] <= 0.0] = f"{NO_FIX} (quality 0)"
+    fixes = table.values[:, _columns(table)]
+    return gps_track(table.times_ns, fixes, source, reasons, table.line_numbers)
 
 
 def _columns(table: TextTable) -> list[int]:
@@ -114,74 +194,96 @@ def _columns(table: TextTable) -> list[int]:
     )
 
 
-def _check_degrees(lat: F64, lon: F64, source: str, lines: I64) -> None:
-    wrong = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 180.0))
-    if len(wrong):
-        row = int(wrong[0])
-        raise MapError(
-            f"{source}:{lines[row]}: latitude {lat[row]:g}, longitude {lon[row]:g}: wants degrees, latitude "
-            "first"
-        )
-    # a rectangle in the ocean off Africa
-    if np.abs(lat).max() <= 0.5 * np.pi and np.abs(lon).max() <= np.pi:
-        raise MapError(f"{source}: latitude and longitude look like radians: degrees are wanted")
+class _Sentence(NamedTuple):
+    """What a sentence tells."""
+
+    clock_ns: int | None  # time of day
+    day_ns: int | None = None  # of RMC
+    is_valid: bool = False  # RMC of a receiver with a fix, whose date is therefore right
+    fix: tuple[float, float, float] | None = None  # of GGA
+    reason: str = ""  # why it is none
 
 
 def _from_nmea(text: str, source: str, date: str) -> GpsTrack:
-    """Read GGA sentences; their day is that of the RMC sentence before or after them."""
-    rows: list[tuple[int, float, float, float]] = []
-    day_ns = _day_ns(date) if date else _first_date(text)
-    without_fix, damaged = 0, 0
-    for line in text.splitlines():
-        if "GGA," not in line and "RMC," not in line:
-            continue
-        match = _SENTENCE.search(line)
-        fields = match["fields"].split(",") if match is not None else []
-        if match is None or not _is_intact(match):
-            damaged += 1
-            continue
-        if match["kind"] == "RMC":
-            named = _rmc_day_ns(fields)
-            day_ns = day_ns if named is None or date else named
-            continue
-        if len(fields) < 11 or fields[5] in ("", "0"):
-            without_fix += 1
-            continue
-        values = _gga(fields)
-        if values is None:
-            damaged += 1
-            continue
-        if day_ns is None:
-            raise UserError(f"{source}: has no date (no RMC sentences): give --gps_date=YYYY-MM-DD")
-        time_ns = day_ns + values[0]
-        if rows and time_ns < rows[-1][0] - _DAY_NS // 2:  # past midnight without a new date
-            day_ns += _DAY_NS
-            time_ns += _DAY_NS
-        if not rows or time_ns != rows[-1][0]:  # several talkers repeat a fix
-            rows.append((time_ns, *values[1:]))
-    if not rows:
-        raise MapError(
-            f"{source}: there are no fixes: {without_fix} sentences without position, {damaged} damaged"
-        )
-    times_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    lat, lon, alt = np.array([row[1:] for row in rows]).T
-    return GpsTrack(times_ns, lat, lon, alt, source, without_fix, damaged)
+    """Read GGA sentences; the days follow their hours from the RMC sentences, or from a given date."""
+    given_ns = _day_ns(date) if date else None
+    lines = [line for line in text.splitlines() if re.search("(GGA|RMC),", line, re.IGNORECASE)]
+    matches = [match for line in lines if (match := _SENTENCE.search(line)) is not None]
+    has_sums = any(match["sum"] for match in matches)
+    sentences = [s for match in matches if (s := _parse(match, has_sums)) is not None]
+    timed = [s for s in sentences if s.clock_ns is not None]
+    is_fix = np.array([s.fix is not None for s in timed], dtype=np.bool_)
+    times_ns = _times_ns(timed, is_fix, given_ns)
+    if times_ns is None:
+        raise UserError(f"{source}: has no date (no RMC sentences): give --gps_date=YYYY-MM-DD")
+    times_ns = times_ns[is_fix]
+    fixes = np.array([s.fix for s in timed if s.fix is not None], dtype=np.float64).reshape(-1, 3)
+    reasons = np.full(len(fixes), "", dtype=_REASON)
+    reasons[1:][np.diff(times_ns) == 0] = REPEATED  # by several talkers
+    without = [s.reason for s in sentences if s.reason] + [DAMAGED] * (len(lines) - len(sentences))
+    return gps_track(
+        np.append(times_ns, np.zeros(len(without), dtype=np.int64)),
+        np.append(fixes, np.full((len(without), 3), np.nan), axis=0),
+        source,
+        np.append(reasons, np.array(without, dtype=_REASON)),
+    )
+
+
+def _parse(match: re.Match[str], has_sums: bool) -> _Sentence | None:
+    """Return what a sentence tells, None if it is damaged."""
+    fields, kind = match["fields"].strip().split(","), match["kind"].upper()
+    if not (_is_intact(match) if has_sums else len(fields) >= _LEAST_FIELDS[kind]):
+        return None
+    if kind == "GGA" and (len(fields) < 11 or fields[5] in ("", "0")):
+        return _Sentence(None, reason=NO_FIX)
+    try:
+        clock_ns = _time_of_day_ns(fields[0])
+        if kind == "GGA":
+            return _Sentence(clock_ns, fix=_fix(fields))
+    except ValueError:
+        return None if kind == "GGA" else _Sentence(None)
+    return _Sentence(clock_ns, _rmc_day_ns(fields), fields[1].upper() == "A")
+
+
+def _times_ns(
+    sentences: list[_Sentence], is_fix: NDArray[np.bool_], given_ns: int | None
+) -> I64 | None:
+    """Return the times (N,) of sentences, None without any date.
+
+    Neighbours are less than half a day apart, unless the date says otherwise: so hours run over midnight,
+    forwards from a date and backwards to what comes before the first.
+    """
+    clock_ns = np.array([s.clock_ns for s in sentences], dtype=np.int64)
+    if not is_fix.any():
+        return clock_ns
+    half = _DAY_NS // 2
+    running = clock_ns[:1] + np.append(0, np.cumsum((np.diff(clock_ns) + half) % _DAY_NS - half))
+    if given_ns is not None:
+        first = int(np.argmax(is_fix))
+        return np.asarray(running + given_ns + clock_ns[first] - running[first])
+    dated = [k for k, s in enumerate(sentences) if s.day_ns is not None]
+    dated = [k for k in dated if sentences[k].is_valid] or dated
+    if not dated:
+        return None
+    days = np.array([sentences[k].day_ns for k in dated], dtype=np.int64)
+    offset = days + clock_ns[dated] - running[dated]
+    last = np.searchsorted(dated, np.arange(len(sentences)), side="right") - 1
+    return np.asarray(running + offset[np.maximum(last, 0)])
 
 
 def _is_intact(match: re.Match[str]) -> bool:
+    """Return whether the check sum is right, of the sentence as it is or in upper case."""
     content = f"{match['body']},{match['fields']}"
-    return functools.reduce(operator.xor, content.encode(), 0) == int(match["sum"], 16)
+    sums = {functools.reduce(operator.xor, text.encode(), 0) for text in (content, content.upper())}
+    return match["sum"] is not None and int(match["sum"], 16) in sums
 
 
-def _gga(fields: list[str]) -> tuple[int, float, float, float] | None:
-    """Return time of day [ns], latitude, longitude [deg] and ellipsoidal altitude [m], None if wrong."""
-    try:
-        lat = _degrees(fields[1], fields[2], "NS")
-        lon = _degrees(fields[3], fields[4], "EW")
-        altitude_m = float(fields[8]) + float(fields[10] or 0.0)
-        return _time_of_day_ns(fields[0]), lat, lon, altitude_m
-    except ValueError:
-        return None
+def _fix(fields: list[str]) -> tuple[float, float, float]:
+    """Return latitude, longitude [deg] and ellipsoidal altitude [m] of GGA; ValueError if they are none."""
+    lat = _degrees(fields[1], fields[2].upper(), "NS")
+    lon = _degrees(fields[3], fields[4].upper(), "EW")
+    altitude_m = float(fields[8]) + float(fields[10] or 0.0) if fields[8] else np.nan
+    return lat, lon, altitude_m
 
 
 def _degrees(text: str, hemisphere: str, signs: str) -> float:
@@ -200,16 +302,6 @@ def _time_of_day_ns(text: str) -> int:
         raise ValueError(text)
     whole = int(seconds[:2]) * 3600 + int(seconds[2:4]) * 60 + int(seconds[4:])
     return whole * 1_000_000_000 + int((fraction or "0").ljust(9, "0")[:9])
-
-
-def _first_date(text: str) -> int | None:
-    """Return the day [ns] of the first intact RMC sentence, which may follow the first fixes."""
-    for match in _SENTENCE.finditer(text):
-        if match["kind"] == "RMC" and _is_intact(match):
-            day_ns = _rmc_day_ns(match["fields"].split(","))
-            if day_ns is not None:
-                return day_ns
-    return None
 
 
 def _rmc_day_ns(fields: list[str]) -> int | None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.errors import MapError, UserError
-from maplab_py.interop.gps import GpsTrack, check_track, read_gps
+from maplab_py.errors import UserError
+from maplab_py.interop.gps import NO_FIX, GpsTrack, gps_track, read_gps
 from maplab_py.interop.recordings.bag_files import (
     all_messages,
     check_bag,
@@ -49,24 +49,22 @@ def read_gps_bag(path: Path, topic: str = "") -> GpsTrack:
         MapError: The bag or a message is damaged, there are no fixes, or stamps go back.
     """
     check_bag(path, "--gps_file")
-    rows: list[tuple[int, float, float, float]] = []
-    without_fix = 0
+    rows: list[tuple[float, float, float]] = []
+    stamps: list[int] = []
+    reasons: list[str] = []
     with opened_bag(path) as reader:
         name = _chosen(path, topic_types(reader), topic)
         connections = [c for c in reader.connections if c.topic == name]
         for connection, _, data in all_messages(path, reader, connections):
             message: Any = reader.deserialize(data, connection.msgtype)
-            fix = (float(message.latitude), float(message.longitude), float(message.altitude))
-            if message.status.status < _FIX_FROM or not np.all(np.isfinite(fix)):
-                without_fix += 1
-                continue
-            rows.append((header_stamp_ns(data, is_ros_2=reader.is2), *fix))
-    source = f"{path}: {name}"
-    if not rows:
-        raise MapError(f"{source}: none of its {without_fix} messages has a fix")
-    times_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    lat, lon, alt = np.array([row[1:] for row in rows]).T
-    return check_track(GpsTrack(times_ns, lat, lon, alt, source, without_fix))
+            status = int(message.status.status)
+            reasons.append(f"{NO_FIX} (status {status})" if status < _FIX_FROM else "")
+            rows.append((message.latitude, message.longitude, message.altitude))
+            stamps.append(header_stamp_ns(data, is_ros_2=reader.is2))
+    fixes = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return gps_track(
+        np.array(stamps, dtype=np.int64), fixes, f"{path}: {name}", np.array(reasons, dtype=np.str_)
+    )
 
 
 def _chosen(path: Path, types: dict[str, str], topic: str) -> str:

@@ -79,8 +79,12 @@ def parse_text_table(
     *,
     unit: str = "",
     span_ns: tuple[int, int] | None = None,
+    allow_nan: bool = False,
 ) -> TextTable:
-    """Parse the text of a table; `source` is its name in error messages, see `read_text_table`."""
+    """Parse the text of a table; `source` is its name in error messages, see `read_text_table`.
+
+    With `allow_nan` empty cells, infinities and NaN become NaN; else they are refused.
+    """
     lines, numbers, others = _data_lines(text)
     if not lines:
         raise MapError(f"{source}: there are no rows in the file: write or copy it again")
@@ -94,7 +98,7 @@ def parse_text_table(
             f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}: correct or "
             "remove the row"
         )
-    kept = _numeric(header, rows[0])
+    kept = _numeric(header, rows)
     if len(kept) < len(rows[0]):
         header = tuple(header[k] for k in kept)
         rows = [[row[k] for k in kept] for row in rows]
@@ -110,7 +114,10 @@ def parse_text_table(
         custom="ns" if has_commas else "s",
         span_ns=span_ns,
     )
-    values = _parse_values([row[1:] for row in rows], source, numbers)
+    cells = [row[1:] for row in rows]
+    if allow_nan:
+        cells = [[cell or "nan" for cell in row] for row in cells]
+    values = _parse_values(cells, source, numbers, allow_nan)
     return TextTable(
         source,
         header,
@@ -189,10 +196,11 @@ def _named_cells(
     return tuple(names), telling[0] if telling else "", [cells(line) for line in lines]
 
 
-def _numeric(header: tuple[str, ...], first: list[str]) -> list[int]:
-    """Return the columns without those that names and first row say to be text."""
-    if len(header) != len(first):
-        return list(range(len(first)))
+def _numeric(header: tuple[str, ...], rows: list[list[str]]) -> list[int]:
+    """Return the columns without those that names and first cells say to be text."""
+    if len(header) != len(rows[0]):
+        return list(range(len(rows[0])))
+    first = [next((row[k] for row in rows if row[k]), "") for k in range(len(header))]
     named = enumerate(zip(header, first, strict=True))
     return [k for k, (name, cell) in named if k == 0 or (_is_number(cell) and not _ID.search(name))]
 
@@ -223,7 +231,7 @@ def _words(line: str) -> list[str]:
     return names.split(",") if "," in names else names.split()
 
 
-def _parse_values(rows: list[list[str]], source: str, numbers: list[int]) -> F64:
+def _parse_values(rows: list[list[str]], source: str, numbers: list[int], allow_nan: bool) -> F64:
     width = len(rows[0])
     text = " ".join([" ".join(row) for row in rows])
     try:
@@ -232,12 +240,15 @@ def _parse_values(rows: list[list[str]], source: str, numbers: list[int]) -> F64
             values = np.fromstring(text, dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning):
         values = np.zeros(0)
-    if values.size == len(rows) * width and np.all(np.isfinite(values)):
+    is_complete = values.size == len(rows) * width
+    if is_complete and allow_nan:
+        values[np.isinf(values)] = np.nan
+    if is_complete and (allow_nan or np.all(np.isfinite(values))):
         return values.reshape(len(rows), width)
     for number, row in zip(numbers, rows, strict=True):
         for token in row:
             try:
-                is_finite = bool(np.isfinite(float(token)))
+                is_finite = bool(np.isfinite(float(token))) or allow_nan
             except ValueError:
                 is_finite = False
             if not is_finite:

@@ -276,7 +276,7 @@ def import_gps(
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
-    from maplab_py.algorithms.external_poses.reports import GpsImport
+    from maplab_py.algorithms.external_poses.reports import GpsImport, LeftOutFixes
     from maplab_py.interop.gps_bags import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
@@ -290,8 +290,7 @@ def import_gps(
         mission_labels(result.vi_map)[mission],
         len(track),
         result.added,
-        track.without_fix,
-        track.damaged,
+        tuple(LeftOutFixes(reason, count) for reason, count in track.left_out),
         *result.origin,
         *result.movement,
         result.median_error_m,

@@ -258,7 +258,7 @@ def test_nmea_of_every_kind(tmp_path: Path) -> None:
     no_fix = sentence("GPGGA,000000.00,,,,,0,00,,,M,,M,,")
     path.write_text("\n".join([no_fix, *lines, lines[-1][:20]]))
     track = read_gps(path)
-    assert (len(track), track.without_fix, track.damaged) == (3, 1, 2)
+    assert (len(track), dict(track.left_out)) == (3, {"without a fix": 1, "damaged": 2})
     # midnight without dates
     late = [
         f"GPGGA,{clock},4700.0,S,00800.0,W,1,9,1.0,1.0,M,,M,," for clock in ("235959", "000001")
@@ -270,6 +270,94 @@ def test_nmea_of_every_kind(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "left_out"),
+    [
+        (
+            "t,lat,lon,alt\n1,47,8,0\n" + "".join(f"{t},0,0,0\n" for t in range(2, 11)),
+            "latitude 0, longitude 0",
+        ),
+        ("t,lat,lon,alt\n1,47,8,0\n2,95,8,0\n3,47,8,0\n", "beyond 90 or 180 deg"),
+        ("t,lat,lon,alt\n1,nan,nan,nan\n2,,,\n3,47,8,0\n", "not a finite number"),
+        ("t,lat,lon,alt\n1,47,8,0\n1,47,8,0\n2,47,8,0\n", "repeated"),
+        ("t,lat,lon,alt,fix_type\n1,47,8,0,3\n2,46,8,0,0\n", "without a fix (quality 0)"),
+        (
+            "%time,field.header.frame_id,field.status.status,field.latitude,field.longitude,field.altitude\n"
+            "1400000000000000000,gps,0,47,8,0\n1400000001000000000,gps,-1,46,8,0\n",
+            "without a fix (status -1)",
+        ),
+    ],
+)
+def test_rows_that_are_no_fixes_are_counted_by_reason(
+    text: str, left_out: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "track.csv"
+    path.write_text(text)
+    track = read_gps(path)
+    assert list(dict(track.left_out)) == [left_out]
+    assert set(track.latitude_deg.tolist()) == {47.0}
+    assert len(track) + sum(dict(track.left_out).values()) == text.count("\n") - 1
+
+
+def clock(text: str) -> str:
+    return sentence(f"GPGGA,{text},4700.0,N,00800.0,E,1,9,1.0,1.0,M,0.0,M,,")
+
+
+def test_days_follow_the_hours(tmp_path: Path) -> None:
+    path = tmp_path / "night.nmea"
+    dated = "GPRMC,{},A,4700.0,N,00800.0,E,0.0,0.0,{},,,A"
+    first_rmc_after_midnight = [
+        clock("235958"),
+        clock("235959"),
+        sentence(dated.format("000000", "010324")),
+        clock("000000"),
+    ]
+    void = [
+        sentence(dated.format("235957", "060180").replace(",A,4700", ",V,4700")),
+        *first_rmc_after_midnight,
+    ]
+    over_two = [
+        sentence(dated.format("235958", "290224")),
+        clock("235958"),
+        clock("235959"),
+        clock("000000"),
+    ]
+    for lines in (first_rmc_after_midnight, void, over_two):
+        path.write_text("\n".join(lines))
+        stamps = [dt.datetime.fromtimestamp(t / 1e9, dt.UTC) for t in read_gps(path).times_ns]
+        assert [f"{t:%d %H:%M:%S}" for t in stamps] == ["29 23:59:58", "29 23:59:59", "01 00:00:00"]
+    later = [
+        sentence(dated.format("120000", "010324")),
+        clock("120000"),
+        sentence(dated.format("120000", "040324")),
+        clock("120000"),
+    ]
+    path.write_text("\n".join(later))
+    assert np.diff(read_gps(path).times_ns).tolist() == [3 * 86_400 * 10**9]
+
+
+def test_sentences_of_other_programs(tmp_path: Path) -> None:
+    path, day = tmp_path / "log.txt", "2024-03-01"
+    lines = [clock("120000"), clock("120001.5")]
+    wanted = [43_200_000_000_000, 43_201_500_000_000]
+    others = {
+        "text before": [f"2024-03-01 12:00:00.123 [gps] {line}" for line in lines],
+        "lower-case sums": [line[:-2] + line[-2:].lower() for line in lines],
+        "lower case": [line.lower() for line in lines],
+        "no sums": [line[:-3] for line in lines],
+        "no sums and a cut line": [*(line[:-3] for line in lines), "$GPGGA,120002,4700.0"],
+    }
+    for name, texts in others.items():
+        path.write_text("\n".join(texts))
+        track = read_gps(path, day)
+        assert (track.times_ns - track.times_ns[0] + wanted[0]).tolist() == wanted, name
+        assert dict(track.left_out) == ({"damaged": 1} if "cut" in name else {}), name
+    path.write_bytes(b"\xb5\x62\x01\x07\xff" + "\r\n".join(lines).encode() + b"\xb5\x62\xfe\n")
+    assert len(read_gps(path, day)) == 2
+    path.write_text("\n".join([*lines, lines[0][:-3]]))  # one sum lacks where others have one
+    assert dict(read_gps(path, day).left_out) == {"damaged": 1}
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "no rows"),
@@ -277,7 +365,10 @@ def test_nmea_of_every_kind(tmp_path: Path) -> None:
         ("t,lat,lon\n1,47,8\n", "no positions"),
         ("t,lat,lon,alt\n1,473769000,85417000,0\n", "wants degrees"),
         ("t,lat,lon,alt\n1,0.826,0.149,0\n2,0.826,0.149,0\n", "radians"),
-        ("t,lat,lon,alt\n2,47,8,0\n1,47,8,0\n", "not after the one before"),
+        ("t,lat,lon,alt\n2,47,8,0\n1,47,8,0\n", ":3: is not after the one before"),
+        ("t,lat,lon,alt\n1,47,8,0\n1,47,9,0\n", r":3: has the stamp .* of the fix before it \(2\)"),
+        ("t,lat,lon,alt\n1,0,0,0\n2,0,0,0\n", "no fixes: 2 latitude 0, longitude 0"),
+        ("t,lat,lon,alt,status\n1,47,8,0,-1\n2,47,8,0,-1\n", r"2 without a fix \(status -1\)"),
         ("t,lat,lon,alt\n1,47,8,nan\n", "not a finite number"),
         ("t,lat,lon,alt\n1,47,8,0\n2,47,8\n", "columns"),
         ("$GPGGA,12", "no fixes"),

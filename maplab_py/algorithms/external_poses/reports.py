@@ -33,6 +33,14 @@ class TrajectoryImport(Report):
 
 
 @dataclasses.dataclass(frozen=True)
+class LeftOutFixes:
+    """Rows or messages that are no fixes."""
+
+    reason: str
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
 class GpsImport(Report):
     """Positions that became measurements of a mission."""
 
@@ -40,8 +48,7 @@ class GpsImport(Report):
     mission: str
     fixes_in_file: int
     added: int  # each to another vertex
-    without_position: int  # sentences of a receiver without a fix
-    damaged: int  # sentences with a wrong check sum
+    left_out: tuple[LeftOutFixes, ...]
     origin_latitude_deg: float
     origin_longitude_deg: float
     origin_altitude_m: float

@@ -80,8 +80,17 @@ def test_fixes_are_read_to_the_last_bit(kind: BagFormat, tmp_path: Path) -> None
         np.testing.assert_array_equal(track.times_ns, TIMES_NS[rows])
         found = np.column_stack([track.latitude_deg, track.longitude_deg, track.altitude_m])
         np.testing.assert_array_equal(found, PLACES[rows])
-        assert (len(track), track.without_fix) == (4, 2)
+        assert len(track) == 4
+        assert dict(track.left_out) == {"without a fix (status -1)": 1, "not a finite number": 1}
         assert track.source == f"{path}: /gps/fix"
+
+
+def test_places_that_no_receiver_has_are_left_out(tmp_path: Path) -> None:
+    places = PLACES.copy()
+    places[1:5], places[5, 0] = 0.0, 95.0
+    track = read_fixes(write_fixes(tmp_path, FORMATS[0], "/fix", places=places))
+    assert track.latitude_deg.tolist() == [PLACES[0, 0]]
+    assert dict(track.left_out) == {"latitude 0, longitude 0": 4, "beyond 90 or 180 deg": 1}
 
 
 def test_bags_without_the_wanted_fixes_are_refused(tmp_path: Path) -> None:
@@ -99,7 +108,7 @@ def test_bags_without_the_wanted_fixes_are_refused(tmp_path: Path) -> None:
         read_fixes(two, topic="/fix")
     with pytest.raises(UserError, match="no topic has sensor_msgs/NavSatFix; topics: /imu"):
         read_fixes(write_fixes(folders[1], kind))
-    with pytest.raises(MapError, match="none of its 6 messages has a fix"):
+    with pytest.raises(MapError, match=r"no fixes: 6 without a fix \(status -1\)"):
         read_fixes(write_fixes(folders[2], kind, "/fix", status=(-1,) * COUNT))
     with pytest.raises(MapError, match="is not after the one before"):
         read_fixes(write_fixes(folders[3], kind, "/fix", times_ns=TIMES_NS[::-1]))
