@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.algorithms.external_poses.options import (
     GpsOptions,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from maplab_py.algorithms.self_calibration.reports import ComparedParameter
     from maplab_py.interop.calibration_import import CalibrationFile
     from maplab_py.interop.trajectories import Trajectory
+    from maplab_py.sensors import Imu
 
 _TRAJECTORY, _GPS, _WHEELS = TrajectoryOptions(), GpsOptions(), WheelOptions()
 _DEVICE = DeviceOptions()
@@ -44,6 +46,29 @@ class ReadCamera:
     width_px: int
     height_px: int
     time_shift_s: float  # t_imu - t_camera
+    line_delay_ns: int  # 0 = global shutter
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadParameter:
+    """A number of a calibration file."""
+
+    parameter: str
+    unit: str
+    value: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _ShownParameter:
+    parameter: str
+    value: str
+    unit: str
+
+
+def _as_shown(row: ReadParameter | _ShownParameter) -> _ShownParameter:
+    if isinstance(row, _ShownParameter):  # a shown report is laid out, too
+        return row
+    return _ShownParameter(row.parameter, f"{row.value:.6g}", row.unit)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +80,15 @@ class CalibrationImport(Report):
     cameras: tuple[ReadCamera, ...]
     has_imu: bool
     has_imu_intrinsics: bool
+    parameters: tuple[ReadParameter, ...] = ()  # poses are on the IMU, else on the first camera
+    notes: tuple[str, ...] = ()  # what was not understood, contradicts, or is odd
     sensors_file: Path | None = None  # that was written
     changes: tuple[ComparedParameter, ...] = ()  # of the map's device
+
+    def display(self) -> CalibrationImport:
+        """Return the report with six digits of numbers, and without what the changes say, too."""
+        shown: Any = () if self.changes else tuple(_as_shown(row) for row in self.parameters)
+        return dataclasses.replace(self, parameters=shown)
 
     @property
     def advice(self) -> str:
@@ -85,16 +117,17 @@ def import_calibration(
     chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
 ) -> CalibrationImport:
-    """Read a calibration of kalibr, EuRoC, OpenVINS, Basalt or COLMAP, for sensors.yaml or for the map.
+    """Read a calibration of another program, for sensors.yaml or for the map.
 
-    The format follows from the content. In a map poses and stamps are unchanged: a time shift that differs
-    from that of the recording becomes an image delay.
+    The format follows from the content: kalibr, EuRoC, OpenVINS, Basalt, COLMAP, VINS-Mono and VINS-Fusion,
+    ORB-SLAM, stella_vslam, Kimera, OKVIS, SVO, DM-VIO, ROS' CameraInfo, OpenCV, RealSense, maplab. In a map
+    poses and stamps are unchanged: a time shift that differs from that of the recording becomes an image
+    delay.
 
     Args:
-        calibration_file: kalibr's camera chain or IMU file, OpenVINS' estimator_config.yaml, a sensor.yaml
-            of EuRoC or the folder with all of them, Basalt's json, the folder of a COLMAP model of one rig,
-            its cameras.txt or cameras.bin of one camera, or sensors.yaml.
-        imu_calibration_file: IMU file that belongs to a camera chain, or to the sensor.yaml of a camera.
+        calibration_file: File with cameras, an IMU or both; or the folder of an EuRoC recording, of OpenVINS'
+            or Kimera's parameters, or of a COLMAP model of one rig.
+        imu_calibration_file: File of the IMU, where the other has cameras alone, as kalibr's camera chain.
         sensors_file: Write sensors.yaml for maplab here.
         apply: Give the calibration to the device of the map.
         apply_imu_noise: With --apply, take over the noise densities of the IMU, too.
@@ -143,14 +176,55 @@ def _described(
                 camera.width_px,
                 camera.height_px,
                 camera.time_offset_ns * 1e-9 + camera.image_delay_s,
+                camera.line_delay_ns,
             )
             for camera in cameras
         ),
         has_imu=imu is not None,
         has_imu_intrinsics=imu is not None and imu.intrinsics is not None,
+        parameters=(*_camera_parameters(calibration), *_imu_parameters(imu)),
+        notes=calibration.notes,
         sensors_file=written,
         changes=changes,
     )
+
+
+def _camera_parameters(calibration: CalibrationFile) -> Iterator[ReadParameter]:
+    import numpy as np
+
+    from maplab_py.geometry import so3
+    from maplab_py.sensors.camera import parameter_names
+
+    if not calibration.rig_id:
+        return
+    for row, (camera, T) in enumerate(zip(calibration.cameras, calibration.T_I_C, strict=True)):
+        names = parameter_names(camera.projection, camera.distortion)
+        values = [*camera.intrinsics, *camera.distortion_parameters]
+        names += [(f"position {axis}", "m") for axis in "xyz"]
+        names += [(f"rotation about {axis}", "deg") for axis in "xyz"]
+        values += [*T[4:], *np.degrees(so3.log(T[:4]))]
+        for (name, unit), value in zip(names, values, strict=True):
+            yield ReadParameter(f"camera {row} {name}", unit, float(value))
+
+
+def _imu_parameters(imu: Imu | None) -> Iterator[ReadParameter]:
+    from maplab_py.sensors.imu import TRIANGLE_NAMES
+
+    if imu is None:
+        return
+    for name, unit, value in (
+        ("accelerometer noise", "m/s²/√Hz", imu.acc_noise_density),
+        ("accelerometer random walk", "m/s³/√Hz", imu.acc_bias_random_walk_noise_density),
+        ("gyroscope noise", "rad/s/√Hz", imu.gyro_noise_density),
+        ("gyroscope random walk", "rad/s²/√Hz", imu.gyro_bias_random_walk_noise_density),
+        ("gravity", "m/s²", imu.gravity_magnitude_mps2),
+    ):
+        yield ReadParameter(name, unit, value)
+    if imu.intrinsics is None:
+        return
+    for sensor, T in (("gyroscope", imu.intrinsics.T_g), ("accelerometer", imu.intrinsics.T_a)):
+        for name, place in TRIANGLE_NAMES.items():
+            yield ReadParameter(f"{sensor} {name}", "", float(T[place]))
 
 
 @command(

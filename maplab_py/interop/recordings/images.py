@@ -41,6 +41,14 @@ class EncodedImage:
         """Check size and completeness; see `ImageData.check`."""
         self._checked_bytes()
 
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height as recorded.
+
+        Raises:
+            MapError: The image cannot be read.
+        """
+        return encoded_size(self.name, self.read())
+
     def decode(self) -> Pixels:
         """Return the pixels; see `ImageData.decode`."""
         return encoded_pixels(self.name, self._checked_bytes(), self.form)
@@ -77,6 +85,10 @@ class RawImage:
     step: int  # bytes of a row
     is_big_endian: bool
     data: Any  # buffer
+
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height as recorded."""
+        return self.width_px, self.height_px
 
     def check(self) -> None:
         """Check size and completeness; see `ImageData.check`."""
@@ -158,7 +170,10 @@ def check_size(name: str, camera: Camera, width_px: int, height_px: int) -> None
         MapError: It has another; names both.
     """
     if (width_px, height_px) != (camera.width_px, camera.height_px):
+        remedy = "calibrate the camera at the size it records"
+        if (width_px, height_px) == (camera.height_px, camera.width_px):
+            remedy = "does the calibration have the height before the width?"
         raise MapError(
             f"{name}: the image is {width_px} x {height_px}, the calibration is of "
-            f"{camera.width_px} x {camera.height_px}: calibrate the camera at the size it records"
+            f"{camera.width_px} x {camera.height_px}: {remedy}"
         )

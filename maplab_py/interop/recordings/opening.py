@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
-from maplab_py.errors import UserError
+from maplab_py.errors import MaplabError, UserError
 from maplab_py.interop.calibration_import import import_calibration, read_calibration
 from maplab_py.interop.calibrations.euroc import HOW_TO_CALIBRATE
 from maplab_py.interop.device import RecordedSensors, with_cameras, with_time_offset
 from maplab_py.interop.recordings.bag_files import is_bag
 from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
+from maplab_py.interop.recordings.images import EncodedImage, RawImage, check_size
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import Recording
+from maplab_py.interop.recordings.protocol import CameraImage, Recording
+
+_FIRST_ITEMS = 5000
+"""Items among which first images are looked for."""
 
 
 def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
@@ -32,7 +37,9 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             )
         active = options.active_cameras
         device = _chosen(_calibration(options) or import_calibration(root), options)
-        return FolderRecording(root, device, active, image_bits=options.image_bits)
+        return _with_sizes_checked(
+            FolderRecording(root, device, active, image_bits=options.image_bits)
+        )
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
     if not is_bag(path):
@@ -43,13 +50,43 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
     given = _calibration(options)
     if given is None:
         raise UserError(f"{path}: a bag has no calibration: {HOW_TO_CALIBRATE}")
-    return BagRecording(
-        path,
-        _chosen(given, options),
-        imu_topic=options.imu_topic,
-        camera_topics=options.topics_of_cameras,
-        image_bits=options.image_bits,
+    return _with_sizes_checked(
+        BagRecording(
+            path,
+            _chosen(given, options),
+            imu_topic=options.imu_topic,
+            camera_topics=options.topics_of_cameras,
+            image_bits=options.image_bits,
+        )
     )
+
+
+def _with_sizes_checked(recording: Recording) -> Recording:
+    """Return the recording if the first image of each camera has the size that was calibrated.
+
+    Raises:
+        MapError: It has another size.
+    """
+    sizes = _first_sizes_px(recording)
+    for row, camera in enumerate(recording.device.cameras):
+        if row in sizes:
+            check_size(f"{recording.name}: camera {row}", camera, *sizes[row])
+    return recording
+
+
+def _first_sizes_px(recording: Recording) -> dict[int, tuple[int, int]]:
+    """Return width and height of the first image of each camera, as far as they are soon found."""
+    sizes: dict[int, tuple[int, int]] = {}
+    try:
+        for item in itertools.islice(recording.items(), _FIRST_ITEMS):
+            if isinstance(item, CameraImage) and item.camera not in sizes:
+                if isinstance(item.data, EncodedImage | RawImage):
+                    sizes[item.camera] = item.data.size_px()
+                if len(sizes) == len(recording.device.cameras):
+                    break
+    except MaplabError:  # the run names it, if it is not skipped
+        return sizes
+    return sizes
 
 
 def _chosen(device: RecordedSensors, options: SourceOptions) -> RecordedSensors:

@@ -18,10 +18,13 @@ class SourceOptions:
     flag_prefix: ClassVar[str] = ""
 
     sensor_calibration_file: Path | None = option(
-        None, help="Calibration: sensors.yaml or kalibr's camchain; empty = as the recording has it"
+        None,
+        help="Calibration: sensors.yaml, kalibr's camchain, or a file of another program that "
+        "import_calibration reads; empty = as the recording has it",
     )
     imu_calibration_file: Path | None = option(
-        None, help="kalibr's IMU file, which belongs to a camchain"
+        None,
+        help="File of the IMU, where the calibration has cameras alone, as kalibr's camchain",
     )
     device: DeviceOptions = DeviceOptions()
     rovio_active_camera_indices: str = option(

@@ -230,8 +230,8 @@ DAMAGES = {
         "there is no calibration .*--sensor_calibration_file",
     ),
     "no camera model": (
-        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "pinhole", "ds"),
-        r"cam0/sensor\.yaml: key 'camera_model': 'ds' is not supported",
+        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "pinhole", "ocam"),
+        r"cam0/sensor\.yaml: key 'camera_model': 'ocam' is not supported",
     ),
     "no intrinsics": (
         lambda f: _edit(f / "mav0/cam0/sensor.yaml", "intrinsics", "intrinsic"),
