@@ -1,0 +1,91 @@
+"""Workflows on recorded maps under the arithmetic of several processors: same decisions, same digits."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.e2e.support import run_program
+from tests.support.data import shared_data
+
+pytestmark = pytest.mark.slow
+
+EUROC = (
+    "load_merge_all_submaps --maps_folder={euroc}; elq; kfh; optvi; relax; lc; optvi; "
+    "evaluate_trajectory --ground_truth={truth}"
+)
+TANGO = "load {tango}; elq; kfh; optvi; relax; lc; optvi"
+USUAL = ("", "")
+KINDS = [
+    ("OPENBLAS_CORETYPE", "Prescott"),
+    ("OPENBLAS_CORETYPE", "Haswell"),
+    ("OPENBLAS_CORETYPE", "Zen"),
+    ("OPENBLAS_CORETYPE", "SkylakeX"),
+    ("NUMBA_CPU_NAME", "generic"),
+]
+VARIES = {"iterations", "rejected_steps", "linear_iterations", "trust_region_radius", "termination"}
+VARIES |= {"recent_decrease_percent", "note", "notes"}
+"""Values of reports that say on which way the optimum was reached, and texts."""
+
+
+@cache
+def reports(chain: str, kind: tuple[str, str], home: Path) -> list[dict[str, Any]]:
+    """Return the reports of a chain of commands that runs under one kind of arithmetic."""
+    script = chain.format(
+        euroc=shared_data("maplab_maps/euroc_v1_01"),
+        truth=shared_data("euroc_imu/V101.gt.csv"),
+        tango=shared_data("maplab_maps/tango_handheld"),
+    )
+    extra = {kind[0]: kind[1]} if kind != USUAL else {}
+    done = run_program(home, "--json", "--discard", "-c", script, extra=extra, seconds=1200)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return [json.loads(line)["report"] for line in done.stdout.splitlines() if line]
+
+
+def numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """Iterate over the numbers of a report that do not depend on time or way, with their names."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            if key not in VARIES and "second" not in key:
+                yield from numbers(each, f"{name}.{key}")
+    elif isinstance(value, list):
+        for each in value:
+            yield from numbers(each, name)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, value
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("home")
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=" ".join)
+@pytest.mark.parametrize("chain", [EUROC, TANGO], ids=["euroc", "tango"])
+def test_results_do_not_depend_on_the_processor(
+    chain: str, kind: tuple[str, str], home: Path
+) -> None:
+    if kind[1] == "SkylakeX" and not has_avx512():
+        pytest.skip("the processor has no AVX-512")
+    expected = list(numbers(reports(chain, USUAL, home)))
+    actual = list(numbers(reports(chain, kind, home)))
+    assert [name for name, _ in actual] == [name for name, _ in expected]
+    assert len(expected) > 100
+    for (name, one), (_, other) in zip(expected, actual, strict=True):
+        if isinstance(one, int):  # closures, merges, landmarks
+            assert other == pytest.approx(one, rel=5e-3, abs=2), name
+        else:
+            assert other == pytest.approx(one, rel=1e-3, abs=1e-4), name
+
+
+def has_avx512() -> bool:
+    """Return whether this processor has the instructions that SkylakeX stands for."""
+    if not sys.platform.startswith("linux"):
+        return False
+    return "avx512dq" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
