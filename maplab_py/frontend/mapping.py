@@ -62,6 +62,7 @@ class Mapping:
         staging_parent: Path | None = None,
         observer: Observer | None = None,
         make_starter: MakeStarter | None = None,
+        status: Callable[[], str] = str,
     ) -> None:
         """Prepare a run.
 
@@ -71,6 +72,7 @@ class Mapping:
             staging_parent: Folder for the temporary folder of images; None = the system's.
             observer: Told of every frame.
             make_starter: See `Odometry`.
+            status: Returns what the status line says beside the odometry; mostly nothing.
 
         Raises:
             FlagError: An option is wrong.
@@ -78,7 +80,7 @@ class Mapping:
         """
         self.options = options or RunOptions()
         self.options.check()
-        self._recording, self._observer = recording, observer
+        self._recording, self._observer, self._status = recording, observer, status
         device, localization = recording.device, self.options.localization
         self.localization = opened_localization(localization, device, self.options.odometry.window)
         self.localized = LocalizationRecord()
@@ -128,6 +130,7 @@ class Mapping:
                     break
                 for update in self._pushed(event):
                     self._take(update, progress)
+            self.is_ended_early |= is_to_end()  # a live source ends itself
         except Cancelled:
             raise
         except MaplabError as error:
@@ -194,7 +197,8 @@ class Mapping:
         now_s = time.perf_counter()
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_EVERY_S
-            progress.step(self.statistics.duration_s, 0.0, self.statistics.status_line(update))
+            line = f"{self.statistics.status_line(update)}  {self._status()}".rstrip()
+            progress.step(self.statistics.duration_s, 0.0, line)
 
     def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
         if update.healthy_until_ns:

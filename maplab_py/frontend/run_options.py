@@ -11,10 +11,11 @@ import numpy as np
 from maplab_py.errors import FlagError
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.interop.live.options import TRANSPORTS
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.options import option
 
-DATA_SOURCES = ("auto", "euroc", "rosbag", "map")
+DATA_SOURCES = ("auto", "euroc", "rosbag", "map", *TRANSPORTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +28,8 @@ class DataSourceOptions:
         "auto",
         choices=DATA_SOURCES,
         help="euroc = EuRoC or TUM-VI folder, rosbag = ROS 1 or ROS 2 bag, map = replay of the tracks "
-        "and IMU samples of a mission, auto = what the path is",
+        "and IMU samples of a mission, ros2, ros1 or foxglove = topics of a running robot, auto = what "
+        "the path is",
     )
     rosbag: Path | None = option(None, help="Bag to read (datasource_type=rosbag)")
     map_mission: str = option(

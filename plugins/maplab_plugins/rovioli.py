@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 from maplab_py.cancellation import ending_early
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
+from maplab_py.interop.live.options import TRANSPORTS, LiveOptions, NetworkOptions
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.plugin import (
     CommandContext,
     EstimationError,
+    UserError,
     check_writable,
     command,
     key_of_folder,
@@ -25,12 +27,15 @@ if TYPE_CHECKING:
     from maplab_py.frontend.mapping import Mapping, Observer
     from maplab_py.frontend.odometry_update import OdometryUpdate
     from maplab_py.frontend.reports import MappingReport
+    from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.viewer.display.viewer import Viewer
 
 _DATA = DataSourceOptions()
 _SOURCE = SourceOptions()
 _RUN = RunOptions()
 _SUBMAPS = SubmapOutput()
+_NETWORK = NetworkOptions()
+_LIVE = LiveOptions()
 _DEFAULT_KEY = "rovioli"
 
 
@@ -56,6 +61,8 @@ def rovioli(
     source: SourceOptions = _SOURCE,
     run: RunOptions = _RUN,
     submaps: SubmapOutput = _SUBMAPS,
+    network: NetworkOptions = _NETWORK,
+    live: LiveOptions = _LIVE,
     map_key: str = "",
     rovioli_visualize_map: bool = False,
     map_publish_interval_s: float = 2.0,
@@ -67,7 +74,8 @@ def rovioli(
     --vio_localization_map_folder it tells where it is in that map. The new map stays in memory and is
     saved to --save_map_folder; with --submap_spool it goes to a map server in parts. Ctrl-C ends the
     recording: the map so far is finished, kept in memory, and saved likewise. A second Ctrl-C cancels
-    the command.
+    the command. With --datasource_type=ros2, ros1 or foxglove it reads the topics of a running robot, and
+    publishes where it is as /maplab/odometry, /maplab/pose_in_map and /tf.
 
     Args:
         datasource_folder: EuRoC or TUM-VI folder, ROS bag, or map folder.
@@ -75,6 +83,7 @@ def rovioli(
         rovioli_visualize_map: Show the map, its landmarks and the image in the viewer as they grow.
         map_publish_interval_s: Time between two pictures in the viewer.
     """
+    from maplab_plugins.live import live_run
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping
@@ -92,16 +101,27 @@ def rovioli(
             check_writable(file, overwrite=output.overwrite_existing_map)
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
-    recording = open_source(datasource_folder, data, source)
     observers: list[Observer] = []
     if rovioli_visualize_map:
         observers.append(_observer(context, key, map_publish_interval_s))
     writer = SubmapWriter(submaps) if submaps.submap_spool is not None else None
     if writer is not None:
         observers.append(writer)
-    mapping = Mapping(recording, run, observer=_Several(observers))
-    with ending_early() as is_to_end:
+    with contextlib.ExitStack() as stack:
+        is_to_end = stack.enter_context(ending_early())
+        recording: Recording
+        if data.type in TRANSPORTS:
+            _check_live(datasource_folder, data, run)
+            live_source = stack.enter_context(
+                live_run(context, data.type, source, network, live, run.stream)
+            )
+            recording, status = live_source.recording, live_source.recording.status
+            observers.insert(0, live_source)  # poses are published before anything else is done
+        else:
+            recording, status = open_source(datasource_folder, data, source), str
+        mapping = Mapping(recording, run, observer=_Several(observers), status=status)
         mapping.run(context.progress, is_to_end=is_to_end)
+        mapping.statistics.notes.extend(recording.notes)
         if writer is not None:
             writer.finish(mapping)
         finished = finish(
@@ -122,6 +142,24 @@ def rovioli(
             disk_copy=finished.disk_copy,
         )
     return finished.report
+
+
+def _check_live(folder: Path | None, data: DataSourceOptions, run: RunOptions) -> None:
+    """Refuse what only recordings have.
+
+    Raises:
+        UserError: A flag contradicts the live source.
+    """
+    for flag, is_given in (
+        ("datasource_folder", folder is not None),
+        ("datasource_rosbag", data.rosbag is not None),
+        ("map_mission", bool(data.map_mission)),
+        ("vio_rosbag_start_s", bool(run.stream.start_s)),
+        ("vio_rosbag_end_s", bool(run.stream.end_s)),
+        ("vio_rosbag_realtime_playback_rate", bool(run.realtime_playback_rate)),
+    ):
+        if is_given:
+            raise UserError(f"--datasource_type={data.type} is live: leave out --{flag}")
 
 
 class _Several:

@@ -162,9 +162,17 @@ def tf_messages(
 
 
 def odometry_messages(
-    times_ns: I64, T_A_B: F64, v_A: F64, frames: tuple[str, str], *, is_ros_2: bool
+    times_ns: I64,
+    T_A_B: F64,
+    v_A: F64,
+    frames: tuple[str, str],
+    *,
+    is_ros_2: bool,
+    w_B: ArrayLike = 0.0,
+    pose_covariance: ArrayLike = 0.0,
+    twist_covariance: ArrayLike = 0.0,
 ) -> list[bytes]:
-    """Return nav_msgs/Odometry; its twist is in B, without angular velocity.
+    """Return nav_msgs/Odometry; its twist is in B.
 
     Args:
         times_ns: Stamps (N,).
@@ -172,6 +180,9 @@ def odometry_messages(
         v_A: Velocities (N, 3) of B, in A [m/s].
         frames: Names of A and B.
         is_ros_2: CDR, else ROS 1.
+        w_B: Angular velocities (N, 3) of B, in B [rad/s].
+        pose_covariance: (N, 36) of position and turn about the axes of A; 0 = unknown.
+        twist_covariance: (N, 36) of velocity and angular velocity in B; 0 = unknown.
     """
     from maplab_py.geometry import so3
 
@@ -180,14 +191,18 @@ def odometry_messages(
     layout.text(frames[1])
     layout.values("p", "<f8", 3)
     layout.values("q", "<f8", 4)
-    layout.constant("<f8", np.zeros(36))
+    layout.values("pose_covariance", "<f8", 36)
     layout.values("v", "<f8", 3)
-    layout.constant("<f8", np.zeros(3 + 36))
+    layout.values("w", "<f8", 3)
+    layout.values("twist_covariance", "<f8", 36)
     return layout.filled(
         len(times_ns),
         p=T_A_B[:, 4:],
         q=T_A_B[:, :4],
+        pose_covariance=pose_covariance,
         v=so3.rotate(so3.inverse(T_A_B[:, :4]), v_A),
+        w=w_B,
+        twist_covariance=twist_covariance,
         **stamp_columns("stamp", times_ns, is_ros_2=is_ros_2),
     )
 

@@ -47,13 +47,10 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             f"{path} is no recording: wants a folder with mav0/cam0, a ROS 1 bag (.bag) or a ROS 2 "
             "bag (folder with metadata.yaml, .db3, .mcap)"
         )
-    given = _calibration(options)
-    if given is None:
-        raise UserError(f"{path}: a bag has no calibration: {HOW_TO_CALIBRATE}")
     return _with_sizes_checked(
         BagRecording(
             path,
-            _chosen(given, options),
+            given_device(options, f"{path}: a bag"),
             imu_topic=options.imu_topic,
             camera_topics=options.topics_of_cameras,
             image_bits=options.image_bits,
@@ -87,6 +84,19 @@ def _first_sizes_px(recording: Recording) -> dict[int, tuple[int, int]]:
     except MaplabError:  # the run names it, if it is not skipped
         return sizes
     return sizes
+
+
+def given_device(options: SourceOptions, source: str) -> RecordedSensors:
+    """Return the sensors of the calibration that the options name.
+
+    Raises:
+        UserError: They name none; `source` has none.
+        MapError: A file of it is missing or damaged.
+    """
+    given = _calibration(options)
+    if given is None:
+        raise UserError(f"{source} has no calibration: {HOW_TO_CALIBRATE}")
+    return _chosen(given, options)
 
 
 def _chosen(device: RecordedSensors, options: SourceOptions) -> RecordedSensors:

@@ -1,0 +1,103 @@
+"""Options of connections to running robots."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import ClassVar
+
+from maplab_py.errors import FlagError
+from maplab_py.options import option
+
+TRANSPORTS = ("ros2", "ros1", "foxglove")
+_HIGHEST_DOMAIN = 232
+_DEFAULT_MASTER = "http://127.0.0.1:11311"
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkOptions:
+    """Where the topics are."""
+
+    flag_prefix: ClassVar[str] = ""
+
+    ros_domain_id: int | None = option(
+        None, help="Domain of ROS 2; empty = ROS_DOMAIN_ID of the environment, else 0"
+    )
+    ros_master_uri: str = option(
+        "",
+        help=f"Master of ROS 1; empty = ROS_MASTER_URI of the environment, else {_DEFAULT_MASTER}",
+    )
+    foxglove_url: str = option(
+        "ws://127.0.0.1:8765", help="WebSocket of foxglove_bridge, or of what speaks its protocol"
+    )
+    live_interface: str = option(
+        "",
+        help="Network interface or IP address to listen on; empty = this computer only (loopback)",
+    )
+    live_wait_s: float = option(10.0, help="Wait so long for the first publishers", unit="s")
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of its range.
+        """
+        if not 0.0 < self.live_wait_s < 1e9:
+            raise FlagError(f"--live_wait_s={self.live_wait_s:g}: must be greater than 0")
+
+    @property
+    def domain(self) -> int:
+        """Domain of ROS 2.
+
+        Raises:
+            FlagError: It is none.
+        """
+        text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+        source = "--ros_domain_id" if self.ros_domain_id is not None else "ROS_DOMAIN_ID"
+        value = str(self.ros_domain_id) if self.ros_domain_id is not None else text
+        if not value.isdecimal() or int(value) > _HIGHEST_DOMAIN:
+            raise FlagError(f"{source}={value}: a domain is a number from 0 to {_HIGHEST_DOMAIN}")
+        return int(value)
+
+    @property
+    def master(self) -> str:
+        """Address of the ROS 1 master."""
+        return self.ros_master_uri or os.environ.get("ROS_MASTER_URI", "") or _DEFAULT_MASTER
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveOptions:
+    """How a live source is read, and what is published."""
+
+    flag_prefix: ClassVar[str] = "live_"
+
+    silence_s: float = option(
+        10.0, help="End when nothing has arrived for so long; 0 = only Ctrl-C ends", unit="s"
+    )
+    max_delay_s: float = option(
+        1.0,
+        help="Leave out the oldest images when they have waited longer than this; IMU samples are "
+        "never left out",
+        unit="s",
+    )
+    publish: bool = option(
+        True,
+        help="Publish /maplab/odometry, /maplab/pose_in_map and /tf where the images come from",
+    )
+    publish_landmarks: bool = option(
+        False, help="Publish the landmarks of the window as /maplab/landmarks (PointCloud2), too"
+    )
+    world_frame: str = option("map", help="Name of the global frame G in what is published")
+    odom_frame: str = option("odom", help="Name of the frame M of the mission in what is published")
+    base_frame: str = option("imu", help="Name of the body frame I in what is published")
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of its range.
+        """
+        if not 0.0 <= self.silence_s < 1e9:
+            raise FlagError(f"--live_silence_s={self.silence_s:g}: wants 0 or more")
+        if not 0.0 < self.max_delay_s < 1e9:
+            raise FlagError(f"--live_max_delay_s={self.max_delay_s:g}: must be greater than 0")

@@ -1,0 +1,171 @@
+"""What the ways to topics have in common."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol
+
+from maplab_py.cancellation import current_token
+from maplab_py.errors import Cancelled, UserError
+from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.recordings.bag_files import listed_topics
+
+MAX_MESSAGE_BYTES = 200_000_000
+"""Larger messages are refused before memory is reserved for them; an image of 60 megapixels fits."""
+LOOPBACK = "127.0.0.1"
+_LOOK_EVERY_S = 0.1
+_SIOCGIFADDR = 0x8915  # <linux/sockios.h>
+
+Take = Callable[[bytes], None]
+"""Is called with each message, in the thread that receives it."""
+Publish = Callable[[bytes], None]
+"""Sends a serialised message."""
+
+
+class Topic(NamedTuple):
+    """A topic that somebody publishes."""
+
+    name: str
+    type: str  # as in "sensor_msgs/msg/Image"
+    publishers: int = 1
+    is_reliable: bool = True  # all publishers offer it (ROS 2)
+
+
+class Transport(Protocol):
+    """A connection to the topics of a robot."""
+
+    @property
+    def name(self) -> str:
+        """Where the topics are, as in "ROS 2 domain 0"."""
+
+    @property
+    def is_ros_2(self) -> bool:
+        """Whether messages are CDR; else they are those of ROS 1."""
+
+    @property
+    def problems(self) -> list[str]:
+        """What has gone wrong since the beginning, one line each."""
+
+    def topics(self) -> dict[str, Topic]:
+        """Return the topics that are published now, by name."""
+
+    def subscribe(self, topic: Topic, take: Take) -> None:
+        """Call a function with every message of a topic from now on."""
+
+    def advertise(self, topic: str, kind: str) -> Publish:
+        """Announce messages of a type; return what sends them."""
+
+    def subscribers(self, topic: str) -> int:
+        """Return how many listen to an advertised topic."""
+
+    def close(self) -> None:
+        """End all connections and threads."""
+
+
+@contextlib.contextmanager
+def open_transport(
+    kind: str, network: NetworkOptions, *, is_server: bool = False
+) -> Iterator[Transport]:
+    """Connect to ROS 2, ROS 1 or Foxglove, as one of `TRANSPORTS` says.
+
+    Args:
+        kind: One of `TRANSPORTS`.
+        network: Where.
+        is_server: Play the server of Foxglove, in place of its client.
+
+    Raises:
+        UserError: A library is missing, or nobody answers.
+    """
+    network.check()
+    transport: Transport
+    if kind == "ros2":
+        from maplab_py.interop.live.ros2 import Ros2
+
+        transport = Ros2(network)
+    elif kind == "ros1":
+        from maplab_py.interop.live.ros1 import Ros1
+
+        transport = Ros1(network)
+    elif is_server:
+        from maplab_py.interop.live.foxglove_server import FoxgloveServer
+
+        transport = FoxgloveServer(network)
+    else:
+        from maplab_py.interop.live.foxglove import FoxgloveClient
+
+        transport = FoxgloveClient(network)
+    try:
+        yield transport
+    finally:
+        transport.close()
+
+
+def wait_for_topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic]:
+    """Wait until all topics are published; return them.
+
+    Raises:
+        UserError: They are not, in time; the message lists those that are.
+        Cancelled: The user does not want to wait.
+    """
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        seen = transport.topics()
+        if all(name in seen for name in names):
+            return [seen[name] for name in names]
+        if time.monotonic() > deadline_s:
+            break
+        pause()
+    missing = ", ".join(name for name in names if name not in seen)
+    listed = listed_topics({topic.name: topic.type for topic in seen.values()})
+    problem = f"; {transport.problems[-1]}" if transport.problems else ""
+    raise UserError(
+        f"{transport.name}: nobody publishes {missing} ({wait_s:g} s waited): start the publisher, or "
+        f"choose other topics; seen: {listed}{problem}"
+    )
+
+
+def pause(wait_s: float = _LOOK_EVERY_S) -> None:
+    """Wait a moment, unless the user wants the end.
+
+    Raises:
+        Cancelled: The user does.
+    """
+    token = current_token()
+    token.check()
+    if token.is_ending:
+        raise Cancelled("ended before anything arrived")
+    time.sleep(wait_s)
+
+
+def listening_address(network: NetworkOptions) -> str:
+    """Return the IP address to listen on.
+
+    Raises:
+        UserError: The interface is unknown.
+    """
+    name = network.live_interface
+    if not name:
+        return LOOPBACK
+    with contextlib.suppress(OSError):
+        socket.inet_aton(name)
+        return name
+    if sys.platform == "linux":
+        import fcntl
+
+        request = struct.pack("256s", name.encode()[:15])
+        with (
+            contextlib.suppress(OSError),
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+        ):
+            answer = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, request)
+            return socket.inet_ntoa(answer[20:24])
+    known = ", ".join(entry for _, entry in socket.if_nameindex())
+    raise UserError(
+        f"--live_interface={name}: there is no such interface with an IPv4 address: give one of "
+        f"{known}, or the IP address of one"
+    )
