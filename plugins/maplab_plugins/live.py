@@ -90,9 +90,9 @@ def live_run(
     Raises:
         UserError: There is no calibration, or a topic is missing or of another type.
     """
+    from maplab_py.interop.live.opening import open_transport
     from maplab_py.interop.live.publishing import PosePublisher
     from maplab_py.interop.live.source import LiveRecording
-    from maplab_py.interop.live.transport import open_transport
     from maplab_py.interop.recordings.opening import given_device
 
     device = given_device(source, f"--datasource_type={kind}: a live source")

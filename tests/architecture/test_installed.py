@@ -53,4 +53,4 @@ def test_the_summary_counts_what_a_machine_cannot_run() -> None:
         "not run here: 12 tests without real data, 8 without a browser"
     )
     assert not_run_here([browser]) == "not run here: 1 test without a browser"
-    assert not_run_here([]) == "not run here: no test for want of real data or a browser"
+    assert not_run_here([]) == "not run here: no test for want of real data, a browser or ROS"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from functools import partial
 
 from maplab_py.errors import FlagError
-from maplab_py.interop.live.options import TRANSPORTS, NetworkOptions
-from maplab_py.interop.live.transport import Topic, Transport, open_transport
+from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.live.transport import Topic, Transport
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -57,11 +59,9 @@ def list_topics(
     """Listen to all topics for a while, and return what there is.
 
     Raises:
-        FlagError: The transport is unknown, or the time is not positive.
-        UserError: A library is missing, or nobody answers.
+        FlagError: The time is not positive.
+        UserError: The transport is unknown, a library is missing, or nobody answers.
     """
-    if kind not in TRANSPORTS:
-        raise FlagError(f"transport {kind}: wants one of {', '.join(TRANSPORTS)}")
     if not 0.0 < listen_s < 1e6:
         raise FlagError(f"--listen_s={listen_s:g}: must be greater than 0")
     with open_transport(kind, network) as transport:
@@ -80,10 +80,14 @@ def _listen(transport: Transport, listen_s: float, progress: Progress) -> dict[s
         progress.step(done_s, listen_s, "listening")
         for name, topic in transport.topics().items():
             if name not in sizes and topic.type in known:
-                sizes[name] = received = []
-                transport.subscribe(topic, lambda data, r=received: r.append(len(data)))  # type: ignore[misc]
+                sizes[name] = []
+                transport.subscribe(topic, partial(_note_size, sizes[name]))
         time.sleep(_LOOK_EVERY_S)
     return sizes
+
+
+def _note_size(sizes: list[int], data: bytes) -> None:
+    sizes.append(len(data))
 
 
 def _row(topic: Topic, sizes: dict[str, list[int]], listen_s: float) -> LiveTopic:

@@ -215,7 +215,8 @@ class Ros1:
     def _opened(self, topic: Topic, uri: str) -> socket.socket:
         """Return a connection to a publisher after the exchange of headers."""
         with _proxy(uri, _PEER_TIMEOUT_S) as publisher:
-            code, message, place = publisher.requestTopic(self._node, topic.name, [["TCPROS"]])  # type: ignore[misc]
+            answer: Any = publisher.requestTopic(self._node, topic.name, [["TCPROS"]])
+        code, message, place = answer
         if code != _SUCCESS or not isinstance(place, list) or len(place) != 3:
             raise ConnectionProblem(f"its publisher refuses ({message})")
         connection = socket.create_connection((str(place[1]), int(place[2])), _PEER_TIMEOUT_S)
@@ -230,10 +231,10 @@ class Ros1:
                 "tcp_nodelay": "1",
             }
             connection.sendall(header_bytes(request))
-            answer = receive_header(connection)
-            if "error" in answer:
-                raise ConnectionProblem(f"its publisher refuses ({answer['error']})")
-            if answer.get("md5sum") not in (md5sum, "*"):
+            header = receive_header(connection)
+            if "error" in header:
+                raise ConnectionProblem(f"its publisher refuses ({header['error']})")
+            if header.get("md5sum") not in (md5sum, "*"):
                 raise ConnectionProblem(f"its messages are not those of {topic.type}")
             connection.settimeout(None)
         except BaseException:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import types
+import types as class_types
 from typing import Any
 
 from maplab_py.errors import UserError
@@ -57,7 +57,7 @@ def dds_type(kind: str) -> Any:
         )
     fields = {name: _field_type(field) for name, field in definitions[kind][1]}
     name = dds_type_name(kind)
-    made = types.new_class(
+    made = class_types.new_class(
         name.rsplit(".", 1)[1],
         (IdlStruct,),
         {"typename": name},
@@ -68,8 +68,9 @@ def dds_type(kind: str) -> Any:
 
 def _field_type(field: tuple[Any, Any]) -> Any:
     """Return the annotation of a field: (kind, (content, ...))."""
-    from cyclonedds.idl import types as idl
+    from cyclonedds.idl import types
 
+    idl: Any = types  # its `array` and `sequence` are indexed, which the library's hints deny
     kind, content = field
     if kind == _BASE:
         return _SCALARS.get(content[0]) or getattr(idl, content[0])

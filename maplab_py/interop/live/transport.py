@@ -7,7 +7,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from maplab_py.cancellation import current_token
@@ -65,44 +65,6 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """End all connections and threads."""
-
-
-@contextlib.contextmanager
-def open_transport(
-    kind: str, network: NetworkOptions, *, is_server: bool = False
-) -> Iterator[Transport]:
-    """Connect to ROS 2, ROS 1 or Foxglove, as one of `TRANSPORTS` says.
-
-    Args:
-        kind: One of `TRANSPORTS`.
-        network: Where.
-        is_server: Play the server of Foxglove, in place of its client.
-
-    Raises:
-        UserError: A library is missing, or nobody answers.
-    """
-    network.check()
-    transport: Transport
-    if kind == "ros2":
-        from maplab_py.interop.live.ros2 import Ros2
-
-        transport = Ros2(network)
-    elif kind == "ros1":
-        from maplab_py.interop.live.ros1 import Ros1
-
-        transport = Ros1(network)
-    elif is_server:
-        from maplab_py.interop.live.foxglove_server import FoxgloveServer
-
-        transport = FoxgloveServer(network)
-    else:
-        from maplab_py.interop.live.foxglove import FoxgloveClient
-
-        transport = FoxgloveClient(network)
-    try:
-        yield transport
-    finally:
-        transport.close()
 
 
 def wait_for_topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic]:

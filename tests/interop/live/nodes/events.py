@@ -13,11 +13,13 @@ import numpy as np
 def load(path: Path) -> list[tuple[int, int, Any]]:
     """Return (stamp_ns, camera or -1 = IMU, pixels or [ax ay az gx gy gz]) by their stamps."""
     with np.load(path) as arrays:
-        samples = [(int(t), -1, row) for t, row in zip(arrays["imu_ns"], arrays["imu"])]
+        samples = [
+            (int(t), -1, row) for t, row in zip(arrays["imu_ns"], arrays["imu"], strict=True)
+        ]
         images = []
         for camera in range(int(arrays["cameras"])):
             stamps, pixels = arrays[f"stamps_ns{camera}"], arrays[f"pixels{camera}"]
-            images += [(int(t), camera, image) for t, image in zip(stamps, pixels)]
+            images += [(int(t), camera, image) for t, image in zip(stamps, pixels, strict=True)]
     return sorted(samples + images, key=lambda event: event[:2])
 
 

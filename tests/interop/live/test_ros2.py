@@ -1,0 +1,101 @@
+"""Topics of ROS 2 between two programs; the counterparts of test_real_nodes are ROS itself."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import UserError
+from maplab_py.interop.live import ros2
+from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.live.ros2_types import dds_type_name, ros_type_name
+from maplab_py.interop.live.transport import Topic
+from tests.interop.live.support import IMU, imu_message
+from tests.support.own_process import in_own_process
+from tests.support.waiting import wait_until
+
+pytest.importorskip("cyclonedds", reason="no cyclonedds for this machine")
+
+
+def _domain() -> int:
+    return 100 + os.getpid() % 100
+
+
+def _round_trip() -> tuple[int, bool, list[str]]:
+    with open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
+        publish = node.advertise("/imu0", IMU)
+        received: list[bytes] = []
+        node.subscribe(Topic("/imu0", IMU), received.append)
+        assert wait_until(lambda: node.subscribers("/imu0"))
+        sent = [imu_message(t, is_ros_2=True) for t in (1, 2, 3)]
+        for message in sent:
+            publish(message)
+        assert wait_until(lambda: len(received) == 3)
+        return len(received), received == sent, list(node.topics())
+
+
+def test_messages_arrive_byte_by_byte() -> None:
+    count, is_equal, others = in_own_process(_round_trip)
+    assert (count, is_equal) == (3, True)
+    assert others == []  # its own topics do not count
+
+
+def test_names_of_types_are_those_of_ros() -> None:
+    assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs.msg.dds_.Image_"
+    assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
+    assert ros_type_name("example::Plain") == "example::Plain"
+
+
+def test_it_listens_on_the_loopback_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    local = ros2._configuration(NetworkOptions())
+    assert 'address="127.0.0.1" multicast="false"' in local
+    assert "<AllowMulticast>false" in local
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS/>")
+    beyond = ros2._configuration(NetworkOptions(live_interface="10.0.0.7"))
+    assert 'address="10.0.0.7"' in beyond
+    assert "<AllowMulticast>false" not in beyond
+    assert beyond.endswith(",<CycloneDDS/>")
+
+
+def test_small_socket_buffers_are_told_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
+    limit = tmp_path / "rmem_max"  # type: ignore[operator]
+    monkeypatch.setattr(ros2, "_RECEIVE_LIMIT", limit)
+    assert ros2._socket_problems() == []
+    limit.write_text("212992\n")
+    (problem,) = ros2._socket_problems()
+    assert "sudo sysctl -w net.core.rmem_max=8388608" in problem
+
+
+def _wrong_interface() -> str:
+    try:
+        with open_transport("ros2", NetworkOptions(live_interface="203.0.113.9")):
+            return ""
+    except UserError as error:
+        return str(error)
+
+
+def test_an_address_that_this_computer_does_not_have_is_refused() -> None:
+    assert "DDS cannot start" in in_own_process(_wrong_interface)
+
+
+def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
+    with pytest.raises(UserError, match=r"pip install 'maplab-py\[ros2\]'"):
+        ros2.Ros2(NetworkOptions())
+
+
+def test_declared_types_have_the_fields_of_the_messages() -> None:
+    from maplab_py.interop.live.ros2_types import dds_type, type_hash
+
+    odometry = dds_type("nav_msgs/msg/Odometry")
+    names = list(odometry.__annotations__)
+    assert names == ["header", "child_frame_id", "pose", "twist"]
+    assert type_hash(IMU).startswith("RIHS01_7d9a00ff131080897a5ec7e26e315954")
+    assert np.size(dds_type("sensor_msgs/msg/PointCloud2").__annotations__) == 1
