@@ -10,7 +10,7 @@ from typing import Any
 from maplab_py.errors import MapError
 from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES
 from maplab_py.interop.recordings.bag_files import imu_sample
-from maplab_py.interop.recordings.images import EncodedImage, RawImage
+from maplab_py.interop.recordings.images import image_of_message
 from maplab_py.interop.recordings.protocol import ImageData
 from maplab_py.sensors import Camera
 
@@ -57,18 +57,7 @@ def image_data(
         message = decode(data, kind)
     except Exception as error:  # the parser's own, of any type
         raise MapError(f"{name}: the message is damaged: check its publisher") from error
-    if not hasattr(message, "encoding"):
-        return EncodedImage(name, camera, message.data.tobytes)
-    return RawImage(
-        name,
-        camera,
-        message.encoding,
-        int(message.width),
-        int(message.height),
-        int(message.step),
-        bool(message.is_bigendian),
-        message.data,
-    )
+    return image_of_message(message, name, camera)
 
 
 class PairedImu:

@@ -13,6 +13,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.cancellation import current_token
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.images import Pixels, bits_of
 from maplab_py.interop.live.messages import PairedImu, image_data, imu_values
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
@@ -24,7 +25,6 @@ from maplab_py.interop.recordings.protocol import (
     CameraImage,
     ImuBatch,
     Item,
-    Pixels,
     RecordedSensors,
 )
 from maplab_py.report import counted
@@ -45,6 +45,8 @@ class _Decoded:
     """Pixels of an image that were decoded when it was taken."""
 
     pixels: Pixels
+    encoding: str
+    bits: int
 
     def check(self) -> None:
         """Do nothing: they are whole."""
@@ -89,6 +91,7 @@ class LiveRecording:
             Cancelled: The user does not want to wait.
         """
         options.check()
+        source.check()
         self.device, self.name = device, transport.name
         self.kind = "live topics"
         self._transport, self._options, self._tell = transport, options, tell
@@ -105,7 +108,9 @@ class LiveRecording:
         self._paired = PairedImu() if len(self._imu_names) == 2 else None
         self._arrivals: collections.OrderedDict[int, float] = collections.OrderedDict()
         self._latencies_ms: collections.deque[float] = collections.deque(maxlen=100_000)
-        self._last_imu_ns, self._seen_sizes, self._told = -1, set[int](), 0
+        self._last_imu_ns, self._told = -1, 0
+        self._given_bits = source.image_bits
+        self._bits: dict[int, int] = {}  # of the values of the images, by camera
         self._first_samples: list[F64] = []
         self._is_checked = False
         self.notes: tuple[str, ...] = ()
@@ -246,12 +251,13 @@ class LiveRecording:
                 )
                 pixels = data.decode()
             except MapError:
-                if row not in self._seen_sizes:
+                if row not in self._bits:
                     raise
                 self.counts[names[row]].damaged += 1
                 return []
-            self._seen_sizes.add(row)
-            images.append(CameraImage(row, message.time_ns, stamp_ns, _Decoded(pixels)))
+            bits = self._bits.setdefault(row, self._given_bits or data.bits or bits_of([pixels]))
+            decoded = _Decoded(pixels, data.encoding, bits)
+            images.append(CameraImage(row, message.time_ns, stamp_ns, decoded, bits))
         return images
 
     def _remember(self, messages: tuple[Message, ...]) -> None:

@@ -13,11 +13,11 @@ from xmlrpc.server import SimpleXMLRPCServer
 import numpy as np
 
 from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
+from maplab_py.interop.calibration_import import import_calibration, read_calibration
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.source import LiveRecording
 from maplab_py.interop.live.transport import Publish, Take, Topic
 from maplab_py.interop.recordings.bag_layouts import imu_messages
-from maplab_py.interop.recordings.calibration import read_folder_calibration
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from tests.interop.recordings.written import Content, make_content, write_calibration, write_folder
@@ -61,11 +61,8 @@ class FakeTransport:
 
 def small_device(folder: Path) -> RecordedSensors:
     """The calibration of the small recording, with topics."""
-    calibration = read_folder_calibration(
-        write_folder(make_content(frames=1), folder / "room") / "mav0"
-    )
-    from maplab_py.interop.recordings.calibration import read_calibration
-
+    room = write_folder(make_content(frames=1), folder / "room")
+    calibration = import_calibration(room / "mav0")
     return read_calibration(write_calibration(calibration, folder / "sensors.yaml"))
 
 
