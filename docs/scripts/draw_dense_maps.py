@@ -17,7 +17,7 @@ from maplab_py.algorithms.dense.fusion.meshing import map_mesh
 from maplab_py.array_types import F64, I32, U8
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
-from maplab_py.simulation.output import write_maps
+from maplab_py.simulation.raw_data import write_maps
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.viewer import colours
 from maplab_py.viewer.vertex_images import VertexImages

@@ -42,8 +42,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
-from maplab_py.simulation.truth import Truth
+from maplab_py.simulation.truth import Truth, true_map
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.summary_map import SummaryMap, summary_map_bytes

@@ -10,9 +10,9 @@ From Python::
     report = run_pipeline(pipeline, Path("results"), PipelineOptions(scheduler="local:2"))
 """
 
+from maplab_py.pipeline.driver import run_pipeline
 from maplab_py.pipeline.options import PipelineOptions
 from maplab_py.pipeline.plan import Pipeline, Stage
 from maplab_py.pipeline.progress import PipelineReport, Watcher
-from maplab_py.pipeline.running import run_pipeline
 
 __all__ = ["Pipeline", "PipelineOptions", "PipelineReport", "Stage", "Watcher", "run_pipeline"]

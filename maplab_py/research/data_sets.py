@@ -15,7 +15,7 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.output_files import write_text
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 
 Row = dict[str, Any]

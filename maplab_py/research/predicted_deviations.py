@@ -20,7 +20,7 @@ from maplab_py.research.data_sets import OPTIONS, append_line, data_set, lines_o
 from maplab_py.research.results import levels
 from maplab_py.research.selections import FEW, WHOLE, joint_designs, random_choice, rankings
 from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 
 

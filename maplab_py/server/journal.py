@@ -11,9 +11,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from maplab_py.atomic import write_file
-from maplab_py.errors import UserError
-from maplab_py.server.merging import Stretch
+from maplab_py.errors import MaplabError, UserError
+from maplab_py.server.merging import Stretch, stretches_of
+from maplab_py.server.spool import Entry, Spool
+from maplab_py.storage.native import is_map_folder, load_map
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import remove_missions
+from maplab_py.vimap.ids import to_hex_list
 
 _FORMAT = 1
 
@@ -105,3 +112,113 @@ def write_journal(journal: Journal, path: Path) -> None:
     """Write a journal, completely or not at all; raises UserError."""
     content = {"format": _FORMAT, **dataclasses.asdict(journal)}
     write_file(path, [json.dumps(content).encode("utf-8", "surrogatepass")])
+
+
+# Recovery of a server at its start: map, journal and spool, brought to agree.
+#
+# The map is the truth: a submap is in it when its vertices are. The journal may lag behind by what was
+# published last, and the map behind the journal where somebody has put a backup in its place.
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recovered:
+    """State at which the server continues.
+
+    Attributes:
+        vi_map: The published map; None without one.
+        journal: What it consists of.
+        notes: What was brought to agree.
+        is_changed: The map was changed and must be published.
+    """
+
+    vi_map: VIMap | None
+    journal: Journal
+    notes: tuple[str, ...]
+    is_changed: bool
+
+
+def recover(spool: Spool, map_folder: Path) -> Recovered:
+    """Read map and journal; submaps in `accepted` that the map has go to `merged`, and back.
+
+    Raises:
+        UserError: The journal is damaged, the map cannot be loaded, or it was not made from this spool.
+    """
+    spool.clean()
+    journal, notes = read_journal(spool.journal), []
+    vi_map = load_map(map_folder)[0] if is_map_folder(map_folder) else None
+    is_changed = False
+    if vi_map is not None and journal.deleted:
+        mask = np.isin(to_hex_list(vi_map.missions.id), journal.deleted)
+        if mask.any():
+            is_changed, vi_map = True, _without(vi_map, mask)
+    journal, lost = _without_lost(spool, journal, vi_map)
+    notes += lost
+    journal, added = _with_unknown(spool, journal, vi_map)
+    notes += added
+    if vi_map is not None:
+        strange = set(to_hex_list(vi_map.missions.id)) - set(journal.robots)
+        if strange:
+            raise UserError(
+                f"--maplab_server_merged_map_folder={map_folder} holds mission {min(strange)}, which "
+                f"did not come through {spool.root}: choose another folder"
+            )
+    return Recovered(vi_map, journal, tuple(notes), is_changed)
+
+
+def _without(vi_map: VIMap, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> VIMap | None:
+    return None if mask.all() else remove_missions(vi_map, mask)
+
+
+def _without_lost(
+    spool: Spool, journal: Journal, vi_map: VIMap | None
+) -> tuple[Journal, list[str]]:
+    """Take submaps back to `accepted` that the journal knows and the map has not."""
+    kept, notes = [], []
+    for submap in journal.merged:
+        if vi_map is not None and all(s.is_in(vi_map) for s in submap.stretches):
+            kept.append(submap)
+        elif spool.take_back(submap.number):
+            notes.append(f"{submap.title}: is not in the map; it is merged again")
+        elif any(entry.number == submap.number for entry in spool.entries()):
+            continue  # was on its way
+        else:
+            notes.append(f"{submap.title}: is not in the map, and its folder was not kept")
+    return dataclasses.replace(journal, merged=tuple(kept)), notes
+
+
+def _with_unknown(
+    spool: Spool, journal: Journal, vi_map: VIMap | None
+) -> tuple[Journal, list[str]]:
+    """Add submaps that the map has and the journal does not know; those in `accepted` move on."""
+    notes: list[str] = []
+    if vi_map is None:
+        return journal, notes
+    known = {submap.number for submap in journal.merged}
+    for entry in spool.entries():
+        if entry.number in known:
+            spool.finish(entry, keep=True)
+            continue
+        record = _if_in_map(spool.folder(entry) / "submap", entry, vi_map)
+        if record is not None:
+            journal = journal.with_merged(record, joint_is_due=True)
+            spool.finish(entry, keep=True)
+            notes.append(f"{entry.title}: was merged before the server ended")
+    if not journal.robots:  # the journal was deleted
+        for folder in sorted(spool.merged.glob("[0-9]*")):
+            entry = Entry(**json.loads((folder / "entry.json").read_text(encoding="utf-8")))
+            record = _if_in_map(folder / "submap", entry, vi_map)
+            if record is not None and entry.number not in known:
+                journal = journal.with_merged(record, joint_is_due=True)
+    return journal, notes
+
+
+def _if_in_map(folder: Path, entry: Entry, vi_map: VIMap) -> MergedSubmap | None:
+    """Return the record of a submap if all its vertices are in the map."""
+    try:
+        submap, _ = load_map(folder)
+    except MaplabError:
+        return None  # the worker will say why
+    if not len(submap.vertices) or (vi_map.vertex_index.rows(submap.vertices.id) < 0).any():
+        return None
+    stretches = tuple(stretches_of(submap))
+    return MergedSubmap(entry.number, entry.robot, entry.name, entry.sha256, stretches)

@@ -32,10 +32,9 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.server.cloud_loops import with_cloud_loops
-from maplab_py.server.open_alignments import OpenAlignments
+from maplab_py.server.cloud_loops import OpenAlignments, with_cloud_loops
 from maplab_py.server.options import IncrementalOptions, MergingOptions
-from maplab_py.server.resource_folders import with_resources_taken_in
+from maplab_py.server.spool import with_resources_taken_in
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import Excerpt, excerpt
 from maplab_py.vimap.ids import IdArray, from_hex, to_hex, to_hex_list

@@ -30,23 +30,19 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import Cancelled, MaplabError, UserError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.server.display import Display
-from maplab_py.server.intake import Intake, Item
-from maplab_py.server.journal import Journal, MergedSubmap, write_journal
-from maplab_py.server.locking import locked_spool
+from maplab_py.server.journal import Journal, MergedSubmap, recover, write_journal
 from maplab_py.server.merging import Merger, stretches_of
 from maplab_py.server.options import (
     IncrementalOptions,
     MapServerOptions,
     ServiceOptions,
 )
-from maplab_py.server.preparation import Preparation
-from maplab_py.server.publishing import Publisher, pause_s
-from maplab_py.server.recovery import recover
+from maplab_py.server.preparation import Intake, Item, Preparation
+from maplab_py.server.publishing import Display, Publisher, pause_s
 from maplab_py.server.reports import DeletedMissions, ServeReport, ServerStatus
 from maplab_py.server.requests import answers
 from maplab_py.server.service import Service
-from maplab_py.server.spool import Spool
+from maplab_py.server.spool import Spool, locked_spool
 from maplab_py.server.status import Events, status_of
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import remove_missions

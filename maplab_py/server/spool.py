@@ -16,18 +16,27 @@ Every step of a submap is one rename in the spool, so a crash leaves it in one f
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import os
 import shutil
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from maplab_py.atomic import move_folder, write_file
+from maplab_py.atomic.system import opened_locked
 from maplab_py.errors import MapError, UserError
 from maplab_py.pipeline.fingerprint import folder_hash
 from maplab_py.storage import checksums
 from maplab_py.storage.native import is_map_folder
+from maplab_py.storage.resources import MAP_FOLDER
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.stacking import resource_folder_name
 
 _PUSHED = ".pushed.json"
 QUIET_S = 5.0
@@ -271,3 +280,55 @@ def _changed_s(folder: Path) -> float:
         except OSError:
             continue
     return max(times)
+
+
+def with_resources_taken_in(whole: VIMap, submap: VIMap) -> VIMap:
+    """Return a map whose own folder has the resources that were in a submap's own folder.
+
+    Maps that are joined refer to the resource folder of the second one as to an external folder. The server
+    brings the files of submaps to the folder of its map instead (`Publisher.with_resources`).
+
+    Args:
+        whole: The map, joined with the submap.
+        submap: The submap.
+    """
+    folders = whole.metadata.external_resource_folders
+    name = resource_folder_name(submap.metadata)
+    if name not in folders:
+        return whole
+    index, folder = folders.index(name), whole.resources.folder
+    left = folder - (folder > index).astype(folder.dtype)
+    metadata = dataclasses.replace(
+        whole.metadata, external_resource_folders=folders[:index] + folders[index + 1 :]
+    )
+    resources = whole.resources.replace(folder=np.where(folder == index, MAP_FOLDER, left))
+    return whole.replace(resources=resources, metadata=metadata)
+
+
+@contextlib.contextmanager
+def locked_spool(spool: Spool) -> Iterator[None]:
+    """Hold the lock of a spool; the system releases it when the process ends, however it ends.
+
+    Raises:
+        UserError: Another process holds it, or it cannot be made.
+    """
+    try:
+        descriptor = opened_locked(spool.lock)
+    except OSError as error:
+        raise UserError(f"{spool.lock}: cannot be locked ({error.strerror})") from error
+    if descriptor is None:
+        raise UserError(
+            f"--spool={spool.root}: another server{_process(spool)} works on it; stop it with "
+            "serve_stop, or give another spool"
+        )
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _process(spool: Spool) -> str:
+    try:
+        return f" (process {int(json.loads(spool.address.read_text())['process'])})"
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""

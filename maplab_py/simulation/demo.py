@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from maplab_py.simulation.evaluation import MapErrors, evaluate_map
-from maplab_py.simulation.output import session_folders
+from maplab_py.simulation.raw_data import session_folders
 from maplab_py.simulation.reports import DemoMission, DemoReport, DemoStep
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.simulate import SimulatedData

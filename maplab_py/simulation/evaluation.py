@@ -8,15 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
-from maplab_py.errors import UserError
+from maplab_py.distinct import distinct
+from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.report import Report
-from maplab_py.simulation.calibration_evaluation import CalibrationError, calibration_errors
-from maplab_py.simulation.merge_evaluation import count_merges, shown_points, sightings
+from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.truth import Truth
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
+from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 _FALSE_EDGE_M, _FALSE_EDGE_DEG = 0.5, 5.0
 
@@ -173,3 +175,169 @@ def _misplacement(T_true_G: F64, p_true: F64, p_G: F64) -> tuple[float, float]:
 
 def _rmse(a: F64, b: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))))
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationError:
+    """Largest deviations of a mission's sensors from the truth, over its cameras and axes."""
+
+    mission: str  # beginning of its id
+    focal_px: float
+    centre_px: float
+    distortion: float
+    camera_rotation_deg: float
+    camera_position_m: float
+    gyro_scale: float
+    gyro_misalignment: float
+    accel_scale: float
+    accel_misalignment: float
+    accel_rotation_deg: float
+
+
+def calibration_errors(
+    vi_map: VIMap, truth: Truth, missions: NDArray[np.int64]
+) -> tuple[CalibrationError, ...]:
+    """Compare the sensors of every mission with the truth.
+
+    Args:
+        vi_map: The map.
+        truth: The truth.
+        missions: Row (M,) of the truth's missions for each mission of the map, -1 = unknown.
+    """
+    return tuple(
+        _of_mission(vi_map, truth, number, row)
+        for number, row in enumerate(missions.tolist())
+        if row >= 0 and _has_sensors(vi_map, number)
+    )
+
+
+def _has_sensors(vi_map: VIMap, mission: int) -> bool:
+    try:
+        for sensor in (MissionSensor.IMU, MissionSensor.NCAMERA):
+            mission_sensor_id(vi_map, mission, sensor)
+    except MapError:
+        return False
+    return True
+
+
+def _of_mission(vi_map: VIMap, truth: Truth, mission: int, row: int) -> CalibrationError:
+    imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+    rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+    imu = vi_map.sensors.imu(imu_id).intrinsics or ImuIntrinsics()
+    T_I_C, true_T_I_C = vi_map.sensors.T_I_C(imu_id, rig_id), truth.T_I_C[row]
+    deviations = []
+    for camera, true in zip(
+        vi_map.sensors.camera_rig(rig_id).cameras, truth.camera_parameters[row], strict=True
+    ):
+        first = len(camera.intrinsics)
+        last = first + len(camera.distortion_parameters)
+        intrinsics = np.abs(camera.intrinsics - true[:first])
+        distortion = np.abs(camera.distortion_parameters - true[first:last])
+        deviations.append(
+            [intrinsics[-4:-2].max(), intrinsics[-2:].max(), distortion.max(initial=0.0)]
+        )
+    focal, centre, distortion_error = np.max(deviations, axis=0)
+    gyro, accel = imu.T_g - truth.imu_T_g[row], imu.T_a - truth.imu_T_a[row]
+    above = np.triu_indices(3, 1)
+    return CalibrationError(
+        mission=to_hex(vi_map.missions.id[mission])[:8],
+        focal_px=float(focal),
+        centre_px=float(centre),
+        distortion=float(distortion_error),
+        camera_rotation_deg=_largest_angle(T_I_C[:, :4], true_T_I_C[:, :4]),
+        camera_position_m=float(np.linalg.norm(T_I_C[:, 4:] - true_T_I_C[:, 4:], axis=1).max()),
+        gyro_scale=float(np.abs(np.diag(gyro)).max()),
+        gyro_misalignment=float(np.abs(gyro[above]).max()),
+        accel_scale=float(np.abs(np.diag(accel)).max()),
+        accel_misalignment=float(np.abs(accel[above]).max()),
+        accel_rotation_deg=_largest_angle(
+            so3.from_matrix(imu.R_A_I)[None], so3.from_matrix(truth.imu_R_A_I[row])[None]
+        ),
+    )
+
+
+def _largest_angle(q: F64, q_true: F64) -> float:
+    turn = so3.log(so3.multiply(so3.inverse(q_true), q))
+    return float(np.rad2deg(np.linalg.norm(turn, axis=1).max()))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sightings:
+    """Observations (O,) of the map whose world point the truth contains."""
+
+    landmark: I64  # row in the map
+    point: I64  # world point, -1 = nothing (clutter)
+    track: I64  # landmark of the truth that the keypoint belonged to at first, -1 = none
+
+
+@dataclasses.dataclass(frozen=True)
+class MergeCounts:
+    """Counts of simulated landmarks (tracks) that were merged or should be."""
+
+    merges: int  # tracks that were joined to another one
+    false_merges: int  # of these: joined to tracks of another world point
+    missed_merges: int  # landmarks that could still be joined to one of the same world point
+    wrong_observations: int  # show another world point than most of their landmark's do
+
+
+def sightings(vi_map: VIMap, truth: Truth) -> Sightings:
+    """Look up the world points of the observations of a map.
+
+    Frames whose number of keypoints has changed are skipped.
+    """
+    row = IdIndex(truth.frame_id).rows(vi_map.frames.id)
+    usable = row >= 0
+    usable[usable] = truth.frame_keypoints[row[usable]] == vi_map.frames.keypoint_count[usable]
+    start = starts_of_counts(truth.frame_keypoints)
+    of_truth = ragged_rows(start, row[usable])
+    of_map = ragged_rows(vi_map.keypoint_start, np.flatnonzero(usable))
+    landmark = vi_map.keypoints.landmark[of_map].astype(np.int64)
+    observing = landmark >= 0
+    rows = of_truth[observing]
+    return Sightings(landmark[observing], truth.keypoint_point[rows], truth.keypoint_landmark[rows])
+
+
+def shown_points(seen: Sightings, landmarks: int) -> I64:
+    """Return the world point (L,) that most observations of each landmark show, -1 = none.
+
+    Ties are resolved by the lowest row.
+    """
+    real = seen.point >= 0
+    pairs, votes = np.unique(
+        np.stack([seen.landmark[real], seen.point[real]], axis=1), axis=0, return_counts=True
+    )
+    order = np.lexsort((pairs[:, 1], -votes, pairs[:, 0]))
+    owner, first = np.unique(pairs[order, 0], return_index=True)
+    result = np.full(landmarks, -1, dtype=np.int64)
+    result[owner] = pairs[order[first], 1]
+    return result
+
+
+def count_merges(seen: Sightings, truth: Truth, point_of_landmark: I64) -> MergeCounts:
+    """Count merges against the truth.
+
+    Args:
+        seen: The map's observations.
+        truth: The truth.
+        point_of_landmark: World point (L,) of the map's landmarks, see `shown_points`.
+    """
+    known = seen.track >= 0
+    pairs = np.unique(np.stack([seen.landmark[known], seen.track[known]], axis=1), axis=0)
+    landmark, point_of_track = pairs[:, 0], truth.landmark_point[pairs[:, 1]]
+    merges = len(pairs) - len(distinct(landmark))
+    # of one landmark's tracks those of the most frequent point are right together
+    groups, size = np.unique(
+        np.stack([landmark, point_of_track], axis=1), axis=0, return_counts=True
+    )
+    most = np.zeros(len(point_of_landmark), dtype=np.int64)
+    np.maximum.at(most, groups[:, 0], size)
+    false_merges = len(pairs) - int(most.sum())
+    shown = point_of_landmark[distinct(seen.landmark)]
+    shown = shown[shown >= 0]
+    wrong = (seen.point >= 0) & (seen.point != point_of_landmark[seen.landmark])
+    return MergeCounts(
+        merges,
+        false_merges,
+        len(shown) - len(distinct(shown)),
+        int(np.count_nonzero(wrong)),
+    )

@@ -10,11 +10,11 @@ import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.compilation import compiled
+from maplab_py.errors import UserError
 from maplab_py.sensors import Camera
-from maplab_py.simulation.brightness import Brightness
-from maplab_py.simulation.pixel_rays import pixel_rays
+from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.ray_caster import RayCaster
-from maplab_py.simulation.scenario import ImageOptions
+from maplab_py.simulation.scenario import ImageOptions, SessionImages
 from maplab_py.simulation.shading_kernels import FAST, PaintedBoxes
 
 
@@ -81,3 +81,86 @@ def _expose(light, vignette, gain, noise, sigma, image):  # type: ignore[no-unty
             value = np.rint(value)
             value = np.float32(0.0) if value < np.float32(0.0) else value
             image[row, column] = np.uint8(np.float32(255.0) if value > np.float32(255.0) else value)
+
+
+_NEWTON_ROUNDS = 30
+_LARGEST_RADIUS = 5.0
+"""Pixels with a larger angle to the optical axis (79 deg) are black."""
+
+
+def pixel_rays(camera: Camera) -> F64:
+    """Return the points (H, W, 2) on the plane z = 1 that the pixel centres show; NaN = none.
+
+    The projection is inverted by Newton's method with numeric derivatives.
+
+    Raises:
+        UserError: No pixel has a ray.
+    """
+    v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
+    wanted = np.stack([u.ravel(), v.ravel()], axis=1)
+    focal, centre = camera.intrinsics[-4:-2], camera.intrinsics[-2:]
+    offset = (wanted - centre) / focal
+    # starts near the centre, where all models are nearly linear, and proceeds outwards
+    x = offset / (1.0 + 0.3 * np.sum(offset**2, axis=1, keepdims=True))
+    step = 1e-6
+    step_u, step_v = np.array([step, 0.0]), np.array([0.0, step])
+    for _ in range(_NEWTON_ROUNDS):
+        here = _project(camera, x)
+        miss = wanted - here
+        if np.abs(miss).max() < 1e-9:
+            break
+        du = (_project(camera, x + step_u) - here) / step
+        dv = (_project(camera, x + step_v) - here) / step
+        determinant = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
+        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+        move = np.stack(
+            [
+                (miss[:, 0] * dv[:, 1] - miss[:, 1] * dv[:, 0]) / determinant,
+                (miss[:, 1] * du[:, 0] - miss[:, 0] * du[:, 1]) / determinant,
+            ],
+            axis=1,
+        )
+        length = np.linalg.norm(move, axis=1, keepdims=True)
+        x = x + move * np.minimum(1.0, 0.5 / np.maximum(length, 1e-12))
+    lost = np.linalg.norm(_project(camera, x) - wanted, axis=1) > 1e-6
+    lost |= np.linalg.norm(x, axis=1) > _LARGEST_RADIUS
+    if lost.all():
+        raise UserError("cameras: no pixel of the image can be inverted to a ray")
+    x[lost] = np.nan
+    return np.asarray(x.reshape(camera.height_px, camera.width_px, 2))
+
+
+def _project(camera: Camera, x: F64) -> F64:
+    return pixels_of(camera, np.concatenate([x, np.ones((len(x), 1))], axis=1))
+
+
+_GAIN_PERIOD_S = 7.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Brightness:
+    """By which grey values are multiplied; the same for all cameras of a rig."""
+
+    light: float = 1.0
+    swing: float = 0.0  # of the gain, slowly to and fro
+    jump_s: F64 = dataclasses.field(default_factory=lambda: np.zeros(0))  # (J,) when the gain jumps
+    gain: F64 = dataclasses.field(default_factory=lambda: np.ones(1))  # (J + 1,) before and after
+
+    def at(self, time_s: float) -> float:
+        """Return the factor at a time [s]."""
+        swing = 1.0 + self.swing * np.sin(2.0 * np.pi * time_s / _GAIN_PERIOD_S)
+        jump = self.gain[np.searchsorted(self.jump_s, time_s, side="right")]
+        return float(self.light * swing * jump)
+
+
+def make_brightness(
+    options: SessionImages, swing: float, duration_s: float, rng: np.random.Generator
+) -> Brightness:
+    """Draw when the gain of a session jumps (a Poisson process), and to which values."""
+    if options.gain_jump_every_s == 0.0 or options.gain_jump == 0.0:
+        return Brightness(options.light, swing)
+    count = rng.poisson(duration_s / options.gain_jump_every_s)
+    jump_s = np.sort(rng.uniform(0.0, duration_s, count))
+    gain = 1.0 + options.gain_jump * rng.uniform(-1.0, 1.0, count + 1)
+    gain[0] = 1.0
+    return Brightness(options.light, swing, jump_s, gain)

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Self
 
 import numpy as np
 
+from maplab_py.array_types import F32, F64
+from maplab_py.geometry import se3, so3
+from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.progress import SILENT, Progress
-from maplab_py.simulation.appearance import make_appearance, make_session_appearance
-from maplab_py.simulation.lidar import Lidar, with_lidar_clouds
+from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
+from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.recording import Recording, SessionSeeds, record
-from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.scenario import ImageOptions, LidarOptions, Scenario
+from maplab_py.simulation.scene import make_appearance, make_scene, make_session_appearance
 from maplab_py.simulation.sensors import Device, make_device
 from maplab_py.simulation.session import session_map
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
-from maplab_py.vimap import VIMap
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
+from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 
 _WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR = range(7)
 """Streams of random numbers; a session's number selects within a stream."""
@@ -121,3 +128,106 @@ def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedDat
 def _generator(seed: int, stream: int, *session: int) -> np.random.Generator:
     """Return the generator of one stream; sessions count from one, zero is the whole world's."""
     return np.random.default_rng([seed, stream, *(number + 1 for number in session)])
+
+
+# A spinning lidar: clouds of the world's surfaces, as resources of the sensor in the session's map.
+#
+# A column of a cloud is a row of the ray caster: its rays lie in the plane through the lidar's axis that
+# the column's azimuth gives.
+
+CLOUDS_WITH_INTENSITY = 21
+"""Number of the resource type of the clouds."""
+_TEXEL_M = 0.1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lidar:
+    """A lidar in a world."""
+
+    caster: RayCaster
+    options: LidarOptions
+    T_L_column: F64  # (columns, 7) z axis horizontal, along the column's azimuth; y axis up
+    slope: F64  # (rings,) tangents of the elevations
+
+    @classmethod
+    def of(cls, world: World, options: LidarOptions, rng: np.random.Generator) -> Self:
+        """Prepare the rays of a lidar; `rng` paints what it sees."""
+        scene = make_scene(world.bounds, world.boxes, ImageOptions(texel_m=_TEXEL_M), rng)
+        elevation = np.deg2rad(np.linspace(options.lowest_deg, options.highest_deg, options.rings))
+        slope = np.tan(elevation)
+        rays = np.zeros((options.columns, options.rings, 2))
+        rays[..., 1] = slope
+        pitch_rad = max(np.ptp(elevation) / max(options.rings - 1, 1), 1e-3)
+        caster = RayCaster.of(painted_boxes(scene), rays, 1.0 / pitch_rad)
+        azimuth = 2.0 * np.pi * np.arange(options.columns) / options.columns
+        cosine, sine, zero = np.cos(azimuth), np.sin(azimuth), np.zeros(options.columns)
+        axes = [[-sine, zero, cosine], [cosine, zero, sine], [zero, zero + 1.0, zero]]
+        q = so3.from_matrix(np.moveaxis(np.array(axes), 2, 0))
+        return cls(caster, options, se3.make(q, np.zeros((options.columns, 3))), slope)
+
+    def scan(self, T_G_L: F64, rng: np.random.Generator) -> PlyCloud:
+        """Return the cloud in the lidar's frame L at a pose (7,), with noise along the rays.
+
+        Intensities are grey values of the surfaces, 0 to 255.
+        """
+        o = self.options
+        grey, depth = self.caster.render(se3.compose(T_G_L, self.T_L_column))
+        length = np.sqrt(1.0 + self.slope**2)
+        range_m = depth * length + o.range_sigma_m * rng.standard_normal(depth.shape)
+        seen = (depth > 0.0) & (range_m >= o.min_range_m) & (range_m <= o.max_range_m)
+        z = range_m / length
+        p_column = np.stack([np.zeros_like(z), z * self.slope, z], axis=2)
+        p_L = se3.transform(self.T_L_column[:, None], p_column)
+        return PlyCloud(p_L[seen], intensity=_as_intensity(grey[seen]))
+
+
+def _as_intensity(grey: F32) -> F64:
+    return np.asarray(np.round(grey, 1), dtype=np.float64)
+
+
+def with_lidar_clouds(
+    vi_map: VIMap,
+    imu_id: str,
+    recording: Recording,
+    lidar: Lidar,
+    rng: np.random.Generator,
+) -> VIMap:
+    """Return the map of a session with a lidar and its clouds, half a period after the start and on.
+
+    Raises:
+        UserError: The temporary folder of the clouds cannot be written.
+    """
+    options = lidar.options
+    words = random_ids(1, rng)[0]
+    T_I_L = se3.make(so3.exp(options.turn_rad), np.asarray(options.position_m))
+    first_s, last_s = recording.frame_s[0], recording.frame_s[-1]
+    time_s = np.arange(first_s + 0.5 / options.rate_hz, last_s, 1.0 / options.rate_hz)
+    time_ns = recording.time_ns[0] + np.round(1e9 * (time_s - first_s)).astype(np.int64)
+    T_G_L = se3.compose(recording.spline.evaluate(time_s).T_G_I, T_I_L)
+    new = NewResources(seed=vi_map.missions.id[0].tobytes())
+    for pose in T_G_L:
+        new.add(CLOUDS_WITH_INTENSITY, b"".join(encode_ply(lidar.scan(pose, rng))))
+    mounted = _with_sensor(vi_map, to_hex(words), imu_id, T_I_L)
+    if not len(new):
+        return mounted
+    return new.attached(
+        mounted,
+        np.arange(len(new)),
+        np.zeros(len(new), dtype=np.int64),
+        ResourceOwner.SENSOR,
+        sensor_id=words,
+        timestamp_ns=time_ns,
+    )
+
+
+def _with_sensor(vi_map: VIMap, sensor_id: str, imu_id: str, T_I_L: F64) -> VIMap:
+    """Add the lidar to the map's sensors and its mission."""
+    keys = {"id": sensor_id, "sensor_type": "LIDAR", "topic": "lidar"}
+    sensors = SensorSet(
+        {**vi_map.sensors.sensors, sensor_id: OtherSensor(sensor_id, "LIDAR", keys)},
+        {**vi_map.sensors.extrinsics, sensor_id: Extrinsics(imu_id, T_I_L)},
+        vi_map.sensors.extra,
+    )
+    ids = np.array(vi_map.missions.sensor_id)
+    ids[:, MissionSensor.LIDAR] = from_hex(sensor_id)
+    return vi_map.replace(sensors=sensors, missions=vi_map.missions.replace(sensor_id=ids))

@@ -9,17 +9,21 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.localization.database import LocalizationMap
+from maplab_py.algorithms.localization.localization import Localizations, Reference
 from maplab_py.array_types import F64, I64, U64
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import UserError
+from maplab_py.geometry import se3, so3
+from maplab_py.geometry.alignment import umeyama
 from maplab_py.input_files import read_npz
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.simulation.drift import mission_frame
+from maplab_py.sensors import CameraRig, Imu, ImuIntrinsics, SensorSet
 from maplab_py.simulation.recording import Recording
-from maplab_py.simulation.sensors import Device
+from maplab_py.simulation.sensors import Device, mission_frame
 from maplab_py.simulation.world import World
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import from_hex
+from maplab_py.vimap.ids import IdIndex, from_hex
 
 STATIONARY_MPS, STATIONARY_RADPS = 1e-3, 1e-3
 """Speed limits below which the body is at rest."""
@@ -186,3 +190,97 @@ def session_truth(
         point_look=world.look,
         point_moving=world.moving,
     )
+
+
+def true_map(vi_map: VIMap, truth: Truth) -> VIMap:
+    """Return the map with true poses, velocities, biases, landmarks, base frames and calibrations.
+
+    Measurements do not change. Each landmark gets the position of the world point that most of its
+    observations show. Sensors get their calibration in the first session that uses them.
+
+    Raises:
+        UserError: The truth is of another data set.
+    """
+    vertex = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
+    mission = IdIndex(truth.mission_id).rows(vi_map.missions.id)
+    landmark = IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)
+    if min(vertex.min(initial=0), mission.min(initial=0), landmark.min(initial=0)) < 0:
+        raise UserError("the truth is of another data set: it does not know everything in the map")
+    T_G_M = truth.T_G_M[mission]
+    of_vertex = T_G_M[vi_map.vertices.mission]
+    T_G_I = truth.T_G_I[vertex]
+    frames = np.array(vi_map.baseframes.T_G_M)
+    frames[vi_map.missions.baseframe] = T_G_M
+    p_G = truth.point_G[truth.landmark_point[landmark]]
+    return vi_map.replace(
+        sensors=_true_sensors(vi_map.sensors, truth),
+        baseframes=vi_map.baseframes.replace(T_G_M=frames),
+        vertices=vi_map.vertices.replace(
+            T_M_I=se3.relative(of_vertex, T_G_I),
+            v_M=so3.rotate(so3.inverse(of_vertex[:, :4]), truth.v_G[vertex]),
+            accel_bias=truth.accel_bias[vertex],
+            gyro_bias=truth.gyro_bias[vertex],
+        ),
+        landmarks=vi_map.landmarks.replace(
+            p_I=se3.transform(se3.inverse(T_G_I[vi_map.landmarks.vertex]), p_G)
+        ),
+    )
+
+
+def _true_sensors(sensors: SensorSet, truth: Truth) -> SensorSet:
+    imus, cameras = IdIndex(truth.imu_id), IdIndex(truth.camera_id.reshape(-1, 2))
+    parameters = truth.camera_parameters.reshape(-1, truth.camera_parameters.shape[-1])
+    poses = truth.T_I_C.reshape(-1, 7)
+    result = dict(sensors.sensors)
+    for sensor_id, sensor in sensors.sensors.items():
+        if isinstance(sensor, Imu):
+            row = int(imus.rows(from_hex(sensor_id)[None])[0])
+            intrinsics = ImuIntrinsics(truth.imu_T_g[row], truth.imu_T_a[row], truth.imu_R_A_I[row])
+            result[sensor_id] = dataclasses.replace(sensor, intrinsics=intrinsics)
+        elif isinstance(sensor, CameraRig):
+            rows = cameras.rows(np.stack([from_hex(camera.id) for camera in sensor.cameras]))
+            changed = []
+            for camera, row in zip(sensor.cameras, rows, strict=True):
+                first = len(camera.intrinsics)
+                last = first + len(camera.distortion_parameters)
+                changed.append(
+                    dataclasses.replace(
+                        camera,
+                        intrinsics=parameters[row, :first],
+                        distortion_parameters=parameters[row, first:last],
+                    )
+                )
+            result[sensor_id] = dataclasses.replace(
+                sensor, cameras=tuple(changed), T_B_C=poses[rows]
+            )
+    return SensorSet(result, sensors.extrinsics, sensors.extra)
+
+
+def true_poses(
+    query: VIMap, localizations: Localizations, database: LocalizationMap, path: Path
+) -> tuple[Reference, F64]:
+    """Return the true poses of the queries, and T_R_G (7,) from the true poses of the observers.
+
+    Args:
+        query: The map of the queries.
+        localizations: The localised poses.
+        database: What was searched.
+        path: The file truth.npz of `simulate`.
+
+    Raises:
+        UserError: The file does not know the queries or the observers, or the map has no ids.
+    """
+    truth = Truth.load(path)
+    index = IdIndex(truth.vertex_id)
+    row = index.rows(query.vertices.id[localizations.vertex])
+    if not (row >= 0).any():
+        raise UserError(f"{path} is of another data set: it knows none of the queries")
+    reference = Reference(str(path), truth.T_G_I[row], row >= 0)
+    if database.observer_id is None:
+        raise UserError("the summary map has no ids: its place in the truth is not known")
+    observer = index.rows(database.observer_id)
+    known = observer >= 0
+    if known.sum() < 3:
+        raise UserError(f"{path} is of another data set: it knows none of the map's vertices")
+    T_R_G, _ = umeyama(truth.T_G_I[observer[known], 4:], database.p_G_observer[known])
+    return reference, T_R_G

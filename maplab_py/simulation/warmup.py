@@ -7,8 +7,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.simulation.brightness import Brightness
-from maplab_py.simulation.imaging import Imager
+from maplab_py.simulation.imaging import Brightness, Imager
 from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import ImageOptions
 from maplab_py.simulation.scene import make_scene

@@ -10,7 +10,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_drawing
+from maplab_py.viewer.drawing import Drawing, make_drawing, spread_rows
 from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.layers import (
     beside,
@@ -28,7 +28,6 @@ from maplab_py.viewer.layers.localization import LocalizedRun
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Extent, Layer, MissionEntry, Scene
-from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
 

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64, U8, U64
 from maplab_py.geometry import so3
 from maplab_py.viewer import colours
-from maplab_py.viewer.first_sightings import first_camera
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import Extent, Points, Segments
-from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.queries import mission_labels
@@ -173,3 +171,102 @@ def axis_lines(T: F64, rows: I64, length_m: float, width_px: float = 2.0) -> Seg
     start = np.repeat(T[:, 4:], 3, axis=0)
     every = np.tile(colours.AXES, (len(T), 1))
     return make_segments(start, start + tips.reshape(-1, 3), every, np.repeat(rows, 3), width_px)
+
+
+def first_observation(vi_map: VIMap) -> I64:
+    """Return the first observing keypoint row (L,) of each landmark in its mission, else any; or -1."""
+    keypoint = vi_map.observations
+    landmark = vi_map.keypoints.landmark[keypoint]
+    home = vi_map.vertices.mission[vi_map.landmarks.vertex]
+    is_foreign = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoint]] != home[landmark]
+    order = np.lexsort((keypoint, is_foreign, landmark))[::-1]
+    first = np.full(len(vi_map.landmarks), -1, dtype=np.int64)
+    first[landmark[order]] = keypoint[order]
+    return first
+
+
+def first_observer(vi_map: VIMap) -> I64:
+    """Return the first observing vertex row (L,) of each landmark in its mission, else any; or -1."""
+    first = first_observation(vi_map)
+    vertex = np.full(len(first), -1, dtype=np.int64)
+    vertex[first >= 0] = vi_map.keypoint_vertex[first[first >= 0]]
+    return vertex
+
+
+def first_camera(vi_map: VIMap) -> I64:
+    """Return the index (L,) of the camera that observed each landmark first, -1 where none did."""
+    first = first_observation(vi_map)
+    camera = np.full(len(first), -1, dtype=np.int64)
+    camera[first >= 0] = vi_map.frames.camera_index[vi_map.keypoint_frame[first[first >= 0]]]
+    return camera
+
+
+BAD_QUALITY = "of bad quality"
+MAX_POINTS = "by --vis_max_points"
+NO_POSITION = "without a finite position"
+
+
+def omission_notes(title: str, drawn: int, *reasons: tuple[int, str]) -> tuple[str, ...]:
+    """Return a line that says how many elements each reason leaves out; nothing if none does.
+
+    Args:
+        title: Title of the layer.
+        drawn: The number of elements that are drawn.
+        reasons: How many elements are left out, and why.
+    """
+    active = [(count, words) for count, words in reasons if count > 0]
+    if not active:
+        return ()
+    total = drawn + sum(count for count, _ in active)
+    causes = ", ".join(f"{count:,} {words}" for count, words in active)
+    return (f"{title}: {drawn:,} of {total:,} are drawn (left out: {causes})",)
+
+
+_BITS = 16
+"""Levels of the octree: voxels of 1 / 65536 of the cloud's width."""
+
+
+def spread_rows(p: F64, limit: int) -> I64:
+    """Return at most `limit` rows of points (N, 3), spread evenly over the space they fill.
+
+    Points are sorted along a Z-order curve. Of the finest octree level with no more occupied
+    voxels than `limit`, the first point of each voxel is taken; the rest is filled up with every
+    n-th of the others, so that dense places stay denser. The same input gives the same rows.
+    """
+    if len(p) <= limit:
+        return np.arange(len(p), dtype=np.int64)
+    key = _z_order(p)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    taken = np.zeros(len(p), dtype=np.bool_)
+    for level in range(_BITS, -1, -1):
+        voxel = key >> np.uint64(3 * level)
+        first = np.append(True, voxel[1:] != voxel[:-1])
+        if np.count_nonzero(first) > limit:
+            break
+        taken = first
+    others = np.flatnonzero(~taken)
+    missing = limit - int(np.count_nonzero(taken))
+    taken[others[(np.arange(missing) * len(others)) // max(missing, 1)]] = True
+    return np.sort(order[taken])
+
+
+def _z_order(p: F64) -> U64:
+    """Return the place (N,) of points (N, 3) on a Z-order curve through their bounding cube."""
+    low = p.min(axis=0)
+    width = max(float((p - low).max()), 1e-12)
+    cell = np.minimum((p - low) / width * (1 << _BITS), (1 << _BITS) - 1).astype(np.uint64)
+    x, y, z = (_spaced(cell[:, axis]) for axis in range(3))
+    return np.asarray(x | y << np.uint64(1) | z << np.uint64(2))
+
+
+def _spaced(x: U64) -> U64:
+    """Put two zero bits between the 16 bits of each number."""
+    for shift, mask in (
+        (16, 0x0000FF0000FF),
+        (8, 0x00F00F00F00F),
+        (4, 0x0C30C30C30C3),
+        (2, 0x249249249249),
+    ):
+        x = (x | x << np.uint64(shift)) & np.uint64(mask)
+    return x

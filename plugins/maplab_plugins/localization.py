@@ -163,7 +163,7 @@ def _reference(
 ) -> tuple[Reference, NDArray[np.float64] | None]:
     from maplab_py.algorithms.localization import reference
     from maplab_py.interop.trajectories import read_trajectory
-    from maplab_py.simulation.localization_truth import true_poses
+    from maplab_py.simulation.truth import true_poses
 
     if truth is not None:
         return true_poses(query, localizations, database, truth)

@@ -59,7 +59,7 @@ def simulate(
             scenario has `images: {render: true}`, images; their truth goes to the folder truth.
         overwrite: Replace maps that are there already.
     """
-    from maplab_py.simulation.output import refuse_used_folder, write_maps
+    from maplab_py.simulation.raw_data import refuse_used_folder, write_maps
 
     description = _scenario(scenario, seed)
     refuse_used_folder(map_folder, overwrite=overwrite)
@@ -105,7 +105,7 @@ def demo(
     """
     from maplab_py.algorithms.warmup import CompilationAhead
     from maplab_py.simulation.demo import KERNELS, MAP_KEY, SCENARIO, demonstrate
-    from maplab_py.simulation.output import refuse_used_folder
+    from maplab_py.simulation.raw_data import refuse_used_folder
 
     refuse_used_folder(map_folder, overwrite=overwrite)
     context.maps.check_new_key(MAP_KEY)

@@ -24,8 +24,8 @@ from maplab_py.sensors import Extrinsics, OtherSensor
 from maplab_py.sensors.wheels import wheel_scale, with_wheel_scale
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.wheels import wheel_velocities, write_wheel_velocities
 from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edge_joining import join_transformation_edges

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 from maplab_py.algorithms.localization.database import database_of_map, database_of_summary
+from maplab_py.algorithms.localization.localization import queries, query_vertices
 from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.localization.queries import queries, query_vertices
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions

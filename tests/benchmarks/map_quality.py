@@ -19,8 +19,7 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
-from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.merge_evaluation import shown_points, sightings
+from maplab_py.simulation.evaluation import evaluate_map, shown_points, sightings
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth

@@ -17,8 +17,8 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3
-from maplab_py.simulation.image_files import SessionFolders, write_images
-from maplab_py.simulation.pixel_rays import pixel_rays
+from maplab_py.simulation.imaging import pixel_rays
+from maplab_py.simulation.raw_data import SessionFolders, write_images
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.sparsification import greedy
 from maplab_py.algorithms.sparsification.coverage import CoverageProblem
 from maplab_py.algorithms.sparsification.integer_programme import solve_relaxed
-from maplab_py.algorithms.sparsification.partition import solve_by_parts
+from maplab_py.algorithms.sparsification.sparsify import solve_by_parts
 from tests.algorithms.sparsification.instances import corridor
 from tests.support.machine import slowness
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.simulation.limits import check_scenario
 from maplab_py.simulation.scenario import SessionOptions
+from maplab_py.simulation.scenario_file import check_scenario
 from maplab_py.simulation.streets import pitch_m
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap

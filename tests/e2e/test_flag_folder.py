@@ -10,7 +10,7 @@ import pytest
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.commands.lines import typed_commands
 from maplab_py.console.commands.registry import load_registry
-from maplab_py.console.scripts.stages import read_stages
+from maplab_py.console.scripts.batch import read_stages
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.settings import Layer
 from maplab_py.pipeline.plan import Pipeline, ordered

@@ -140,7 +140,7 @@ def _page(path: Path, version: int) -> None:
 
 
 def _truth(path: Path, version: int) -> None:
-    from maplab_py.simulation.mesh import write_mesh
+    from maplab_py.simulation.raw_data import write_mesh
     from maplab_py.simulation.surfaces import Surfaces
 
     side = np.eye(3)[:1] * version
@@ -154,7 +154,7 @@ def _aliases(path: Path, version: int) -> None:
 
 
 def _history(path: Path, version: int) -> None:
-    from maplab_py.console.prompt.history import open_history
+    from maplab_py.console.prompt.loop import open_history
 
     open_history(path)[0].store_string(f"optvi --ba_num_iterations={version}")
 

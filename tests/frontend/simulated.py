@@ -14,7 +14,7 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 from tests.support.noiseless import without_noise
 

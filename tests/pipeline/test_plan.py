@@ -10,7 +10,7 @@ from maplab_py.console.scripts.batch import read_batch
 from maplab_py.errors import FlagError, UserError
 from maplab_py.pipeline import Pipeline, PipelineOptions, Stage
 from maplab_py.pipeline.plan import ordered
-from maplab_py.pipeline.tasks import names_of
+from maplab_py.pipeline.records import names_of
 
 SAVE = "save --map_folder=<RESULT_FOLDER>"
 

@@ -16,10 +16,10 @@ import pytest
 from maplab_py.errors import MaplabError
 from maplab_py.pipeline.orders import Ending, Outcome
 from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
+from maplab_py.server.preparation import WorkerPool
 from maplab_py.server.server import MapServer
 from maplab_py.server.spool import Spool, push
 from maplab_py.server.worker import SubmapOrder
-from maplab_py.server.worker_pool import WorkerPool
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap

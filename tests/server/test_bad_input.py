@@ -169,7 +169,7 @@ def test_a_full_disk_delays_what_comes(servers: Servers, monkeypatch: pytest.Mon
 def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
+    monkeypatch.setattr("maplab_py.server.preparation._SECONDS_BETWEEN_RETRIES", 0.1)
     attempts: Counter[str] = Counter()
 
     def full(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
@@ -219,7 +219,7 @@ def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
 def test_a_failure_that_is_not_the_submap_s_is_tried_again(
     servers: Servers, monkeypatch: pytest.MonkeyPatch, ending: Ending, error: str
 ) -> None:
-    monkeypatch.setattr("maplab_py.server.intake._SECONDS_BETWEEN_RETRIES", 0.1)
+    monkeypatch.setattr("maplab_py.server.preparation._SECONDS_BETWEEN_RETRIES", 0.1)
     failed: list[str] = []
 
     def failing(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from maplab_py.errors import FlagError
-from maplab_py.server.display import Display
 from maplab_py.server.options import ServiceOptions
+from maplab_py.server.publishing import Display
 from maplab_py.vimap import VIMap
 
 MAPS = [VIMap() for _ in range(4)]
@@ -24,7 +24,7 @@ def test_every_map_is_shown_without_an_interval() -> None:
 
 def test_the_latest_map_is_shown_when_its_time_has_come(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("maplab_py.server.display.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("maplab_py.server.publishing.time.monotonic", lambda: now[0])
     seen: list[VIMap] = []
     display = Display(seen.append, 10.0)
     display.offer(MAPS[0])

@@ -12,7 +12,7 @@ import pytest
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, write_ply
-from maplab_py.server.lookup import dense_points_in_range, map_lookup
+from maplab_py.server.requests import dense_points_in_range, map_lookup
 from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import find_maps, save_map

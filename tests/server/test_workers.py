@@ -12,8 +12,8 @@ import pytest
 
 from maplab_py.pipeline.orders import Ending
 from maplab_py.server import worker as worker_module
+from maplab_py.server.preparation import WorkerPool
 from maplab_py.server.worker import SubmapOrder, answer
-from maplab_py.server.worker_pool import WorkerPool
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import LandmarkQuality
 from tests.server.support import submaps

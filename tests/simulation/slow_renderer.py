@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F32, F64, I64
 from maplab_py.geometry import so3
-from maplab_py.simulation.scene import Scene
+from maplab_py.simulation.scene import Scene, Textures
 from maplab_py.simulation.shading_kernels import LEVELS
-from maplab_py.simulation.textures import Textures
 
 _TINY = np.float32(1e-9)
 

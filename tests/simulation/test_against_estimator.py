@@ -29,7 +29,7 @@ from maplab_py.simulation.scenario import (
 )
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from tests.simulation.small import PERFECT, SMALL
 
 AT_TRUTH = VIOptimizationOptions(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.simulation.appearance import describe, make_appearance, make_session_appearance
 from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions
+from maplab_py.simulation.scene import describe, make_appearance, make_session_appearance
 from tests.simulation.small import docs_script, simulated
 from tests.support.data import REPOSITORY, shared_data
 

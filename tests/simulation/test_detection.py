@@ -10,6 +10,7 @@ import pytest
 from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
 from maplab_py.simulation import detection
+from maplab_py.simulation.detection import drifts
 from maplab_py.simulation.scenario import (
     CameraOptions,
     MeasurementOptions,
@@ -17,7 +18,6 @@ from maplab_py.simulation.scenario import (
     WorldOptions,
 )
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.simulation.tracks import drifts
 from maplab_py.simulation.world import make_world
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.tables import FrameField

@@ -13,7 +13,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.simulation.evaluation import MapErrors, evaluate_map
 from maplab_py.simulation.scenario import CalibrationOptions, OtherSensorOptions, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import remove_observations
 from tests.simulation.small import PERFECT, SMALL, simulated

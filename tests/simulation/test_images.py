@@ -18,12 +18,9 @@ from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import back_project
-from maplab_py.simulation.brightness import Brightness
 from maplab_py.simulation.cameras import pixels_of
-from maplab_py.simulation.imaging import Imager
-from maplab_py.simulation.mesh import write_mesh
-from maplab_py.simulation.pixel_rays import pixel_rays
-from maplab_py.simulation.raw_data import write_raw_data
+from maplab_py.simulation.imaging import Brightness, Imager, pixel_rays
+from maplab_py.simulation.raw_data import write_mesh, write_raw_data
 from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import (
     CalibrationOptions,

@@ -10,10 +10,9 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import parse_ply
-from maplab_py.simulation.lidar import Lidar
-from maplab_py.simulation.limits import check_scenario
 from maplab_py.simulation.scenario import LidarOptions, Scenario, WorldOptions
-from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.scenario_file import check_scenario
+from maplab_py.simulation.simulate import Lidar, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.storage.resources import ResourceStore

@@ -10,7 +10,7 @@ import pytest
 
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.simulation.pixel_rays import pixel_rays
+from maplab_py.simulation.imaging import pixel_rays
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.scenario import ImageOptions
 from maplab_py.simulation.scene import Scene, make_scene

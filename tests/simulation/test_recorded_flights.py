@@ -13,7 +13,7 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.imu_csv import ImuRecording, read_imu_csv, write_imu_csv
 from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc
-from maplab_py.simulation.recorded_imu import recorded_samples
+from maplab_py.simulation.recording import recorded_samples
 from maplab_py.simulation.scenario import SessionOptions, WorldOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SimulatedData, simulate

@@ -16,9 +16,8 @@ from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory
-from maplab_py.simulation.brightness import Brightness, make_brightness
-from maplab_py.simulation.image_files import SessionFolders, write_images
-from maplab_py.simulation.raw_data import write_raw_data
+from maplab_py.simulation.imaging import Brightness, make_brightness
+from maplab_py.simulation.raw_data import SessionFolders, write_images, write_raw_data
 from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import (
     CameraOptions,

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.ray_kernels import cast_rays
+from maplab_py.simulation.ray_caster import cast_rays
 from maplab_py.simulation.scenario import (
     CameraOptions,
     ImageOptions,

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.simulation.occlusion import is_hidden
+from maplab_py.simulation.detection import is_hidden
 from maplab_py.simulation.scenario import WorldOptions
 from maplab_py.simulation.world import make_world
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.interop.ply import parse_ply
-from maplab_py.simulation.output import write_maps
+from maplab_py.simulation.raw_data import write_maps
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.true_map import true_map
-from maplab_py.simulation.truth import Truth
+from maplab_py.simulation.truth import Truth, true_map
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 

@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from maplab_py.viewer.building import Subject, build_scene, make_checked_drawing
-from maplab_py.viewer.live import moved_scene
+from maplab_py.viewer.drawing import spread_rows
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.playback import make_timeline
+from maplab_py.viewer.playback import make_timeline, moved_scene
 from maplab_py.viewer.scene import Points, Segments
-from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap.merge import merge_maps
 from tests.vimap.builders import walk_map
 

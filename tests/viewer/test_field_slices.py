@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.dense.distance.field import DistanceField
-from maplab_py.algorithms.dense.distance.field_file import encode_field
+from maplab_py.algorithms.dense.distance.field import DistanceField, encode_field
 from maplab_py.algorithms.dense.distance.fields import FIELD_TYPE
 from maplab_py.errors import UserError
 from maplab_py.storage.new_resources import NewResources
 from maplab_py.viewer import colours
-from maplab_py.viewer.field_slices import field_slice
+from maplab_py.viewer.mesh_sources import field_slice
 from maplab_py.vimap import ResourceOwner, VIMap
 from tests.vimap.builders import walk_map
 

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from maplab_py.viewer.glb import coloured_glb, is_coloured
+from maplab_py.viewer.display.parts import coloured_glb, is_coloured
 from maplab_py.viewer.scene import Mesh
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.viewer.drawing import make_drawing
-from maplab_py.viewer.lookup import find_by_id
 from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.picking import find_by_id
 from maplab_py.viewer.scene import Entity
 from maplab_py.vimap.ids import to_hex
 from tests.vimap.builders import walk_map

@@ -16,8 +16,7 @@ from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.scores import descriptor_deviations
-from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.algorithms.sparsification.sparsify import descriptor_deviations, sparsify
 from maplab_py.errors import EstimationError
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.storage.native import load_map, save_map

@@ -8,6 +8,7 @@ that are consistent with the tree.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,6 @@ from maplab_py.algorithms.anchoring.absolute import (
     anchor_by_absolute_poses,
 )
 from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
-from maplab_py.algorithms.anchoring.hypotheses import described_hypotheses
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
 from maplab_py.algorithms.anchoring.pairs import (
     USED,
@@ -27,9 +27,17 @@ from maplab_py.algorithms.anchoring.pairs import (
     fits,
     strongest_pairs,
 )
-from maplab_py.algorithms.anchoring.reports import AnchoringReport, MissionAlignment
+from maplab_py.algorithms.anchoring.reports import (
+    AlignmentHypothesis,
+    AnchoringReport,
+    MissionAlignment,
+)
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.loop_closure.alignment_contest import AlignmentChoice
+from maplab_py.algorithms.loop_closure.alignment_contest import (
+    AlignmentChoice,
+    Contest,
+    listed_alignments,
+)
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
@@ -102,7 +110,7 @@ def anchor_missions(
     used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
     if used:
         T_G_M = fit_missions(_joined(used), T_G_M, known | ~reached)
-    alignments = [_described(pair, names) for pair in pairs]
+    alignments = [_describe(pair, names) for pair in pairs]
     anchored = reached & wanted
     report = AnchoringReport(
         already_known=already_known,
@@ -174,7 +182,7 @@ def _nothing_to_do(
     )
 
 
-def _described(pair: Pair, names: list[str]) -> MissionAlignment:
+def _describe(pair: Pair, names: list[str]) -> MissionAlignment:
     return MissionAlignment(
         missions=f"{names[pair.a]} - {names[pair.b]}",
         closures=pair.closures,
@@ -300,3 +308,46 @@ def _with_base_frames(vi_map: VIMap, T_G_M: F64, anchored: NDArray[np.bool_]) ->
     poses, is_known = vi_map.baseframes.T_G_M.copy(), vi_map.baseframes.is_known.copy()
     poses[rows], is_known[rows] = yaw.to_pose(T_G_M[anchored]), True
     return vi_map.replace(baseframes=vi_map.baseframes.replace(T_G_M=poses, is_known=is_known))
+
+
+def described_hypotheses(
+    contests: Sequence[Contest], names: Sequence[str]
+) -> tuple[AlignmentHypothesis, ...]:
+    """Describe the alignments of all pairs of missions that have several or none that wins."""
+    return tuple(
+        _describe_hypothesis(number, contests[i], k, names)
+        for number, (i, k) in enumerate(listed_alignments(contests), start=1)
+    )
+
+
+def _describe_hypothesis(
+    number: int, contest: Contest, k: int, names: Sequence[str]
+) -> AlignmentHypothesis:
+    alignments = contest.pair.alignments
+    alignment = alignments[k]
+    only_this = [len(alignment.stretches_A), len(alignment.stretches_B)]
+    if len(alignments) > 1:
+        rival = alignments[0 if k else 1]
+        only_this = [
+            len(np.setdiff1d(alignment.stretches(side), rival.stretches(side))) for side in (0, 1)
+        ]
+    a, b = contest.pair.missions
+    x, y, z, yaw_rad = (float(value) for value in alignment.T_B_A)
+    return AlignmentHypothesis(
+        number=number,
+        missions=f"{names[a]} - {names[b]}",
+        closures=len(alignment.rows),
+        stretches=(len(alignment.stretches_A), len(alignment.stretches_B)),
+        only_this=(only_this[0], only_this[1]),
+        position_m=(x, y, z),
+        yaw_deg=float(np.degrees(yaw_rad)),
+        outcome=_outcome(contest, k),
+    )
+
+
+def _outcome(contest: Contest, k: int) -> str:
+    if contest.winner < 0:
+        return "undecided"
+    if k == contest.winner:
+        return "wins"
+    return "runner-up" if k == (1 if contest.winner == 0 else 0) else "loses"

@@ -7,17 +7,26 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.landmarks.covariance import landmark_covariance
 from maplab_py.algorithms.landmarks.quality import predicted_sigma
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
 from maplab_py.algorithms.loop_closure.closure_table import Closures
+from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
-from maplab_py.algorithms.loop_closure.landmark_distance import compare_landmarks
-from maplab_py.algorithms.loop_closure.landmark_votes import Votes, unite
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import I64
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
+from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import merge_landmarks, with_p_G
+from maplab_py.vimap.queries import observer_counts
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vision.point_covariance import (
+    ClosurePoses,
+    LandmarkPairs,
+    squared_sigmas,
+)
+from maplab_py.vision.track_union import unite_tracks
 
 FEW_OBSERVATIONS = "too few verified observations agree"
 TOO_FAR = "too far apart once the closure is applied"
@@ -162,3 +171,195 @@ def _mergeable(vi_map: VIMap, closures: Closures) -> NDArray[np.bool_]:
     place = vi_map.vertices.mission[closures.place_vertex]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     return np.asarray((query == place) | (known[query] & known[place]))
+
+
+_POSE_DRIFT = 0.01
+"""Standard deviation of a landmark due to errors of observing poses, relative to its distance."""
+_APART_RATIO = 0.1
+"""Distance of two landmarks, relative to their depth, beyond which a pair is doubtful."""
+_DOUBTFUL_SQUARED_SIGMAS = 6.25
+"""Exceeded by a tenth of the pairs that are one point: chi square of three degrees of freedom."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Agreement:
+    """Distances of landmarks of the query and the place after the closure is applied."""
+
+    gap_m: F64  # (N,) between them
+    depth_m: F64  # (N,) of the place's landmark from the query
+    squared_sigmas: F64  # (N,) squared Mahalanobis distance, three degrees of freedom
+
+    def is_doubtful(self, distance_m: float) -> Mask:
+        """Return which pairs (N,) are one point less likely, or because nobody knows their depth.
+
+        These are the tenth of the true pairs that is farthest apart in deviations, and pairs farther
+        apart than a distance and a tenth of their depth.
+        """
+        is_apart = self.gap_m > np.maximum(distance_m, _APART_RATIO * self.depth_m)
+        return np.asarray(is_apart | (self.squared_sigmas > _DOUBTFUL_SQUARED_SIGMAS))
+
+
+def compare_landmarks(
+    vi_map: VIMap, closures: Closures, closure: I64, source: I64, target: I64, sigma_px: float
+) -> Agreement:
+    """Compare landmarks of queries with those of places.
+
+    Args:
+        vi_map: The map.
+        closures: The closures.
+        closure: Row of the closure (N,) that matched them; its covariance is known.
+        source: Landmark (N,) that the query sees.
+        target: Landmark (N,) of the place.
+        sigma_px: Standard deviation of keypoints.
+    """
+    query = closures.query_vertex
+    mission = vi_map.vertices.mission[closures.place_vertex].astype(np.int64)
+    T_M_I = closures.T_M_I
+    T_I_G = se3.inverse(vi_map.T_G_I[query])
+    p_I = se3.transform(T_I_G[closure], vi_map.p_G[source])
+    p_M = points_in_mission(vi_map, target, mission[closure])
+    gap_M = se3.transform(T_M_I[closure], p_I) - p_M
+    depth_m = np.linalg.norm(p_M - T_M_I[closure, 4:], axis=1)
+    landmarks, row = np.unique(np.concatenate([source, target]), return_inverse=True)
+    pairs = LandmarkPairs(
+        gap_M, p_I, _POSE_DRIFT * depth_m, closure, row[: len(source)], row[len(source) :]
+    )
+    poses = ClosurePoses(
+        R_M_Gq=so3.to_matrix(se3.compose(T_M_I, T_I_G)[:, :4]),
+        R_M_G=so3.to_matrix(se3.inverse(vi_map.T_G_M)[mission, :4]),
+        R_M_I=so3.to_matrix(T_M_I[:, :4]),
+        covariance=closures.covariance,
+    )
+    squared = squared_sigmas(pairs, landmark_covariance(vi_map, landmarks, sigma_px), poses)
+    return Agreement(np.asarray(np.linalg.norm(gap_M, axis=1)), depth_m, squared)
+
+
+_ROUNDS = 4
+"""Merged landmarks collect the votes of their members; later rounds merge next to nothing."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Votes:
+    """Verified observations (N,) that two landmarks are one point."""
+
+    first: I64  # (N,) landmark that the query observes
+    second: I64  # (N,) landmark that it was matched with
+    query: I64  # (N,) query vertex
+    bits: NDArray[np.int32]  # (N,) different bits
+    is_doubtful: Mask  # (N,) the positions say little for one point; see `Agreement.is_doubtful`
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class United:
+    """Pairs of landmarks to merge, one row per vote for them."""
+
+    first: I64  # (P,)
+    second: I64  # (P,)
+    vote: I64  # (P,) row of `Votes`
+    wanted: I64  # (P,) query vertices that had to agree
+    too_few: int  # pairs that fewer query vertices support
+    seen_together: int  # pairs that one image sees both of
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs (P,) of landmarks, `first` the larger row."""
+
+    of_vote: I64  # (N,)
+    first: I64
+    second: I64
+    votes: I64  # query vertices that support the pair
+    bits: F64  # mean number of different bits
+    is_doubtful: Mask  # according to any vote
+
+
+def unite(vi_map: VIMap, votes: Votes, min_votes: int) -> United:
+    """Return the pairs that enough query vertices support and no image contradicts.
+
+    A pair needs `min_votes` query vertices, or all vertices that observe one of the two landmarks where
+    they are fewer: after keyframing many landmarks have a single observer. Doubtful pairs need one
+    more. Votes are counted again after merging: those for several landmarks that were merged are votes
+    for one.
+
+    Args:
+        vi_map: The map.
+        votes: Verified observations; the landmarks of a vote differ.
+        min_votes: Number of query vertices.
+    """
+    count = len(vi_map.landmarks)
+    image = vi_map.keypoint_frame[vi_map.observations].astype(np.int64)
+    observers = observer_counts(vi_map)
+    label = np.arange(count)
+    links = np.zeros((2, 0), dtype=np.int64)
+    none = np.zeros(0, dtype=np.int64)
+    parts = [(none, none, none, none)]
+    for _ in range(_ROUNDS):
+        pairs = count_pairs(votes, label)
+        wanted = np.minimum(observers[pairs.first], observers[pairs.second])
+        wanted = np.minimum(wanted, min_votes + pairs.is_doubtful)
+        enough = pairs.votes >= wanted
+        order = np.lexsort((pairs.second, pairs.first, pairs.bits, -pairs.votes))
+        order = order[enough[order]]
+        both = np.stack([pairs.first[order], pairs.second[order]])
+        # what earlier rounds have merged comes first
+        first, second = np.concatenate([links, both], axis=1)
+        fits = unite_tracks(first, second, vi_map.observation_start, image, len(vi_map.frames))
+        fits = fits[links.shape[1] :]
+        if not fits.any():
+            break
+        is_united = np.zeros(len(pairs.votes) + 1, dtype=np.bool_)
+        is_united[order[fits]] = True
+        vote = np.flatnonzero(is_united[pairs.of_vote])
+        of_vote = pairs.of_vote[vote]
+        parts.append((pairs.first[of_vote], pairs.second[of_vote], vote, wanted[of_vote]))
+        links = np.concatenate([links, both[:, fits]], axis=1)
+        label = _components(links, count)
+        np.maximum.at(observers, label, observers)
+    merged = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return United(
+        first=merged[0],
+        second=merged[1],
+        vote=merged[2],
+        wanted=merged[3],
+        too_few=int(np.count_nonzero(~enough)),
+        seen_together=int(np.count_nonzero(~fits)),
+    )
+
+
+def count_pairs(votes: Votes, label: I64) -> Pairs:
+    """Count the votes for pairs of landmarks.
+
+    A pair is the same in both directions. Votes for landmarks that are merged belong to pair -1.
+
+    Args:
+        votes: Verified observations.
+        label: Landmark (L,) that each landmark has been merged into.
+    """
+    count = max(len(label), 1)
+    a, b = label[votes.first], label[votes.second]
+    open_ = np.flatnonzero(a != b)
+    key = np.maximum(a, b)[open_] * count + np.minimum(a, b)[open_]
+    key, pair = np.unique(key, return_inverse=True)
+    pair = pair.astype(np.int64)
+    span = int(votes.query.max(initial=0)) + 1
+    voters = distinct(pair * span + votes.query[open_])
+    number = np.bincount(voters // span, minlength=len(key))
+    mean = np.bincount(pair, weights=votes.bits[open_], minlength=len(key)) / np.maximum(
+        np.bincount(pair, minlength=len(key)), 1
+    )
+    of_vote = np.full(len(a), -1, dtype=np.int64)
+    of_vote[open_] = pair
+    is_doubtful = np.bincount(pair, weights=votes.is_doubtful[open_], minlength=len(key)) > 0
+    return Pairs(of_vote, key // count, key % count, number, mean, is_doubtful)
+
+
+def _components(links: I64, count: int) -> I64:
+    """Return the smallest row (count,) that each landmark is connected with by links (2, N)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(links.shape[1], dtype=np.int8), tuple(links)), shape=(count, count))
+    groups, label = connected_components(graph, directed=False)
+    smallest = np.full(groups, count, dtype=np.int64)
+    np.minimum.at(smallest, label, np.arange(count))
+    return np.asarray(smallest[label])

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
+import os
+import weakref
 from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flags import Flag, looks_like_flag, normalise
 from maplab_py.console.commands.lines import Word, escaped, scan
-from maplab_py.console.prompt.matching import Rank, match_rank
-from maplab_py.console.prompt.values import known_values, path_values
 from maplab_py.console.session.session import Session
-from maplab_py.errors import UserError
+from maplab_py.errors import MaplabError, UserError
+from maplab_py.report import counted
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
 
 _MOST_VALUES = 1000
 """More values of a flag are not proposed: nobody looks through them, and they take time."""
@@ -160,3 +168,166 @@ def _ranked(
         if rank is not None:
             fitting.append((rank, -used[name], len(name), name, candidate))
     return [entry[-1] for entry in sorted(fitting, key=lambda entry: entry[:-1])]
+
+
+Rank = tuple[int, int]
+"""Kind of the match and number of pieces; smaller is better."""
+_FEW_PIECES = 2
+
+
+def match_rank(typed: str, name: str) -> Rank | None:
+    """Return how well a name fits what was typed, None if it does not.
+
+    The kinds, best first: the whole name, its beginning, the beginning of one of its words, letters
+    in order from the first one on (`ovi` fits optvi), a part, letters in order. Letters in order
+    are better if they form fewer pieces.
+    """
+    typed, name = typed.lower(), name.lower()
+    if name.startswith(typed):
+        return (0 if len(typed) == len(name) else 1), 1
+    if f"_{typed}" in name:
+        return 2, 1
+    is_part = typed in name
+    letters = iter(name)
+    if not all(letter in letters for letter in typed):
+        return None
+    if name[:1] == typed[:1]:
+        pieces = _pieces(typed, name)
+        return (3, pieces) if not is_part or pieces == _FEW_PIECES else (4, 1)
+    return (4, 1) if is_part else (5, _pieces(typed, name))
+
+
+def _pieces(typed: str, name: str) -> int:
+    """Return the least number of pieces of a name that make up what was typed."""
+    # best[j]: fewest pieces for the letters so far, of which the last one stands at name[j]
+    none = len(name) + 1
+    best = [1 if letter == typed[:1] else none for letter in name]
+    for letter in typed[1:]:
+        before, best = best, [none] * len(name)
+        fewest = none
+        for place, other in enumerate(name):
+            if place >= 2:
+                fewest = min(fewest, before[place - 2] + 1)
+            if other == letter:
+                best[place] = min(before[place - 1] if place else none, fewest)
+    return min(best, default=none)
+
+
+class Value(NamedTuple):
+    """A value that a flag can have."""
+
+    text: str  # as it is typed
+    note: str = ""  # what it is
+    id: str = ""  # may be typed instead, its beginning too
+    shown: str = ""  # the last part of a path
+
+
+_MAP_FILE = Path("vi_map") / "vi_map_metadata"
+_KIND_OF_FLAG = {
+    "map_key": "map",
+    "target_map_key": "map",
+    "map_mission": "mission",
+    "map_mission_list": "mission",
+    "command_name": "command",
+}
+
+
+def known_values(command: Command, flag: Flag, session: Session) -> list[Value]:
+    """Return the values that a flag can have now."""
+    if flag.type.choices:
+        return [Value(value) for value in flag.type.choices]
+    source = command.completes.get(flag.name) or _KIND_OF_FLAG.get(flag.name, "")
+    if callable(source):
+        try:
+            return [Value(text, note) for text, note in source(session)]
+        except MaplabError:  # such as: no map is selected
+            return []
+    return _SOURCES[source](session) if source in _SOURCES else []
+
+
+def _maps(session: Session) -> list[Value]:
+    return [Value(entry.key, str(entry.folder or "")) for entry in session.maps]
+
+
+def _snapshots(session: Session) -> list[Value]:
+    if not session.maps.selected_key:
+        return []
+    snapshots = session.maps.selected.snapshots
+    return [Value(name, _size(vi_map)) for name, vi_map in snapshots.items()]
+
+
+def _size(vi_map: VIMap) -> str:
+    vertices = counted(len(vi_map.vertices), "vertex", "vertices")
+    return f"{vertices}, {counted(len(vi_map.landmarks), 'landmark')}"
+
+
+def _jobs(session: Session) -> list[Value]:
+    return [Value(str(job.number), f"{job.state}: {job.text}") for job in session.jobs.jobs]
+
+
+def _aliases(session: Session) -> list[Value]:
+    return [Value(name, line) for name, line in session.aliases.items()]
+
+
+def _command_values(session: Session) -> list[Value]:
+    return [Value(name, session.registry.find(name).summary) for name in session.registry.names]
+
+
+def _missions(session: Session) -> list[Value]:
+    """Return the missions by name, or by id where the name is not unique."""
+    if not session.maps.selected_key:
+        return []
+    vi_map = session.vi_map
+    if vi_map not in _MISSIONS:
+        _MISSIONS[vi_map] = _described_missions(vi_map)
+    return _MISSIONS[vi_map]
+
+
+_MISSIONS: weakref.WeakKeyDictionary[VIMap, list[Value]] = weakref.WeakKeyDictionary()
+"""The missions of a map do not change, as maps are values."""
+
+
+def _described_missions(vi_map: VIMap) -> list[Value]:
+    from maplab_py.vimap.ids import to_hex_list
+    from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
+
+    names = [str(name) for name in vi_map.missions.name]
+    counts = Counter(names)
+    lengths, spans = mission_distances_m(vi_map), mission_time_spans_ns(vi_map)
+    values = []
+    for row, id_ in enumerate(to_hex_list(vi_map.missions.id)):
+        start = dt.datetime.fromtimestamp(int(spans[row, 0]) // 10**9, tz=dt.UTC)
+        is_unique = bool(names[row]) and counts[names[row]] == 1
+        what = f"{id_[:8]}  {lengths[row]:.0f} m from {start:%Y-%m-%d %H:%M:%S}"
+        values.append(Value(names[row] if is_unique else id_, what, id_))
+    return values
+
+
+_SOURCES: dict[str, Callable[[Session], list[Value]]] = {
+    "alias": _aliases,
+    "command": _command_values,
+    "job": _jobs,
+    "map": _maps,
+    "mission": _missions,
+    "snapshot": _snapshots,
+}
+
+
+def path_values(typed: str) -> list[Value]:
+    """Return the files and folders that continue a typed path: maps first, folders with a slash."""
+    head, separator, tail = typed.rpartition("/")
+    folder = Path(os.path.expanduser(os.path.expandvars(head + separator)) or ".")
+    candidates = []
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError:
+        return []
+    for entry in entries:
+        if not entry.name.startswith(tail) or (entry.name.startswith(".") and not tail):
+            continue
+        is_folder = entry.is_dir()
+        is_map = is_folder and os.path.exists(os.path.join(entry.path, _MAP_FILE))
+        shown = entry.name + ("/" if is_folder else "")
+        value = Value(head + separator + shown, "map" if is_map else "", shown=shown)
+        candidates.append((not is_map, value))
+    return [value for _, value in sorted(candidates, key=lambda pair: pair[0])]

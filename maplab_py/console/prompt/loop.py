@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import logging
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from prompt_toolkit import PromptSession
 from prompt_toolkit.auto_suggest import AutoSuggestFromHistory
@@ -15,7 +18,7 @@ from prompt_toolkit.completion import CompleteEvent, Completer, Completion
 from prompt_toolkit.document import Document
 from prompt_toolkit.filters import Condition
 from prompt_toolkit.formatted_text import StyleAndTextTuples
-from prompt_toolkit.history import History
+from prompt_toolkit.history import FileHistory, History, InMemoryHistory
 from prompt_toolkit.input import Input
 from prompt_toolkit.input.typeahead import get_typeahead, store_typeahead
 from prompt_toolkit.key_binding import KeyPress
@@ -25,17 +28,19 @@ from prompt_toolkit.output import ColorDepth
 from prompt_toolkit.patch_stdout import patch_stdout
 from prompt_toolkit.styles import Style
 
-from maplab_py.console.prompt.colouring import coloured_parts
+from maplab_py.console.commands.command import Command
+from maplab_py.console.commands.flags import looks_like_flag, resolve_name
+from maplab_py.console.commands.lines import Word, scan
+from maplab_py.console.commands.registry import Registry
 from maplab_py.console.prompt.completion import complete
-from maplab_py.console.prompt.history import open_history, recent_commands
-from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.scripts.runner import LEAVE, Runner
 from maplab_py.console.session.maps import MapEntry
 from maplab_py.console.session.paths import state_folder
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.foreground import NotedInterrupts, interrupts_noted
 from maplab_py.console.terminal.render import wants_colour
-from maplab_py.errors import Cancelled
+from maplab_py.errors import Cancelled, FlagError
 from maplab_py.report import counted
 
 SHEEP = "sheep"
@@ -288,3 +293,92 @@ def _history() -> History:
     if problem:
         sys.stderr.write(f"warning: the history is not kept: {problem}\n")
     return history
+
+
+def coloured_parts(line: str, registry: Registry) -> list[tuple[str, str]]:
+    """Split a line into (style, text) whose texts joined are the line.
+
+    Styles are command, flag, value, unknown (a command or flag that does not exist) or empty.
+    """
+    parts: list[tuple[str, str]] = []
+    position = 0
+    for words in scan(line):
+        command: Command | None = None
+        for number, word in enumerate(words):
+            parts.append(("", line[position : word.start]))
+            raw = line[word.start : word.end]
+            if number == 0:
+                known = word.text in registry.names
+                command = registry.find(word.text) if known else None
+                style = "command" if known or word.text in LEAVE else "unknown"
+                parts.append((style, raw))
+            else:
+                parts += _argument_parts(word, raw, command)
+            position = word.end
+    parts.append(("", line[position:]))
+    return [part for part in parts if part[1]]
+
+
+def _argument_parts(word: Word, raw: str, command: Command | None) -> list[tuple[str, str]]:
+    if not looks_like_flag(word.text) or command is None:
+        return [("value", raw)]
+    name, equals, value = raw.partition("=")
+    style = "flag"
+    if not command.raw_arguments:
+        try:
+            resolve_name(name.lstrip("-"), command.flags, command.name)
+        except FlagError:
+            style = "unknown"
+    return [(style, name + equals), ("value", value)]
+
+
+_RECENT_BYTES = 100_000
+"""Part of the history that the ranking of completions takes into account."""
+
+logger = logging.getLogger(__name__)
+
+
+class KeptHistory(FileHistory):
+    """A history file; a line that cannot be written is kept in memory only."""
+
+    def store_string(self, string: str) -> None:
+        """Append a line in one write, completely or not at all."""
+        lines = "".join(f"+{line}\n" for line in string.split("\n"))
+        data = f"\n# {dt.datetime.now()}\n{lines}".encode()
+        try:
+            _append(Path(os.fsdecode(self.filename)), data)
+        except OSError:
+            logger.warning("%s: a line is not kept", self.filename, exc_info=True)
+
+
+def open_history(path: Path) -> tuple[History, str]:
+    """Return a history that is kept in a file, else one in memory and the reason for that."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        return InMemoryHistory(), str(error)
+    return KeptHistory(str(path)), ""
+
+
+def recent_commands(path: Path) -> list[str]:
+    """Return the first words of the lines at the end of a history file; none if it is unreadable."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _RECENT_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()[1:]
+    except OSError:
+        return []
+    return [line[1:].split(maxsplit=1)[0] for line in lines if line[:1] == "+" and line[1:].strip()]
+
+
+def _append(path: Path, data: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+    try:
+        size = os.fstat(descriptor).st_size
+        if os.write(descriptor, data) != len(data):
+            os.ftruncate(descriptor, size)
+    finally:
+        os.close(descriptor)

@@ -15,10 +15,10 @@ from maplab_py.console.terminal.foreground import cancelling_interrupts
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.console.terminal.stage_table import StageTable
 from maplab_py.errors import Cancelled, FlagError
+from maplab_py.pipeline.driver import run_pipeline
 from maplab_py.pipeline.options import PipelineOptions
 from maplab_py.pipeline.plan import Pipeline, in_place
 from maplab_py.pipeline.progress import Watcher
-from maplab_py.pipeline.running import run_pipeline
 
 _MAPS_FOLDER = "maps_folder"
 _DEFAULTS = PipelineOptions()

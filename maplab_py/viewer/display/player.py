@@ -15,13 +15,12 @@ from maplab_py.array_types import I64
 from maplab_py.geometry import se3
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.parts import add_part
-from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments, spread_rows
 from maplab_py.viewer.layers.cameras import frustum_points, mission_cameras
 from maplab_py.viewer.layers.clouds import Cloud, cloud_colours, colour_ranges
 from maplab_py.viewer.layers.landmarks import landmark_colours, point_size
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Timeline, make_timeline
-from maplab_py.viewer.subsampling import spread_rows
 
 _FRUSTUM = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 

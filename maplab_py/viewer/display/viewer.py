@@ -20,10 +20,9 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.display.callbacks import by_user
 from maplab_py.viewer.display.camera import aim, aim_initially, approach
-from maplab_py.viewer.display.export import export_html
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes
-from maplab_py.viewer.display.picture import save_picture, take_picture
+from maplab_py.viewer.display.picture import export_html, save_picture, take_picture
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
@@ -31,11 +30,9 @@ from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.layers.closures import REFUSED
-from maplab_py.viewer.live import moved_scene
-from maplab_py.viewer.lookup import MIN_DIGITS, find_by_id
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.picking import Pick, pick
-from maplab_py.viewer.playback import without_played
+from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, pick
+from maplab_py.viewer.playback import moved_scene, without_played
 from maplab_py.viewer.scene import Scene, is_elsewhere
 from maplab_py.vimap import VIMap
 

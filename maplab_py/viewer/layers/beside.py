@@ -8,11 +8,18 @@ import numpy as np
 
 from maplab_py.array_types import F64, U8
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.drawing import (
+    BAD_QUALITY,
+    MAX_POINTS,
+    NO_POSITION,
+    Drawing,
+    make_points,
+    make_segments,
+    omission_notes,
+    spread_rows,
+)
 from maplab_py.viewer.layers.landmarks import point_size
-from maplab_py.viewer.omissions import BAD_QUALITY, MAX_POINTS, NO_POSITION, omission_notes
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part
-from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.ids import to_hex_list
 

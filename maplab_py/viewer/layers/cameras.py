@@ -12,8 +12,7 @@ from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, SensorSet
 from maplab_py.sensors.projection import back_project
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_segments
-from maplab_py.viewer.omissions import omission_notes
+from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
 from maplab_py.viewer.scene import Axes, Layer, Part
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id

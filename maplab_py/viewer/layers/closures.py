@@ -11,8 +11,7 @@ from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_segments
-from maplab_py.viewer.omissions import omission_notes
+from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
 from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, LegendEntry
 
 ACCEPTED, REFUSED = "accepted_closures", "refused_closures"

@@ -9,10 +9,15 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, U8
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_points
-from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
+from maplab_py.viewer.drawing import (
+    MAX_POINTS,
+    NO_POSITION,
+    Drawing,
+    make_points,
+    omission_notes,
+    spread_rows,
+)
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Mesh, Part
-from maplab_py.viewer.subsampling import spread_rows
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,11 +7,17 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_points
-from maplab_py.viewer.first_sightings import first_camera, first_observer
-from maplab_py.viewer.omissions import MAX_POINTS, NO_POSITION, omission_notes
+from maplab_py.viewer.drawing import (
+    MAX_POINTS,
+    NO_POSITION,
+    Drawing,
+    first_camera,
+    first_observer,
+    make_points,
+    omission_notes,
+    spread_rows,
+)
 from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
-from maplab_py.viewer.subsampling import spread_rows
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.descriptors import type_of_name
 from maplab_py.vimap.queries import observation_counts, observer_counts

@@ -8,9 +8,8 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_points, make_segments
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments, spread_rows
 from maplab_py.viewer.scene import WHOLE_MAP, Layer
-from maplab_py.viewer.subsampling import spread_rows
 
 _MAX_LANDMARKS = 60_000
 _POINT_SIZE = 0.005

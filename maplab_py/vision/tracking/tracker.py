@@ -9,12 +9,11 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maplab_py.array_types import F64, U8, Mask
+from maplab_py.array_types import F32, F64, I64, U8, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.vision.features.detection import GridDetector, refined
-from maplab_py.vision.tracking.drift import align, patches
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
     follow,
@@ -22,7 +21,6 @@ from maplab_py.vision.tracking.flow import (
     turn_matrix,
     turned_in_plane,
 )
-from maplab_py.vision.tracking.live_tracks import LiveTracks
 from maplab_py.vision.tracking.motion import (
     ImageMotion,
     camera_turn,
@@ -31,7 +29,7 @@ from maplab_py.vision.tracking.motion import (
     summarise,
 )
 from maplab_py.vision.tracking.options import TrackingOptions
-from maplab_py.vision.tracking.stereo import StereoOptions, match
+from maplab_py.vision.tracking.patch_kernels import SIDE_PX, align_patches, sample_patches
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
@@ -260,3 +258,206 @@ def compile_kernels() -> None:
     image = np.kron(grey, np.ones((8, 8), dtype=np.uint8))
     for time_ns, turn in enumerate((None, np.eye(3), None)):
         tracker.track(time_ns, (image,), turn)
+
+
+# Keypoints without drift: each is aligned with the patch about it in the first image of its track.
+#
+# Lucas-Kanade from image to image adds up the errors of all images: patches are compared without a change of
+# scale and shear, and a keypoint moves away from its point by a pixel in five seconds. Its landmark is
+# then triangulated at a wrong depth, whatever the number of observations. Comparison with the first image
+# under an affine warp (J. Shi, C. Tomasi, Good Features to Track, CVPR 1994) has an error that does not grow.
+
+_MIN_SIMILARITY = 0.8
+"""Correlation of a patch and the image below which the image does not show it."""
+_LARGEST_STEP_PX = 1.5
+"""Farthest that a keypoint is moved from where Lucas-Kanade has put it."""
+_LARGEST_STRETCH = 1.8
+"""Change of scale, in any direction, from which on the latest image takes the place of the first one."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AlignedKeypoints:
+    """K keypoints in an image, and what the next images are compared with."""
+
+    uv: F64  # (K, 2)
+    patch: F32  # (K, S, S)
+    warp: F64  # (K, 2, 2) from offsets in the patch to offsets in the image
+
+
+def align(image: U8, uv: F64, patch: F32, warp: F64) -> AlignedKeypoints:
+    """Align keypoints with their patches.
+
+    Where the image does not show a patch, the keypoint stays where it is; it is compared with this image
+    from now on.
+
+    Args:
+        image: Image (H, W).
+        uv: Keypoints (K, 2) in it, from Lucas-Kanade.
+        patch: Their patches (K, S, S).
+        warp: Expected warps (K, 2, 2).
+    """
+    aligned_uv, aligned_warp, similarity = uv.copy(), warp.copy(), np.empty(len(uv))
+    align_patches(image, patch, aligned_uv, aligned_warp, similarity)
+    with np.errstate(invalid="ignore"):  # of places that are no numbers
+        step_px = np.linalg.norm(aligned_uv - uv, axis=1)
+    is_finite = np.isfinite(step_px) & np.isfinite(aligned_warp).all(axis=(1, 2))
+    shows = is_finite & (similarity >= _MIN_SIMILARITY) & (step_px <= _LARGEST_STEP_PX)
+    aligned_uv[~shows], aligned_warp[~shows] = uv[~shows], np.eye(2)
+    stretch = np.linalg.svd(aligned_warp, compute_uv=False)
+    is_stretched = (stretch[:, 0] > _LARGEST_STRETCH) | (stretch[:, 1] < 1.0 / _LARGEST_STRETCH)
+    is_new = ~shows | is_stretched
+    patch = patch.copy()
+    patch[is_new], aligned_warp[is_new] = patches(image, aligned_uv[is_new]), np.eye(2)
+    return AlignedKeypoints(aligned_uv, patch, aligned_warp)
+
+
+def patches(image: U8, uv: F64) -> F32:
+    """Return the patches (K, S, S) about keypoints (K, 2) of an image (H, W)."""
+    result = np.empty((len(uv), SIDE_PX, SIDE_PX), dtype=np.float32)
+    sample_patches(image, uv, result)
+    return result
+
+
+_MIN_DISTANCE_M, _FAR_M = 0.05, 1000.0
+_NEIGHBOURS = 3
+"""A point of unknown distance is sought at the median inverse distance of so many neighbours."""
+_RETRY_FRAMES = 4
+"""Interval in which a point of unknown distance is sought again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoOptions:
+    """Limits of stereo."""
+
+    flow: FlowOptions
+    gate_px: float  # distance to the epipolar line
+    distance_m: float  # where the points are sought while no distance is known
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StereoMatches:
+    """Observations of K tracks by another camera."""
+
+    uv: F64  # (K, 2) of its prepared image
+    ray: F64  # (K, 3)
+    is_matched: Mask  # (K,)
+    distance_m: F64  # (K,) from the first camera, NaN where it is not known
+
+
+def match(
+    first: CameraView,
+    second: CameraView,
+    images: tuple[U8, U8],
+    tracks: LiveTracks,
+    options: StereoOptions,
+) -> StereoMatches:
+    """Find the tracks of a camera in the image that another took at the same time.
+
+    Points are sought where they would be at their last known distance, else at the distance of
+    their neighbours in the image, else at the default distance. A match must be tracked back to where
+    it came from, lie on its epipolar line, and in front of both cameras.
+    """
+    R_A_B, p_A_B = first.R_I_C.T @ second.R_I_C, first.R_I_C.T @ (second.p_I_C - first.p_I_C)
+    expected_m = _expected_distances(tracks, options.distance_m)
+    guess, visible = second.pixels((expected_m[:, None] * tracks.ray - p_A_B) @ R_A_B)
+    is_due = np.isfinite(tracks.distance_m) | (tracks.num_frames % _RETRY_FRAMES == 1)
+    rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
+    uv_second, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow)
+    ray_second, exists = second.rays(uv_second)
+    off, distance, is_ahead = _triangulated(tracks.ray[rows], ray_second @ R_A_B.T, p_A_B)
+    gate = options.gate_px / second.focal_px
+    is_match &= exists & second.is_usable(uv_second) & (np.abs(off) <= gate)
+    # where the rays are nearly parallel, noise decides on which side they meet
+    chord = np.linalg.norm(tracks.ray[rows] - ray_second @ R_A_B.T, axis=1)
+    is_far = chord <= gate
+    is_match &= is_far | (is_ahead & (distance >= _MIN_DISTANCE_M))
+    distance = np.where(is_ahead, np.clip(distance, _MIN_DISTANCE_M, _FAR_M), _FAR_M)
+
+    count = len(tracks)
+    uv, ray = np.zeros((count, 2)), np.zeros((count, 3))
+    is_matched, distance_m = np.zeros(count, dtype=np.bool_), np.full(count, np.nan)
+    uv[rows], ray[rows], is_matched[rows] = uv_second, ray_second, is_match
+    distance_m[rows] = np.where(is_match, distance, np.nan)
+    return StereoMatches(uv, ray, is_matched, distance_m)
+
+
+def _expected_distances(tracks: LiveTracks, default_m: float) -> F64:
+    """Return the distances (K,) at which tracks are sought."""
+    known = np.isfinite(tracks.distance_m)
+    if np.count_nonzero(known) < _NEIGHBOURS:
+        return np.where(known, tracks.distance_m, default_m)
+    rows = np.flatnonzero(~known)
+    offset = tracks.uv[rows, None] - tracks.uv[known][None]
+    squares = np.sum(offset * offset, axis=2)
+    nearest = np.argsort(squares, axis=1, kind="stable")[:, :_NEIGHBOURS]
+    expected = tracks.distance_m.copy()
+    expected[rows] = 1.0 / np.median(1.0 / tracks.distance_m[known][nearest], axis=1)
+    return expected
+
+
+def _triangulated(a: F64, b: F64, p: F64) -> tuple[F64, F64, Mask]:
+    """Intersect rays a (K, 3) from the origin with rays b (K, 3) from p (3,).
+
+    Returns:
+        Distances (K,) of b to the plane of a and p, distances along a, and whether the point is in
+        front of both.
+    """
+    normal = np.cross(p, a)
+    length = np.linalg.norm(normal, axis=1)
+    is_beside = length > 1e-9
+    off = np.sum(normal * b, axis=1) / np.where(is_beside, length, 1.0)
+    axis = np.cross(a, b)
+    square = np.maximum(np.sum(axis * axis, axis=1), 1e-18)
+    along_a = np.sum(np.cross(p, b) * axis, axis=1) / square
+    along_b = np.sum(np.cross(p, a) * axis, axis=1) / square
+    return off, along_a, (along_a > 0.0) & (along_b > 0.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LiveTracks:
+    """Tracks at the latest image of a camera."""
+
+    uv: F64  # (K, 2) of the prepared image
+    ray: F64  # (K, 3) unit, in the camera
+    track_id: I64  # (K,)
+    num_frames: I64  # (K,)
+    distance_m: F64  # (K,) along the ray, NaN = unknown
+    patch: F32  # (K, S, S) about the keypoint in an earlier image
+    warp: F64  # (K, 2, 2) from offsets in the patch to offsets in the latest image
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    def __getitem__(self, rows: Mask | I64) -> LiveTracks:
+        columns = (getattr(self, field.name)[rows] for field in dataclasses.fields(self))
+        return LiveTracks(*columns)
+
+    def joined(self, others: LiveTracks) -> LiveTracks:
+        """Return these tracks followed by others."""
+        names = [field.name for field in dataclasses.fields(self)]
+        pairs = ((getattr(self, name), getattr(others, name)) for name in names)
+        return LiveTracks(*(np.concatenate(pair) for pair in pairs))
+
+    def at(self, uv: F64, ray: F64) -> LiveTracks:
+        """Return the tracks an image later."""
+        return dataclasses.replace(self, uv=uv, ray=ray, num_frames=self.num_frames + 1)
+
+    def compared_with(self, patch: F32, warp: F64) -> LiveTracks:
+        """Return the tracks with other patches (K, S, S) and warps (K, 2, 2)."""
+        return dataclasses.replace(self, patch=patch, warp=warp)
+
+    @classmethod
+    def new(cls, uv: F64, ray: F64, first_id: int) -> LiveTracks:
+        """Return tracks that begin, numbered from an id on."""
+        count = len(uv)
+        ids = np.arange(first_id, first_id + count, dtype=np.int64)
+        patch = np.zeros((count, SIDE_PX, SIDE_PX), dtype=np.float32)
+        warp = np.tile(np.eye(2), (count, 1, 1))
+        return cls(
+            uv, ray, ids, np.ones(count, dtype=np.int64), np.full(count, np.nan), patch, warp
+        )
+
+    @classmethod
+    def none(cls) -> LiveTracks:
+        """Return no tracks."""
+        return cls.new(np.zeros((0, 2)), np.zeros((0, 3)), 0)

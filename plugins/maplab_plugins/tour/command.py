@@ -61,7 +61,7 @@ def tour(
 
 def _simulate(context: CommandContext, folder: Path) -> None:
     """Write the recordings unless an earlier tour has done so."""
-    from maplab_py.simulation.output import refuse_used_folder, write_maps
+    from maplab_py.simulation.raw_data import refuse_used_folder, write_maps
     from maplab_py.simulation.scenario_file import load_scenario
 
     if (folder / "truth.npz").is_file():

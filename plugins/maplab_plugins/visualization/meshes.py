@@ -86,7 +86,7 @@ def visualize_esdf(
             the vertices.
     """
     from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.field_slices import field_slice
+    from maplab_py.viewer.mesh_sources import field_slice
 
     rows = missions.rows(context.vi_map)
     folder = context.map_folder or Path()

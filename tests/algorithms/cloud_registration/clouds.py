@@ -9,7 +9,6 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3
-from maplab_py.simulation.lidar import Lidar
 from maplab_py.simulation.scenario import (
     DriftOptions,
     LidarOptions,
@@ -18,6 +17,7 @@ from maplab_py.simulation.scenario import (
     SessionOptions,
     WorldOptions,
 )
+from maplab_py.simulation.simulate import Lidar
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.vimap import VIMap

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.cloud_registration.global_registration import register_globally
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
-from maplab_py.algorithms.cloud_registration.overlap import compare_clouds
 from maplab_py.algorithms.cloud_registration.registration import (
     PreparedCloud,
     Registration,
@@ -15,6 +13,7 @@ from maplab_py.algorithms.cloud_registration.registration import (
     prepare_cloud,
     register_clouds,
 )
+from maplab_py.algorithms.cloud_registration.search import compare_clouds, register_globally
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from tests.algorithms.cloud_registration.clouds import (

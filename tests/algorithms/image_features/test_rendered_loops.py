@@ -16,7 +16,7 @@ from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.interop.resources.images import import_images
-from maplab_py.simulation.output import write_maps
+from maplab_py.simulation.raw_data import write_maps
 from maplab_py.simulation.scenario import SessionImages
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.truth import Truth

@@ -18,10 +18,11 @@ from maplab_py.algorithms.localization.localization import (
     describe,
     localize_missions,
     pose_errors,
+    queries,
+    query_vertices,
 )
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.localization.queries import queries, query_vertices
 from maplab_py.algorithms.localization.reference import ground_truth, trajectory_of_queries
 from maplab_py.algorithms.localization.result_file import csv_lines
 from maplab_py.algorithms.summary.options import SummaryMapOptions

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.geometry import se3
-from maplab_py.simulation.merge_evaluation import sightings
+from maplab_py.simulation.evaluation import sightings
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SimulatedData, simulate

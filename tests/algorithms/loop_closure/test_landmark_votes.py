@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.landmark_votes import Votes, unite
+from maplab_py.algorithms.loop_closure.merging import Votes, unite
 from maplab_py.vimap import VIMap
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 

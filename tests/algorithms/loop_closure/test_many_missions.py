@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.algorithms.loop_closure import candidates, matching, verification
+from maplab_py.algorithms.loop_closure import candidates, detection, matching
 from maplab_py.algorithms.loop_closure import features as features_module
 from maplab_py.algorithms.loop_closure.features import map_features
-from maplab_py.algorithms.loop_closure.matching import match_features
+from maplab_py.algorithms.loop_closure.matching import SearchMemory, match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.search_memory import SearchMemory
 from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.geometry import yaw
 from maplab_py.vision.index import MatchRule
@@ -96,7 +95,7 @@ def test_a_repeated_search_of_chosen_missions_builds_no_index(room, monkeypatch)
     [
         (features_module, "_RAYS_AT_ONCE", 1000),
         (candidates, "_PART_BYTES", 1e5),
-        (verification, "_MATCHES_AT_ONCE", 500),
+        (detection, "_MATCHES_AT_ONCE", 500),
     ],
 )
 def test_places_that_are_looked_at_in_parts_are_the_same(room, monkeypatch, module, name, size):

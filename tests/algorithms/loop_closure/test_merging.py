@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.landmarks.covariance import landmark_covariance
-from maplab_py.algorithms.loop_closure import landmark_distance, merging
-from maplab_py.algorithms.loop_closure.landmark_distance import compare_landmarks
+from maplab_py.algorithms.loop_closure import merging
+from maplab_py.algorithms.loop_closure.merging import compare_landmarks
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
 from maplab_py.geometry import se3
@@ -51,7 +51,7 @@ def test_covariances_are_those_of_least_squares_over_the_keypoints():
 
 
 def test_distances_of_one_point_are_as_large_as_the_noise_says(monkeypatch):
-    monkeypatch.setattr(landmark_distance, "_POSE_DRIFT", 0.0)  # poses are exact here
+    monkeypatch.setattr(merging, "_POSE_DRIFT", 0.0)  # poses are exact here
     vi_map, _ = make_map(TWICE, noise_px=1.0)
     rng = np.random.default_rng(5)
     covariance = landmark_covariance(vi_map, np.arange(len(vi_map.landmarks)), 1.0)

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure import search_memory
-from maplab_py.algorithms.loop_closure.search_memory import SearchMemory, nearest_rows
+from maplab_py.algorithms.loop_closure import matching
+from maplab_py.algorithms.loop_closure.matching import SearchMemory, nearest_rows
 from maplab_py.array_types import I32
 from maplab_py.vision.descriptors import pack_words
 from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule
@@ -38,7 +38,7 @@ class _Counted:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.built = 0
-        monkeypatch.setattr(search_memory, "make_index", self)
+        monkeypatch.setattr(matching, "make_index", self)
 
     def __call__(
         self,

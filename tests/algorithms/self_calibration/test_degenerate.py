@@ -15,7 +15,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.simulation.scenario import MotionOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 
 STILL = {"shake_m": 0.0, "shake_rad": 0.0}
 

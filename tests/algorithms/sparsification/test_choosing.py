@@ -15,7 +15,7 @@ from maplab_py.algorithms.sparsification.greedy import (
     exchange,
 )
 from maplab_py.algorithms.sparsification.integer_programme import solve_exactly, solve_relaxed
-from maplab_py.algorithms.sparsification.partition import solve_by_parts, split
+from maplab_py.algorithms.sparsification.sparsify import solve_by_parts, split
 from tests.algorithms.sparsification.instances import corridor
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.scores import (
+from maplab_py.algorithms.sparsification.sparsify import (
     descriptor_deviations,
     landmark_scores,
     mission_counts,
+    sparsify,
 )
-from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.errors import FlagError, UserError
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.consistency import check_consistency

@@ -25,7 +25,7 @@ from maplab_py.simulation.scenario import (
     WorldOptions,
 )
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from tests.support.noiseless import without_noise

@@ -17,7 +17,7 @@ import numpy as np
 
 from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import load_registry
-from maplab_py.console.scripts.stages import read_stages
+from maplab_py.console.scripts.batch import read_stages
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama

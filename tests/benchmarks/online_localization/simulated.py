@@ -25,7 +25,7 @@ from maplab_py.simulation.scenario import (
     WorldOptions,
 )
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.ids import IdIndex

@@ -25,7 +25,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
-from maplab_py.simulation.merge_evaluation import Sightings, sightings
+from maplab_py.simulation.evaluation import Sightings, sightings
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth

@@ -22,9 +22,9 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
-from maplab_py.server.intake import Intake
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
+from maplab_py.server.preparation import Intake
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.server import MapServer
 from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps

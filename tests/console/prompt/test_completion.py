@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.console.commands.registry import load_registry
-from maplab_py.console.prompt.colouring import coloured_parts
-from maplab_py.console.prompt.completion import complete
-from maplab_py.console.prompt.matching import match_rank
+from maplab_py.console.prompt.completion import complete, match_rank
+from maplab_py.console.prompt.loop import coloured_parts
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError
 from maplab_py.storage.mission_names import named

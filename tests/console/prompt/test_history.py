@@ -7,7 +7,7 @@ from pathlib import Path
 
 from prompt_toolkit.history import InMemoryHistory
 
-from maplab_py.console.prompt.history import open_history
+from maplab_py.console.prompt.loop import open_history
 
 
 def test_lines_of_two_consoles_are_kept(tmp_path: Path) -> None:

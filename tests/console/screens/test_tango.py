@@ -15,8 +15,7 @@ from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.maps import MapsState
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.terminal.drawing import drawn
-from maplab_py.console.terminal.fitting import fitted
+from maplab_py.console.terminal.drawing import drawn, fitted
 from maplab_py.console.terminal.layout import Block, Pairs, Paragraph, Table
 from maplab_py.vimap.ids import to_hex
 from tests.console.screens.recording import Screen, screen_of

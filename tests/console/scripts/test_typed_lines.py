@@ -16,7 +16,7 @@ from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.paths import user_aliases
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.terminal import pager
+from maplab_py.console.terminal import output
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import FlagError
 from maplab_py.report import Message
@@ -211,17 +211,17 @@ def test_the_pager_gets_what_is_longer_than_the_screen(
         def flush(self) -> None:
             pass
 
-    assert not pager.page("x\n" * 1000)
+    assert not output.page("x\n" * 1000)
     monkeypatch.setattr("sys.stdin", Screen())
     monkeypatch.setattr("sys.stdout", Screen())
     monkeypatch.setenv("MAPLAB_PAGER", f"cat > {tmp_path}/paged")
-    assert not pager.page("x\n" * 3)
-    assert pager.page("x\n" * 1000)
+    assert not output.page("x\n" * 3)
+    assert output.page("x\n" * 1000)
     assert (tmp_path / "paged").read_text() == "x\n" * 1000
     monkeypatch.setenv("MAPLAB_PAGER", "cat")
-    assert not pager.page("x\n" * 1000)
+    assert not output.page("x\n" * 1000)
     monkeypatch.delenv("MAPLAB_PAGER")
-    assert pager.pager_command() in ("less -FRXK", "")
+    assert output.pager_command() in ("less -FRXK", "")
 
 
 def test_a_report_goes_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

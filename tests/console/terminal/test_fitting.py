@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from maplab_py.console.terminal.cells import format_column
-from maplab_py.console.terminal.drawing import drawn
-from maplab_py.console.terminal.fitting import GAP, fitted
-from maplab_py.console.terminal.layout import Table
+from maplab_py.console.terminal.drawing import GAP, drawn, fitted
+from maplab_py.console.terminal.layout import Table, format_column
 
 WORDS = st.text("abcdefgh.0123456789", min_size=1, max_size=12)
 TEXTS = st.lists(WORDS, min_size=0, max_size=4).map(" ".join)

@@ -9,7 +9,7 @@ from io import TextIOWrapper
 
 import pytest
 
-from maplab_py.console.terminal import pager
+from maplab_py.console.terminal import output
 from tests.support.waiting import wait_until
 
 
@@ -26,9 +26,9 @@ def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 @pytest.mark.parametrize("keys", [b"x", b"map_stats\r"])
 def test_typed_keys_are_seen_and_left_to_be_read(keyboard: int, keys: bytes) -> None:
-    assert not pager.keys_are_waiting()
+    assert not output.keys_are_waiting()
     os.write(keyboard, keys)
-    assert wait_until(pager.keys_are_waiting)
+    assert wait_until(output.keys_are_waiting)
     if keys.endswith(b"\r"):
         assert sys.stdin.readline() == "map_stats\n"
     else:
@@ -39,4 +39,4 @@ def test_typed_keys_are_seen_and_left_to_be_read(keyboard: int, keys: bytes) -> 
 def test_nothing_waits_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     with open(os.devnull) as null:
         monkeypatch.setattr(sys, "stdin", null)
-        assert not pager.keys_are_waiting()
+        assert not output.keys_are_waiting()

@@ -23,7 +23,7 @@ from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex

@@ -13,21 +13,21 @@ _CHECKS = ("tests/algorithms/self_calibration/test_checks.py",)
 SELF_CALIBRATION = (
     Fault(
         "covariance_follows_the_residuals_down",
-        "maplab_py/algorithms/self_calibration/uncertainty/segment_test.py",
+        "maplab_py/algorithms/self_calibration/pruning.py",
         "max(fit, 1.0)",
         "fit",
         _SINGLE,
     ),
     Fault(
         "covariance_ignores_the_residuals",
-        "maplab_py/algorithms/self_calibration/uncertainty/segment_test.py",
+        "maplab_py/algorithms/self_calibration/pruning.py",
         "uncertainty.covariance(formal_scale=max(fit, 1.0))",
         "uncertainty.covariance()",
         _SINGLE,
     ),
     Fault(
         "variance_not_shrunk_by_the_prior",
-        "maplab_py/algorithms/self_calibration/uncertainty/segment_test.py",
+        "maplab_py/algorithms/self_calibration/pruning.py",
         "root = np.sqrt(1.0 - eigen.prior_share[determined])",
         "root = np.ones(int(determined.sum()))",
         _SINGLE,

@@ -8,7 +8,7 @@ import re
 import cv2
 import numpy as np
 
-from maplab_py.viewer.display.strip_chart import image_tag, plot_paths, strip_chart, value_text
+from maplab_py.viewer.display.playback_control import image_tag, plot_paths, strip_chart, value_text
 from maplab_py.viewer.signals import Signal
 
 ALL = np.arange(50)

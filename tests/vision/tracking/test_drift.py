@@ -9,9 +9,8 @@ import pytest
 from maplab_py.array_types import F64, U8
 from maplab_py.geometry import se3
 from maplab_py.vision.features.detection import GridDetector, refined
-from maplab_py.vision.tracking.drift import align, patches
 from maplab_py.vision.tracking.options import TrackingOptions
-from maplab_py.vision.tracking.tracker import FrameTracker
+from maplab_py.vision.tracking.tracker import FrameTracker, align, patches
 from tests.vision.features.test_detection import mosaic
 from tests.vision.tracking.rendered import mono, pixels_at, points_at, pose, turn
 

@@ -9,7 +9,7 @@ import pytest
 
 from maplab_py.array_types import F64, Mask
 from maplab_py.geometry import so3
-from maplab_py.vision.tracking.two_point import two_point_motion
+from maplab_py.vision.tracking.motion import two_point_motion
 from maplab_py.vision.tracking.two_point_kernels import TwoPointLimits
 
 LIMITS = TwoPointLimits(

@@ -11,6 +11,7 @@ from maplab_py.algorithms.dense.distance.options import DistanceOptions
 from maplab_py.algorithms.dense.distance.triangle_tree import TriangleTree
 from maplab_py.algorithms.dense.fusion.block_kernels import BLOCK_SIDE
 from maplab_py.algorithms.dense.fusion.grid import TsdfGrid
+from maplab_py.algorithms.dense.grid_container import GridContent, GridFormat, encode_arrays
 from maplab_py.array_types import F32, F64, I32, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.memory import require_memory
@@ -171,3 +172,32 @@ def _rows_in(blocks: I32, wanted: I32 | I64) -> I64:
     )
     place = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
     return np.where(keys[place] == queries, place, -1)
+
+
+_FORMAT = GridFormat("esdf 1", "distance field", "create_esdf_from_depth_resource")
+
+
+def encode_field(field: DistanceField) -> bytes:
+    """Return the content of the file; equal fields give equal bytes."""
+    header = {
+        "voxel_size_m": field.voxel_size_m,
+        "max_distance_m": field.max_distance_m,
+        "blocks": len(field.coordinates),
+    }
+    return encode_arrays(_FORMAT, header, (field.coordinates, field.distance_m))
+
+
+def decode_field(data: bytes, source: str) -> DistanceField:
+    """Read the content of a file.
+
+    Raises:
+        MapError: It is no such file, or damaged; names the source.
+    """
+    content = GridContent(_FORMAT, data, source)
+    blocks = content.count("blocks")
+    return DistanceField(
+        float(content.value("voxel_size_m")),
+        float(content.value("max_distance_m")),
+        content.array("<i4", (blocks, 3)),
+        content.array("<f4", (blocks, *(BLOCK_SIDE,) * 3)),
+    )

@@ -7,8 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.dense.distance.field import DistanceField, distance_field
-from maplab_py.algorithms.dense.distance.field_file import decode_field, encode_field
+from maplab_py.algorithms.dense.distance.field import (
+    DistanceField,
+    decode_field,
+    distance_field,
+    encode_field,
+)
 from maplab_py.algorithms.dense.distance.options import DistanceOptions
 from maplab_py.algorithms.dense.fusion.depth_inputs import (
     depth_type,

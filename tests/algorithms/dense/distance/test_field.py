@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from maplab_py.algorithms.dense.distance.field import DistanceField, distance_field, voxel_centres
-from maplab_py.algorithms.dense.distance.field_file import decode_field, encode_field
+from maplab_py.algorithms.dense.distance.field import (
+    DistanceField,
+    decode_field,
+    distance_field,
+    encode_field,
+    voxel_centres,
+)
 from maplab_py.algorithms.dense.distance.options import DistanceOptions
 from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
 from maplab_py.algorithms.dense.pinhole import Pinhole

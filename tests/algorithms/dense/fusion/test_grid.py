@@ -8,13 +8,13 @@ import numba
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.dense.fusion.grid import GridSettings, Mesh, TsdfGrid
-from maplab_py.algorithms.dense.fusion.grid_file import (
+from maplab_py.algorithms.dense.fusion.fusion import (
     FusedDepth,
     StoredGrid,
     decode_grid,
     encode_grid,
 )
+from maplab_py.algorithms.dense.fusion.grid import GridSettings, Mesh, TsdfGrid
 from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.array_types import F32, F64
 from maplab_py.errors import MapError

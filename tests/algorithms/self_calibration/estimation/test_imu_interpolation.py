@@ -16,7 +16,7 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.simulation.scenario import MotionOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.true_map import true_map
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import ragged_rows
 from tests.algorithms.self_calibration.scenes import scene_map

@@ -13,10 +13,10 @@ import pytest
 
 from maplab_py.algorithms.self_calibration import pruning
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.pruning import SegmentTest
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.file import load_database, save_database
 from maplab_py.algorithms.self_calibration.segments.selection import collect
-from maplab_py.algorithms.self_calibration.uncertainty.segment_test import SegmentTest
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT
 from maplab_py.sensors import CameraRig, Distortion, SensorSet

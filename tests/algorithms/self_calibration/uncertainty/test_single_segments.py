@@ -13,12 +13,12 @@ from scipy.stats import chi2, kstest
 from maplab_py.algorithms.self_calibration import pruning
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameter, Parameters
 from maplab_py.algorithms.self_calibration.estimation.partitions import bias_gaps, runs_of
-from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
-from maplab_py.algorithms.self_calibration.segments.selection import collect, evaluate
-from maplab_py.algorithms.self_calibration.uncertainty.segment_test import (
+from maplab_py.algorithms.self_calibration.pruning import (
     SegmentTest,
     squared_distance,
 )
+from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
+from maplab_py.algorithms.self_calibration.segments.selection import collect, evaluate
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Imu
