@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from maplab_py.vision.descriptors import differences, pack_words
-from maplab_py.vision.hamming_index import HammingIndex
 from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.index_engines import INDEX_ENGINES, make_index
+from maplab_py.vision.index_engines import INDEX_ENGINES, HammingIndex, make_index
 from maplab_py.vision.multi_index import InvertedMultiIndex
 from tests.vision.synthetic import descriptor_set, tracks
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from maplab_py.algorithms.self_calibration.segments.selection import Evaluation
 from maplab_py.array_types import F64, I64
-from maplab_py.research.data_sets import OPTIONS
+from studies.data_sets import OPTIONS
 
 Loss = Callable[[F64], float]
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.array_types import F64
 from maplab_py.output_files import write_text
-from maplab_py.research.data_sets import Row, lines_of
-from maplab_py.research.results import THESIS, Results, kind_of, overall, relative_rms
-from maplab_py.research.results_picture import picture
+from studies.data_sets import Row, lines_of
 
 FEW_SETS = 3
 """With fewer data sets there is no standard deviation over them."""
@@ -20,7 +19,7 @@ _CLAIMS = {"8: random": "0.23-0.55", "8: least informative": "worse"}
 
 _INTRODUCTION = """# Self-calibration: results
 
-Made by `python -m maplab_py.research`: simulated sessions of one device with an unknown calibration,
+Made by `python -m studies`: simulated sessions of one device with an unknown calibration,
 starting from the nominal one. The numbers of the thesis (Schneider 2019) are of recordings with a real
 tablet, without ground truth; here the errors are against ground truth.
 
@@ -306,10 +305,122 @@ def _predicted(rows: list[Row]) -> list[str]:
             "segments|sets|deviations (thesis = 1)|over random|accelerometer scale",
             cells,
         ),
-        "Medians, from the Jacobians at the true states (`python -m maplab_py.research predict`);",
+        "Medians, from the Jacobians at the true states (`python -m studies predict`);",
         "nothing is estimated. *Together*: selected one after the other for the least trace (in units of",
         "the thesis' or of a segment's usual deviations), determinant, or variance of the",
         "accelerometer's scale of their joint covariance. Gravity turns by "
         f"{tilt_deg:.0f} degrees (rms) in the IMU frame.",
         "",
     ]
+
+
+_WIDTH, _ROW_PX, _LEFT, _RIGHT = 720.0, 30.0, 210.0, 20.0
+
+
+def picture(results: Results) -> str:
+    """Return an SVG: the error of every data set by method, on a logarithmic scale."""
+    values = {
+        method: np.array([overall(row) for row in rows.values()])
+        for method, rows in results.by_method.items()
+    }
+    every = np.log10(np.concatenate(list(values.values())))
+    low, high = float(np.floor(every.min())), float(np.ceil(every.max()))
+    height = 40.0 + _ROW_PX * len(values) + 30.0
+
+    def x_of(value: float) -> float:
+        share = (float(np.log10(value)) - low) / max(high - low, 1.0)
+        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
+
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {height:g}" '
+        'font-family="sans-serif" font-size="13">',
+        f'<rect width="{_WIDTH:g}" height="{height:g}" fill="#ffffff"/>',
+        f'<text x="{_WIDTH / 2:g}" y="20" text-anchor="middle">Error of the calibration, by data set '
+        "(1 = deviations of the thesis, table 6.1)</text>",
+    ]
+    for decade in range(int(low), int(high) + 1):
+        x = x_of(10.0**decade)
+        lines += [
+            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="32" y2="{height - 26:g}" stroke="#cccccc"/>',
+            f'<text x="{x:.1f}" y="{height - 8:g}" text-anchor="middle">{10.0**decade:g}</text>',
+        ]
+    for number, (method, errors) in enumerate(values.items()):
+        y = 50.0 + _ROW_PX * number
+        lines.append(f'<text x="10" y="{y + 4:g}">{method}</text>')
+        lines += [
+            f'<circle cx="{x_of(error):.1f}" cy="{y:g}" r="4" fill="#2060a0" fill-opacity="0.5"/>'
+            for error in errors.tolist()
+        ]
+        x = x_of(float(np.median(errors)))
+        lines.append(
+            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{y - 10:g}" y2="{y + 10:g}" stroke="#c02020" '
+            'stroke-width="3"/>'
+        )
+    return "\n".join([*lines, "</svg>"]) + "\n"
+
+
+THESIS = {
+    "focal length": (0.35, 1.0, "px"),
+    "centre": (0.7, 1.0, "px"),
+    "distortion": (5e-4, 1.0, ""),
+    "gyroscope scale": (1e-3, 1.0, ""),
+    "accelerometer scale": (2.5e-3, 1.0, ""),
+    "gyroscope misalignment": (1e-3, 1.0, ""),
+    "accelerometer misalignment": (5e-3, 1.0, ""),
+    "accelerometer rotation": (0.15, float(np.rad2deg(1.0)), "deg"),
+    "camera position": (3.0, 1e3, "mm"),
+    "camera rotation": (0.07, float(np.rad2deg(1.0)), "deg"),
+}
+"""Deviation of table 6.1, factor to its unit, unit."""
+
+
+def kind_of(name: str) -> str:
+    """Return the row of the table that a parameter belongs to."""
+    words = name.split()
+    if words[0] == "camera" and words[1] in ("position", "rotation"):
+        return " ".join(words[:2])
+    if words[0] == "camera":
+        return "focal length" if words[1] == "focal" else words[1]
+    return f"{words[0]} {words[1] if words[1] == 'rotation' else words[2]}"
+
+
+def levels(names: Sequence[str]) -> F64:
+    """Return the deviation (k,) of every parameter in table 6.1, in the parameters' units."""
+    return np.array([THESIS[kind_of(name)][0] / THESIS[kind_of(name)][1] for name in names])
+
+
+def relative_rms(values: Sequence[float], names: Sequence[str]) -> float:
+    """Return the root mean square of errors or deviations (k,) relative to table 6.1."""
+    return float(np.sqrt(np.mean((np.array(values) / levels(names)) ** 2)))
+
+
+def overall(row: Row) -> float:
+    """Return the error of a calibration in units of the deviations of table 6.1."""
+    return relative_rms(row["error"], row["names"])
+
+
+class Results:
+    """Results of one scenario, by method and data set."""
+
+    def __init__(self, rows: list[Row], odometry: list[Row]) -> None:
+        """Sort rows of `accuracy.measure` and of `odometry.measure_odometry`."""
+        self.odometry_m = {(row["set"], row["method"]): row["vio_m"] for row in odometry}
+        self.map_m = {row["method"]: row["map_m"] for row in rows if row["set"] < 0}
+        self.by_method: dict[str, dict[int, Row]] = {}
+        for row in rows:
+            if row["set"] >= 0:
+                self.by_method.setdefault(row["method"], {})[row["set"]] = row
+
+    def pairs(self, method: str, other: str) -> tuple[list[Row], list[Row]]:
+        """Return the rows of two methods for the data sets that both have."""
+        first, second = self.by_method.get(method, {}), self.by_method.get(other, {})
+        common = sorted(first.keys() & second.keys())
+        return [first[k] for k in common], [second[k] for k in common]
+
+    def spread_ratio(self, method: str, other: str) -> F64:
+        """Return the ratio (k,) of the standard deviations of errors over the common data sets."""
+        a, b = (
+            np.std([row["error"] for row in rows], axis=0, ddof=1)
+            for rows in self.pairs(method, other)
+        )
+        return np.asarray(a / b)

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.self_calibration.segments.selection import Evaluation, evaluate
-from maplab_py.research import accuracy, odometry, predicted_deviations
-from maplab_py.research.__main__ import main
-from maplab_py.research.data_sets import lines_of
-from maplab_py.research.selections import METHODS, chosen_segments, joint_designs, rankings
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
+from studies import accuracy, odometry, predicted_deviations
+from studies.__main__ import main
+from studies.data_sets import lines_of
+from studies.selections import METHODS, chosen_segments, joint_designs, rankings
 from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map
 
 NAMES = ["gyroscope x scale", "accelerometer z scale", "camera centre u", "camera position x"]

@@ -18,7 +18,12 @@ from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
-from maplab_py.research.data_sets import (
+from maplab_py.research.joint_ekf import filter_jointly
+from maplab_py.sensors import SensorSet
+from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.simulate import SimulatedData
+from maplab_py.vimap.ids import IdIndex
+from studies.data_sets import (
     OPTIONS,
     append_line,
     evaluation_session,
@@ -26,11 +31,6 @@ from maplab_py.research.data_sets import (
     problem_of,
     true_problem,
 )
-from maplab_py.research.joint_ekf import filter_jointly
-from maplab_py.sensors import SensorSet
-from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.simulate import SimulatedData
-from maplab_py.vimap.ids import IdIndex
 
 _FIXED = dataclasses.replace(OPTIONS, states="extrinsics_rotation", prior_rotation_deg=1e-6)
 """Prior of the rotation that the filter estimates: a millionth of a degree, effectively fixed."""

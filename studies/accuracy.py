@@ -24,7 +24,13 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
-from maplab_py.research.data_sets import (
+from maplab_py.research.information_gain import select_by_gain
+from maplab_py.sensors import SensorSet
+from maplab_py.simulation.evaluation import evaluate_map
+from maplab_py.simulation.scenario import Scenario
+from maplab_py.simulation.simulate import SimulatedData
+from maplab_py.vimap import VIMap
+from studies.data_sets import (
     OPTIONS,
     SHORT,
     Row,
@@ -35,13 +41,7 @@ from maplab_py.research.data_sets import (
     problem_of,
     true_problem,
 )
-from maplab_py.research.information_gain import select_by_gain
-from maplab_py.research.selections import FEW, chosen_segments
-from maplab_py.sensors import SensorSet
-from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.simulate import SimulatedData
-from maplab_py.vimap import VIMap
+from studies.selections import FEW, chosen_segments
 
 
 def map_error_m(data: SimulatedData, sensors: SensorSet) -> float:

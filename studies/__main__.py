@@ -1,11 +1,11 @@
 """Studies of the self-calibration on simulated sessions of one device.
 
-python -m maplab_py.research measure --scenario=ar_room --sets=15 --out=ar_room.jsonl
-python -m maplab_py.research odometry --results=ar_room.jsonl --out=ar_room_vio.jsonl
-python -m maplab_py.research predict --scenario=ar_room --sets=3 --out=ar_room_predicted.jsonl
-python -m maplab_py.research consistency --sets=50 --swaps=0.03 --out=swaps.jsonl
-python -m maplab_py.research page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=docs
-python -m maplab_py.research picture --out=docs/images/segment_information.svg
+python -m studies measure --scenario=ar_room --sets=15 --out=ar_room.jsonl
+python -m studies odometry --results=ar_room.jsonl --out=ar_room_vio.jsonl
+python -m studies predict --scenario=ar_room --sets=3 --out=ar_room_predicted.jsonl
+python -m studies consistency --sets=50 --swaps=0.03 --out=swaps.jsonl
+python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=docs
+python -m studies picture --out=docs/images/segment_information.svg
 
 The first four studies append one line per data set and method to a file; a study that was interrupted
 continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
@@ -24,12 +24,12 @@ from maplab_py.algorithms.self_calibration.drawing import draw
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.segments.selection import segment_information
 from maplab_py.output_files import write_text
-from maplab_py.research import accuracy, odometry, predicted_deviations, results_page
-from maplab_py.research.data_sets import OPTIONS, with_noise
-from maplab_py.research.selections import JUDGED, METHODS
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
+from studies import accuracy, odometry, predicted_deviations, results_page
+from studies.data_sets import OPTIONS, with_noise
+from studies.selections import JUDGED, METHODS
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -78,7 +78,7 @@ def _picture(scenario: Scenario) -> str:
 def _parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        prog="python -m maplab_py.research", description=__doc__, formatter_class=formatter
+        prog="python -m studies", description=__doc__, formatter_class=formatter
     )
     studies = parser.add_subparsers(dest="study", required=True)
     for name, sets in (

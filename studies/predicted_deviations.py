@@ -16,12 +16,12 @@ from maplab_py.algorithms.self_calibration.segments.splitting import extract_sub
 from maplab_py.algorithms.self_calibration.uncertainty.information import posterior_covariance
 from maplab_py.array_types import F64
 from maplab_py.geometry import so3
-from maplab_py.research.data_sets import OPTIONS, append_line, data_set, lines_of, problem_of
-from maplab_py.research.results import levels
-from maplab_py.research.selections import FEW, WHOLE, joint_designs, random_choice, rankings
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
+from studies.data_sets import OPTIONS, append_line, data_set, lines_of, problem_of
+from studies.results_page import levels
+from studies.selections import FEW, WHOLE, joint_designs, random_choice, rankings
 
 
 def predict(scenario: Scenario, sets: range, out: Path) -> None:

@@ -1,0 +1,1 @@
+"""Studies of the self-calibration on simulated sessions: `python -m studies --help`."""
