@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from maplab_py.cancellation import ending_early
+from maplab_py.interop.live.bag_recording import RecordingOptions
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
+from maplab_py.interop.live.playing import PlayingOptions
+from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.plugin import CommandContext, command
 
 if TYPE_CHECKING:
     from maplab_py.frontend.mapping import Mapping
     from maplab_py.frontend.odometry_update import OdometryUpdate
+    from maplab_py.interop.live.bag_recording import RecordedBag
     from maplab_py.interop.live.listing import LiveTopics
+    from maplab_py.interop.live.playing import PlayedRecording
     from maplab_py.interop.live.publishing import PosePublisher
     from maplab_py.interop.live.source import LiveRecording
-    from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+    from maplab_py.interop.recordings.options import StreamOptions
 
 _NETWORK = NetworkOptions()
 _LIVE = LiveOptions()
+_SOURCE = SourceOptions()
+_PLAYING = PlayingOptions()
+_RECORDING = RecordingOptions()
 
 
 @command(
@@ -43,6 +53,84 @@ def live_topics(
     from maplab_py.interop.live.listing import list_topics
 
     return list_topics(transport, network, listen_s, progress=context.progress)
+
+
+@command(
+    "play_recording",
+    example="play_recording walk ros2 --play_rate=0.5",
+    needs_map=False,
+    acts_outside=True,
+    see_also=("live_topics", "record_bag", "rovioli"),
+)
+def play_recording(
+    context: CommandContext,
+    recording: Path,
+    transport: str = "ros2",
+    *,
+    source: SourceOptions = _SOURCE,
+    network: NetworkOptions = _NETWORK,
+    options: PlayingOptions = _PLAYING,
+) -> PlayedRecording:
+    """Publish images and IMU samples of a recording as topics of ROS 2, ROS 1 or Foxglove.
+
+    Topics are those of the calibration, else /imu0, /cam0/image_raw, /cam1/image_raw, ...; stamps are those
+    of the recording. Ctrl-C ends it.
+
+    Args:
+        recording: EuRoC or TUM-VI folder, or ROS bag.
+        transport: ros2, ros1 or foxglove (then this command is the server, at --foxglove_url).
+    """
+    from maplab_py.interop.live.playing import play_recording as play
+    from maplab_py.interop.recordings.opening import open_recording
+
+    opened = open_recording(recording, source)
+    with ending_early() as is_to_end:
+        return play(
+            opened, transport, network, options, progress=context.progress, is_to_end=is_to_end
+        )
+
+
+@command(
+    "record_bag",
+    example="record_bag ros2 walk_bag --record_topics=/imu0,/cam0/image_raw",
+    needs_map=False,
+    writes_files=True,
+    see_also=("live_topics", "play_recording", "bag_info", "rovioli"),
+)
+def record_bag(
+    context: CommandContext,
+    transport: str,
+    bag: Path,
+    *,
+    network: NetworkOptions = _NETWORK,
+    options: RecordingOptions = _RECORDING,
+    live_silence_s: float = _LIVE.silence_s,
+    overwrite: bool = False,
+) -> RecordedBag:
+    """Write the topics of a robot to a bag while they arrive, byte by byte.
+
+    Messages of ROS 2 go to a folder (mcap), those of ROS 1 to a file .bag. Ctrl-C ends the recording, and
+    the bag is complete.
+
+    Args:
+        transport: ros2, ros1 or foxglove.
+        bag: File .bag of ROS 1, or folder of a ROS 2 bag.
+        live_silence_s: End when nothing has arrived for so long [s]; 0 = only Ctrl-C ends.
+        overwrite: Replace a bag that exists.
+    """
+    from maplab_py.interop.live.bag_recording import record_bag as record
+
+    with ending_early() as is_to_end:
+        return record(
+            transport,
+            bag,
+            network,
+            options,
+            silence_s=live_silence_s,
+            overwrite=overwrite,
+            progress=context.progress,
+            is_to_end=is_to_end,
+        )
 
 
 class LiveRun:

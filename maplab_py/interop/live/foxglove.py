@@ -112,10 +112,7 @@ class FoxgloveClient:
             from websockets.exceptions import InvalidHandshake, InvalidURI
             from websockets.sync.client import connect
         except ImportError as error:
-            raise UserError(
-                "topics of Foxglove are read with the library websockets: install it with "
-                "`pip install 'maplab-py[foxglove]'`"
-            ) from error
+            raise library_missing() from error
         try:
             return connect(
                 self._url,
@@ -245,3 +242,11 @@ def _channel(entry: dict[str, Any]) -> _Channel:
     if "/" in kind and kind.count("/") == 1:
         kind = f"{package}/msg/{name}"
     return _Channel(int(entry["id"]), str(entry["topic"]), str(entry["encoding"]), kind)
+
+
+def library_missing() -> UserError:
+    """Return the error that says what to install."""
+    return UserError(
+        "topics of Foxglove are read with the library websockets: install it with "
+        "`pip install 'maplab-py[foxglove]'`"
+    )

@@ -11,8 +11,15 @@ from maplab_py.interop.live.transport import Transport
 
 
 @contextlib.contextmanager
-def open_transport(kind: str, network: NetworkOptions) -> Iterator[Transport]:
+def open_transport(
+    kind: str, network: NetworkOptions, *, is_server: bool = False
+) -> Iterator[Transport]:
     """Connect to ROS 2, ROS 1 or Foxglove, as one of `TRANSPORTS` says.
+
+    Args:
+        kind: One of `TRANSPORTS`.
+        network: Where.
+        is_server: Be the server of Foxglove, in place of its client.
 
     Raises:
         UserError: The transport is unknown, a library is missing, or nobody answers.
@@ -29,6 +36,10 @@ def open_transport(kind: str, network: NetworkOptions) -> Iterator[Transport]:
         from maplab_py.interop.live.ros1 import Ros1
 
         transport = Ros1(network)
+    elif is_server:
+        from maplab_py.interop.live.foxglove_server import FoxgloveServer
+
+        transport = FoxgloveServer(network)
     else:
         from maplab_py.interop.live.foxglove import FoxgloveClient
 
