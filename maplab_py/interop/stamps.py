@@ -261,18 +261,18 @@ class _Numbers:
     def open_unit(self, kind: StampKind, named: str, fitting: list[str]) -> str:
         """Return the message that the unit remains open."""
         if len(self._tokens) == 1 or not self._step:
-            found = f"of one time ('{self._tokens[0]}') the unit cannot be told"
+            reason = f"of one time ('{self._tokens[0]}') the unit cannot be told"
         else:
             steps = ", ".join(f"{self.step_text(name)} in {name}" for name in fitting)
-            found = f"the unit of the time stamps is open: rows are {steps} apart"
+            reason = f"the unit of the time stamps is open: rows are {steps} apart"
             if named:
-                found = (
+                reason = (
                     f"in {named}, as the header says, rows are {self.step_text(named)} apart, as no "
                     f"{kind.name} delivers them ({steps})"
                 )
         return (
-            f"{self._place(0)}: {found}: give --time_unit=s|ms|us|ns, or write the unit into a header, as in "
-            "`# timestamp [ns]`"
+            f"{self._place(0)}: {reason}: give --time_unit=s|ms|us|ns, or write the unit into a header, as "
+            "in `# timestamp [ns]`"
         )
 
     def _place(self, row: int) -> str:
@@ -296,7 +296,7 @@ def _concluded(
     custom = "s" if numbers.has_fractions else custom
     fitting = [name for name in UNITS if numbers.fits(name)]
     if len(fitting) == 1 or not numbers.step_s("s"):
-        return _of_one_time(numbers, fitting, custom, span_ns)
+        return _single_unit(numbers, fitting, custom, span_ns)
     typical = [name for name in possible if _is_within(numbers.step_s(name), kind.typical_s)]
     dated = [name for name in possible if numbers.is_calendar_time(name)]
     if span_ns is not None:
@@ -313,7 +313,7 @@ def _concluded(
     return typical[0] if len(typical) == 1 and custom not in possible else ""
 
 
-def _of_one_time(
+def _single_unit(
     numbers: _Numbers, fitting: list[str], custom: str, span_ns: tuple[int, int] | None
 ) -> str:
     """Return the unit of a single time: the format's, unless the date would be another."""

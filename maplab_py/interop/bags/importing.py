@@ -27,8 +27,8 @@ from maplab_py.interop.recordings.bag_files import (
 )
 from maplab_py.interop.recordings.images import (
     EncodedImage,
+    camera_bits,
     check_size,
-    found_bits,
     image_of_message,
 )
 from maplab_py.interop.recordings.protocol import CameraImage
@@ -263,7 +263,7 @@ def _bits(topic: _Topic, camera: Camera, numbers: I64) -> int:
         images.append(CameraImage(0, 0, 0, data))
         if data.bits:
             break
-    return found_bits(images)
+    return camera_bits(images)
 
 
 def _depth_m(message: Any, name: str, camera: Camera) -> F32:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from maplab_py.interop.bags.sensor_messages import COMPRESSED, IMAGE
 from maplab_py.interop.recordings.bag_files import all_messages, check_bag, opened_bag
 from maplab_py.interop.recordings.bag_writing import format_of_bag
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
 _PROGRESS_EVERY = 1000
+_IMAGES = (IMAGE, COMPRESSED)
 _NS_TO_S = 1e-9
 
 
@@ -24,6 +26,7 @@ class BagTopic:
     start_s: float | None  # after the bag's first message
     duration_s: float
     rate_hz: float
+    encoding: str = ""  # of the first image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +47,7 @@ class _Times:
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
+    encoding: str = ""
 
     def add(self, time_ns: int) -> None:
         """Count a message."""
@@ -66,10 +70,14 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
             topics[connection.topic, connection.msgtype] = _Times(connection.msgtype)
         total = reader.message_count
         messages = all_messages(path, reader, list(reader.connections))
-        for done, (connection, time_ns, _) in enumerate(messages):
+        for done, (connection, time_ns, data) in enumerate(messages):
             if done % _PROGRESS_EVERY == 0:
                 progress.step(done, total, "messages")
-            topics[connection.topic, connection.msgtype].add(time_ns)
+            times = topics[connection.topic, connection.msgtype]
+            if not times.count and times.type in _IMAGES:
+                image = reader.deserialize(data, times.type)
+                times.encoding = image.encoding if times.type == IMAGE else image.format
+            times.add(time_ns)
     heard = [times for times in topics.values() if times.count]
     start_ns = min((times.first_ns for times in heard), default=None)
     end_ns = max((times.last_ns for times in heard), default=0)
@@ -93,5 +101,6 @@ def _topic(topic: str, times: _Times, start_ns: int) -> BagTopic:
         messages=times.count,
         start_s=(times.first_ns - start_ns) * _NS_TO_S if times.count else None,
         duration_s=duration_s,
+        encoding=times.encoding,
         rate_hz=(times.count - 1) / duration_s if duration_s > 0.0 else 0.0,
     )

@@ -71,7 +71,7 @@ def read_times(file: Path, time_unit: str = "") -> dict[str, int]:
         raise MapError(f"{file}: is not text: name a file of image names and time stamps") from None
     except OSError as error:
         raise MapError(f"cannot read {file}: {error.strerror}") from error
-    found: dict[str, tuple[int, str]] = {}
+    stamps: dict[str, tuple[int, str]] = {}
     header = ""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.strip()
@@ -81,14 +81,14 @@ def read_times(file: Path, time_unit: str = "") -> dict[str, int]:
         match = re.fullmatch(r"(.+?)[\s,]+([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)", content)
         if match is None:
             raise MapError(f"{file}:{number}: wants an image name and a time stamp")
-        if match[1] in found:
+        if match[1] in stamps:
             raise MapError(f"{file}:{number}: image {match[1]} is there twice")
-        found[match[1]] = (number, match[2])
-    if not found:
+        stamps[match[1]] = (number, match[2])
+    if not stamps:
         raise MapError(f"{file}: there are no rows in the file: write or copy it again")
-    lines, tokens = zip(*found.values(), strict=True)
-    times_ns = _times_ns(tuple(found), tokens, str(file), lines, time_unit, header)
-    return dict(zip(found, times_ns.tolist(), strict=True))
+    lines, tokens = zip(*stamps.values(), strict=True)
+    times_ns = _times_ns(tuple(stamps), tokens, str(file), lines, time_unit, header)
+    return dict(zip(stamps, times_ns.tolist(), strict=True))
 
 
 def _times_ns(

@@ -1,33 +1,51 @@
-"""Bags as files: opening them with the library rosbags (the extra `bags`), and their topics."""
+"""Bags as files: which they are, opening them, and what to do about damaged ones."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.input_files import read_text
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
-    BagReader = AnyReader
+    from maplab_py.interop.recordings.bag_reader import BagReader as BagReader
 
 _REMEDY = "copy the bag again, or repair it with `rosbag reindex` or `ros2 bag reindex`"
+_REMEDIES = (
+    (r"not indexed|index looks damaged", "it was not closed: run `rosbag reindex {file}`"),
+    (
+        r"end magic|Truncated record|MCAP footer|MCAP summary|Unexpected record|Chunk ",
+        "it is cut or was not closed: run `mcap recover {file} -o whole.mcap` and read whole.mcap",
+    ),
+    (
+        r"malformed|not a database|disk I/O|has [\d,]+ of|no tables",
+        "it is cut or was not closed: run `sqlite3 {file} .recover | sqlite3 whole.db3` and read whole.db3",
+    ),
+    (r"Profile is not", "convert it to an MCAP file of ROS 2, as with `rosbags-convert`"),
+    (r"zstd|[Cc]ompress|frame", "its compressed data are damaged: copy it again"),
+)
+"""Words of the libraries' errors, and what helps."""
 _S_TO_NS = 1_000_000_000
 _IMU_NUMBERS, _GYRO, _ACCEL = 37, slice(13, 16), slice(25, 28)
 """Numbers behind the header of sensor_msgs/Imu, and which of them are the measurements."""
 _SQLITE, _SQLITE_HEADER = b"SQLite format 3\x00", 100
+_METADATA = "metadata.yaml"
+_MAX_METADATA_BYTES = 50_000_000
+_STORAGE = re.compile(r"\.(db3|mcap)(\.zstd?)?")
 
 
 def is_bag(path: Path) -> bool:
     """Tell whether a path is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    return path.suffix in (".bag", ".db3", ".mcap")
+        return (path / _METADATA).is_file() or bool(_storages_in(path))
+    return path.suffix == ".bag" or _is_storage(path)
 
 
 def check_bag(path: Path, flag: str) -> None:
@@ -40,8 +58,8 @@ def check_bag(path: Path, flag: str) -> None:
         raise UserError(f"{flag}={path} does not exist: give a ROS 1 bag, or a ROS 2 bag")
     if not is_bag(path):
         raise UserError(
-            f"{flag}={path} is no bag: wants a ROS 1 bag (.bag) or a ROS 2 bag (folder with "
-            "metadata.yaml, .db3, .mcap)"
+            f"{flag}={path} is no bag: wants a ROS 1 bag (.bag) or a ROS 2 bag (a folder, or a file .db3 or "
+            ".mcap)"
         )
 
 
@@ -52,45 +70,121 @@ def message_types(*, is_ros_2: bool) -> Typestore:
         UserError: The library is missing.
     """
     try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from maplab_py.interop.recordings import bag_reader
     except ImportError as error:
         raise _library_missing("bags") from error
-    if is_ros_2:
-        return get_typestore(Stores.ROS2_HUMBLE)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    tf = "tf2_msgs/msg/TFMessage"  # the library's messages of ROS 1 lack it
-    if tf not in store.types:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
-    return store
+    return bag_reader.message_types(is_ros_2=is_ros_2)
 
 
 @contextlib.contextmanager
-def opened_bag(path: Path) -> Iterator[AnyReader]:
+def opened_bag(path: Path) -> Iterator[BagReader]:
     """Open a bag; whatever its parser says of damage becomes a MapError.
 
     Raises:
         UserError: The library is missing.
-        MapError: The bag is damaged, without index, or has messages of unknown types.
+        MapError: The bag is damaged, or without index.
     """
     try:
-        from rosbags.highlevel import AnyReader
+        from maplab_py.interop.recordings.bag_reader import BagReader
     except ImportError as error:
         raise _library_missing(str(path)) from error
     try:
-        # files of ROS 2 before Iron hold no definitions of their messages
         _check_databases(path)
-        with AnyReader([path], default_typestore=message_types(is_ros_2=True)) as reader:
+        with BagReader(path) as reader:
             yield reader
     except MaplabError:
         raise
-    except KeyError as error:
-        raise MapError(
-            f"{path}: the bag has messages of type {error} without their definition: record them "
-            "with ROS 2 Iron or later, or leave their topic out with `ros2 bag convert`"
-        ) from error
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise MapError(f"{path}: the bag cannot be read ({reason}): {_REMEDY}") from error
+        raise MapError(
+            f"{path}: the bag cannot be read ({reason}): {_remedy(path, reason)}"
+        ) from error
+
+
+def storage_files(path: Path) -> list[Path]:
+    """Return the files of a ROS 2 bag: those of its metadata.yaml, or all, where it has none.
+
+    Raises:
+        MapError: A file is missing.
+    """
+    if not path.is_dir():
+        return [path]
+    present = _storages_in(path)
+    listed = bag_metadata(path).get("relative_file_paths") or []
+    named = [Path(str(name)).name for name in listed]
+    if not named or not present:
+        if not present:
+            raise MapError(
+                f"{path}: the bag cannot be read (there is no file .db3 or .mcap): copy the folder again"
+            )
+        return present
+    files = []
+    for name in named:
+        stem = name.removesuffix(".zstd").removesuffix(".zst")
+        matches = [
+            file for file in present if file.name in (name, stem, f"{stem}.zstd", f"{stem}.zst")
+        ]
+        if not matches:
+            raise MapError(
+                f"{path}: the bag cannot be read ({name} of its {_METADATA} is missing): copy it there, or "
+                f"remove {_METADATA} to read the other files"
+            )
+        files.append(matches[0])
+    return files
+
+
+def bag_metadata(path: Path) -> dict[str, Any]:
+    """Return what the metadata.yaml of a folder says; nothing where there is none, or it is damaged."""
+    import yaml
+
+    try:
+        remedy = "it is no such file"
+        text = read_text(path / _METADATA, _MAX_METADATA_BYTES, remedy=remedy, error=MapError)
+        content = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return dict(content["rosbag2_bagfile_information"])
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _storages_in(folder: Path) -> list[Path]:
+    """Return the storage files of a folder; a plain file hides its compressed copy."""
+    files = {file.name: file for file in folder.iterdir() if _is_storage(file)}
+    kept = [
+        file for name, file in files.items() if not _is_packed(file) or Path(name).stem not in files
+    ]
+    return sorted(kept)
+
+
+def _is_storage(path: Path) -> bool:
+    return (
+        path.is_file()
+        and _STORAGE.search(path.name) is not None
+        and path.suffix
+        in (
+            ".db3",
+            ".mcap",
+            ".zstd",
+            ".zst",
+        )
+    )
+
+
+def _is_packed(path: Path) -> bool:
+    return path.suffix in (".zstd", ".zst")
+
+
+def _remedy(path: Path, reason: str) -> str:
+    """Return what the user can do about a bag that the library cannot read."""
+    file = path
+    if path.is_dir():
+        files = _storages_in(path)
+        file = next((part for part in files if part.name in reason or len(files) == 1), file)
+    if file.is_file() and not file.stat().st_size:
+        return "the file is empty: copy it again"
+    for words, remedy in _REMEDIES:
+        if re.search(words, reason):
+            return remedy.format(file=file)
+    return _REMEDY
 
 
 def all_messages(
@@ -138,7 +232,7 @@ def imu_sample(data: bytes, *, is_ros_2: bool) -> tuple[float, ...]:
     return numbers[_ACCEL] + numbers[_GYRO]
 
 
-def topic_types(reader: AnyReader) -> dict[str, str]:
+def topic_types(reader: BagReader) -> dict[str, str]:
     """Return the type of the messages of each topic."""
     return {connection.topic: connection.msgtype for connection in reader.connections}
 

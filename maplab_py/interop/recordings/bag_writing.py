@@ -90,8 +90,9 @@ def format_of_bag(path: Path) -> BagFormat:
     if path.is_dir():
         has_mcap = any(".mcap" in file.suffixes for file in path.iterdir())
         return BagFormat.MCAP if has_mcap else BagFormat.SQLITE3
-    suffixes = {".bag": BagFormat.ROS1, ".mcap": BagFormat.MCAP}
-    return suffixes.get(path.suffix, BagFormat.SQLITE3)
+    if path.suffix == ".bag":
+        return BagFormat.ROS1
+    return BagFormat.MCAP if ".mcap" in path.suffixes else BagFormat.SQLITE3
 
 
 def messages_of_topic(

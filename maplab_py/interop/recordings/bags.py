@@ -26,7 +26,7 @@ from maplab_py.interop.recordings.bag_files import (
     opened_bag,
     topic_types,
 )
-from maplab_py.interop.recordings.images import bits_note, found_bits, image_of_message
+from maplab_py.interop.recordings.images import bits_note, camera_bits, image_of_message
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
     ImuBatch,
@@ -35,7 +35,7 @@ from maplab_py.interop.recordings.protocol import (
 )
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from maplab_py.interop.recordings.bag_files import BagReader
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -154,7 +154,7 @@ class BagRecording:
                     with contextlib.suppress(MapError):
                         if images[0].data.bits:
                             break
-                bits = self._given_bits or found_bits(images)
+                bits = self._given_bits or camera_bits(images)
                 self._bits[stream.camera] = (
                     CONTAINER_BITS if bits == 8 or self._given_bits else bits
                 )
@@ -217,7 +217,7 @@ class BagRecording:
                 ):
                     yield time_ns, stream, message
 
-    def _examined(self, reader: AnyReader, stream: _Stream) -> _Stream:
+    def _examined(self, reader: BagReader, stream: _Stream) -> _Stream:
         """Return the stream with the bag's name of its topic and the times of its first message."""
         sensor = "IMU" if stream.camera == _IMU else f"camera {stream.camera}"
         flag = "--imu_topic" if stream.camera == _IMU else "--camera_topics"

@@ -18,7 +18,7 @@ from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import ImuRecording, read_imu_csv
-from maplab_py.interop.recordings.images import bits_note, found_bits, image_file
+from maplab_py.interop.recordings.images import bits_note, camera_bits, image_file
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Item, RecordedSensors
 from maplab_py.sensors import Camera
 
@@ -102,7 +102,7 @@ class FolderRecording:
         for row, camera in enumerate(self._cameras):
             first, end = _range(camera.times_ns, start_ns, end_ns)
             samples = [camera.image(row, first + k) for k in sampled(end - first)]
-            bits = self._given_bits or found_bits(samples)
+            bits = self._given_bits or camera_bits(samples)
             self._bits[row] = CONTAINER_BITS if bits == 8 or self._given_bits else bits
             streams.append(camera.images(row, range(first, end), bits))
         images = heapq.merge(*streams, key=lambda image: (image.time_ns, image.camera))

@@ -144,7 +144,7 @@ def image_of_message(message: Any, name: str, camera: Camera) -> EncodedImage | 
     )
 
 
-def found_bits(images: list[CameraImage]) -> int:
+def camera_bits(images: list[CameraImage]) -> int:
     """Return the bits of a camera, sought in those of its images that can be decoded."""
     decoded = []
     for image in images:

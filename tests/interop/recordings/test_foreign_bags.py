@@ -1,0 +1,187 @@
+"""Bags of other recorders: topics, spellings, metadata, compression; each failure with its remedy."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from maplab_py.errors import MapError
+from maplab_py.interop.bags.listing import bag_info
+from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.stream import EventStream
+from tests.interop.recordings.written import (
+    assert_content,
+    make_content,
+    write_bag,
+    write_calibration,
+    write_folder,
+)
+
+pytest.importorskip("rosbags")
+
+CONTENT = make_content(frames=4)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> SourceOptions:
+    folder = tmp_path_factory.mktemp("device")
+    device = open_recording(write_folder(make_content(frames=1), folder / "room")).device
+    return SourceOptions(sensor_calibration_file=write_calibration(device, folder / "sensors.yaml"))
+
+
+def bag(tmp_path: Path, storage: str = "sqlite3") -> Path:
+    return write_bag(CONTENT, tmp_path / "room", version=2, storage=storage)
+
+
+def assert_reads(path: Path, calibrated: SourceOptions) -> None:
+    assert_content(list(EventStream(open_recording(path, calibrated))), CONTENT)
+
+
+def database(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(path / "room.db3")
+
+
+@pytest.mark.parametrize(
+    ("kind", "encoding", "definition"),
+    [
+        ("odd_msgs/msg/Odd", "ros2msg", "no definition at all : {"),
+        ("odd_msgs/msg/Odd", "ros2msg", ""),
+        ("odd_msgs/msg/Odd", "unknown", "?"),
+        ("odd_msgs/msg/Odd", "ros2msg", "other_msgs/Missing part\n"),
+        ("sensor_msgs/msg/NavSatFix", "ros2msg", "uint8 version\nstring other\n"),
+        ("sensor_msgs/msg/Imu", "ros2msg", "float32 only\n"),
+        ("Odd", "jsonschema", "{}"),
+    ],
+)
+def test_topics_that_nobody_asked_for(
+    tmp_path: Path, calibrated: SourceOptions, kind: str, encoding: str, definition: str
+) -> None:
+    path = bag(tmp_path)
+    with database(path) as data:
+        data.execute("DELETE FROM message_definitions WHERE topic_type = ?", (kind,))
+        data.execute(
+            "INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, "
+            "type_description_hash) VALUES (?, ?, ?, 'x')",
+            (kind, encoding, definition),
+        )
+        data.execute("INSERT INTO topics VALUES (99, '/odd', ?, 'json', '{bad: [', 'y')", (kind,))
+        data.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (99, 5, 'text')")
+    assert_reads(path, calibrated)
+    assert "/odd" in [topic.topic for topic in bag_info(path).topics]
+
+
+def test_both_spellings_of_types(tmp_path: Path, calibrated: SourceOptions) -> None:
+    path = bag(tmp_path)
+    with database(path) as data:
+        data.execute("UPDATE topics SET type = replace(type, '/msg/', '/')")
+        data.execute("DELETE FROM message_definitions")
+    assert_reads(path, calibrated)
+    assert {t.type for t in bag_info(path).topics} == {
+        "sensor_msgs/msg/Imu",
+        "sensor_msgs/msg/Image",
+    }
+
+
+def test_an_old_schema(tmp_path: Path, calibrated: SourceOptions) -> None:
+    path = bag(tmp_path)
+    with database(path) as data:
+        data.execute("DROP TABLE schema")
+        data.execute("DROP TABLE message_definitions")
+        data.execute("ALTER TABLE topics DROP COLUMN offered_qos_profiles")
+        data.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
+    assert_reads(path / "room.db3", calibrated)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("", None),
+        ("storage_identifier: sqlite3", "storage_identifier: ''"),
+        ("storage_identifier: mcap", "storage_identifier:"),
+        ("version: 9", "version: 11"),
+        ("serialization_format: cdr", "serialization_format: odd"),
+        ("topics_with_message_count", "other"),
+    ],
+)
+def test_metadata_that_are_missing_or_odd(
+    tmp_path: Path, calibrated: SourceOptions, storage: str, old: str, new: str | None
+) -> None:
+    path = bag(tmp_path, storage)
+    metadata = path / "metadata.yaml"
+    if new is None:
+        metadata.unlink()
+    else:
+        metadata.write_text(metadata.read_text().replace(old, new))
+    assert_reads(path, calibrated)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("has_metadata", [True, False])
+def test_compressed_files(
+    tmp_path: Path, calibrated: SourceOptions, storage: str, has_metadata: bool
+) -> None:
+    zstd = pytest.importorskip("backports.zstd")
+    path = bag(tmp_path, storage)
+    file = path / f"room.{'db3' if storage == 'sqlite3' else 'mcap'}"
+    packed = file.with_name(f"{file.name}.zstd")
+    packed.write_bytes(zstd.compress(file.read_bytes()))
+    file.unlink()
+    if not has_metadata:
+        (path / "metadata.yaml").unlink()
+    assert_reads(path, calibrated)
+    assert_reads(packed, calibrated)
+    packed.write_bytes(packed.read_bytes()[:-50])
+    with pytest.raises(MapError, match="copy it again"):
+        open_recording(path, calibrated)
+
+
+@pytest.mark.parametrize("has_metadata", [True, False])
+def test_messages_that_are_compressed_one_by_one(
+    tmp_path: Path, calibrated: SourceOptions, has_metadata: bool
+) -> None:
+    zstd = pytest.importorskip("backports.zstd")
+    path = bag(tmp_path)
+    with database(path) as data:
+        for key, content in data.execute("SELECT id, data FROM messages").fetchall():
+            data.execute("UPDATE messages SET data = ? WHERE id = ?", (zstd.compress(content), key))
+    if not has_metadata:
+        (path / "metadata.yaml").unlink()
+    assert_reads(path, calibrated)
+
+
+def test_several_files_without_metadata(tmp_path: Path, calibrated: SourceOptions) -> None:
+    path = bag(tmp_path)
+    (path / "metadata.yaml").unlink()
+    shutil.copy(path / "room.db3", path / "a_second.db3")
+    middle = CONTENT.imu_ns[len(CONTENT.imu_ns) // 2].item()
+    with database(path) as data:
+        data.execute("DELETE FROM messages WHERE timestamp >= ?", (middle,))
+    with sqlite3.connect(path / "a_second.db3") as data:
+        data.execute("DELETE FROM messages WHERE timestamp < ?", (middle,))
+    assert_reads(path, calibrated)
+
+
+def test_each_failure_names_its_remedy(tmp_path: Path, calibrated: SourceOptions) -> None:
+    mcap = bag(tmp_path, "mcap")
+    file = mcap / "room.mcap"
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(MapError, match=r"`mcap recover \S*room.mcap -o whole.mcap`"):
+        open_recording(mcap, calibrated)
+    shutil.rmtree(mcap)
+    path = bag(tmp_path)
+    (path / "room.db3").rename(path / "other.db3")
+    with pytest.raises(MapError, match=r"room.db3 of its metadata.yaml is missing"):
+        open_recording(path, calibrated)
+    shutil.rmtree(path)
+    unclosed = write_bag(CONTENT, tmp_path / "room.bag")
+    data = bytearray(unclosed.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    unclosed.write_bytes(data)
+    with pytest.raises(MapError, match=r"not closed: run `rosbag reindex \S*room.bag`"):
+        open_recording(unclosed, calibrated)
