@@ -26,7 +26,14 @@ class BagTopic:
     start_s: float | None  # after the bag's first message
     duration_s: float
     rate_hz: float
-    encoding: str = ""  # of the first image
+
+
+@dataclasses.dataclass(frozen=True)
+class BagImages:
+    """How the images of a topic are stored."""
+
+    topic: str
+    encoding: str  # or format, of the first image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +46,7 @@ class BagInfo(Report):
     duration_s: float
     messages: int
     topics: tuple[BagTopic, ...]
+    images: tuple[BagImages, ...] = ()
 
 
 @dataclasses.dataclass
@@ -90,6 +98,11 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
         topics=tuple(
             _topic(topic, times, start_ns or 0) for (topic, _), times in sorted(topics.items())
         ),
+        images=tuple(
+            BagImages(topic, times.encoding)
+            for (topic, _), times in sorted(topics.items())
+            if times.encoding
+        ),
     )
 
 
@@ -101,6 +114,5 @@ def _topic(topic: str, times: _Times, start_ns: int) -> BagTopic:
         messages=times.count,
         start_s=(times.first_ns - start_ns) * _NS_TO_S if times.count else None,
         duration_s=duration_s,
-        encoding=times.encoding,
         rate_hz=(times.count - 1) / duration_s if duration_s > 0.0 else 0.0,
     )
