@@ -14,10 +14,19 @@ _LARGEST_RADIUS = 6.0
 def pixels_of(camera: Camera, p_C: F64) -> F64:
     """Return pixels (N, 2) of points (N, 3) that lie in front of the camera."""
     values = camera.intrinsics
-    depth = p_C[:, 2]
+    depth, distance = p_C[:, 2], np.sqrt(np.einsum("ij,ij->i", p_C, p_C))
     if camera.projection is Projection.UNIFIED:
-        depth = depth + values[0] * np.sqrt(np.einsum("ij,ij->i", p_C, p_C))
-        values = values[1:]
+        depth = depth + values[0] * distance
+    elif camera.projection is Projection.DOUBLE_SPHERE:
+        # Usenko, Demmel and Cremers (2018), eq. (40)
+        shifted = depth + values[0] * distance
+        second = np.sqrt(np.sum(p_C[:, :2] ** 2, axis=1) + shifted**2)
+        depth = values[1] * second + (1.0 - values[1]) * shifted
+    elif camera.projection is Projection.EXTENDED_UNIFIED:
+        # Khomutenko, Garcia and Martinet (2016), eq. (5)
+        scaled = np.sqrt(values[1] * np.sum(p_C[:, :2] ** 2, axis=1) + depth**2)
+        depth = values[0] * scaled + (1.0 - values[0]) * depth
+    values = values[-4:]
     x = _distorted(camera, p_C[:, 0] / depth, p_C[:, 1] / depth)
     return np.stack([values[0] * x[0] + values[2], values[1] * x[1] + values[3]], axis=1)
 
@@ -33,9 +42,11 @@ def field_of_view_radius(camera: Camera) -> float:
 def _distorted(camera: Camera, x: F64, y: F64) -> tuple[F64, F64]:
     k = camera.distortion_parameters
     r2 = x * x + y * y
-    if camera.distortion is Distortion.RADTAN:
-        # Brown (1966): radial and decentring terms
-        radial = 1.0 + r2 * (k[0] + r2 * k[1])
+    if camera.distortion in (Distortion.RADTAN, Distortion.RADTAN5, Distortion.RATIONAL):
+        # Brown (1966): radial and decentring terms; rational as in OpenCV's documentation
+        k3, k4, k5, k6 = np.append(k[4:], np.zeros(8 - len(k))) if len(k) < 8 else k[4:]
+        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k3))
+        radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         return (
             x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
             y * radial + 2.0 * k[3] * x * y + k[2] * (r2 + 2.0 * y * y),

@@ -8,20 +8,29 @@ import numpy as np
 import pytest
 
 from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import project
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
 
 PARAMETERS = {
     Distortion.NONE: [],
     Distortion.RADTAN: [-0.28, 0.07, 2e-4, 2e-5],
+    Distortion.RADTAN5: [-0.28, 0.07, 2e-4, 2e-5, -0.01],
+    Distortion.RATIONAL: [0.3, 0.02, 2e-4, 2e-5, 1e-3, 0.6, 0.05, 2e-3],
     Distortion.EQUIDISTANT: [-0.02, 0.01, -0.006, 0.001],
     Distortion.FOV: [0.92],
 }
 PINHOLE = [380.0, 390.0, 376.0, 240.0]
+MIRROR = {
+    Projection.PINHOLE: [],
+    Projection.UNIFIED: [0.8],
+    Projection.DOUBLE_SPHERE: [-0.2, 0.6],
+    Projection.EXTENDED_UNIFIED: [0.6, 1.1],
+}
 
 
 def _camera(projection: Projection, distortion: Distortion) -> Camera:
-    intrinsics = PINHOLE if projection is Projection.PINHOLE else [0.8, *PINHOLE]
+    intrinsics = [*MIRROR[projection], *PINHOLE]
     return Camera(
         "0" * 32,
         projection,
@@ -38,8 +47,7 @@ def _points() -> np.ndarray:
     return rng.uniform([-2.0, -1.5, 2.0], [2.0, 1.5, 8.0], (500, 3))
 
 
-@pytest.mark.parametrize("projection", Projection)
-@pytest.mark.parametrize("distortion", Distortion)
+@pytest.mark.parametrize(("projection", "distortion"), CAMERA_MODELS)
 def test_agrees_with_the_estimators(projection: Projection, distortion: Distortion) -> None:
     camera = _camera(projection, distortion)
     expected, visible = project(camera, _points())
