@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from maplab_py import kernel_cache
+from maplab_py.child_processes import end_with_parent
 from maplab_py.console.commands.flags import parse_words
 from maplab_py.console.commands.registry import Registry, load_registry
 from maplab_py.console.scripts.aliases import read_aliases
@@ -32,7 +33,6 @@ from maplab_py.console.terminal.streams import (
     writing_output,
 )
 from maplab_py.errors import FlagError, MaplabError, UserError
-from maplab_py.pipeline.child import end_with_parent
 from maplab_py.pipeline.options import PipelineOptions
 
 _MAPS_FOLDER = "maps_folder"

@@ -1,31 +1,18 @@
-"""The fresh process of a task: started with few threads, watched, and ended with its worker."""
+"""The fresh process of a task: started, watched, and ended with its worker."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
-import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
+from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, processors, start
 from maplab_py.memory import resident_bytes
 from maplab_py.pipeline.orders import Order
 
-PARENT_VARIABLE = "MAPLAB_ENDS_WITH_PROCESS"
-"""Process whose end ends this one."""
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
-_SECONDS_BETWEEN_LOOKS = 0.1
 STARTS = " starts "
 """Stands in the first line of an attempt in a log."""
 
@@ -47,22 +34,6 @@ class ChildEnd:
     is_cancelled: bool
 
 
-def end_with_parent() -> None:
-    """End this process soon after the worker that `PARENT_VARIABLE` names; nothing without one."""
-    text = os.environ.pop(PARENT_VARIABLE, "")  # not for shell commands of the script
-    if not text.isdigit():
-        return
-    parent = int(text)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
-        os.killpg(0, signal.SIGKILL)
-
-    if os.getpgrp() == os.getpid():  # started by `run_child`: the group is this task alone
-        threading.Thread(target=watch, name="end with parent", daemon=True).start()
-
-
 def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:
     """Run the commands of an order in a fresh process of the console, and wait for its end.
 
@@ -74,22 +45,19 @@ def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:
     """
     switches = ["--keep_going"] * order.keep_going + ["--discard"] * order.discard
     with order.reports.open("wb") as reports, order.log.open("ab") as log:
-        child = subprocess.Popen(
+        child = start(
             [sys.executable, "-m", "maplab_py", "--json", *switches, *order.flags],
+            threads=order.threads or max(1, processors() // max(1, order.tasks_per_host)),
             stdin=subprocess.PIPE,
             stdout=reports,
             stderr=log,
             cwd=order.folder,
-            env=thread_environment(_threads(order)),
-            start_new_session=True,
         )
         try:
             _send(child, order.script)
             return _watched(child, order.memory_gb * 1e9, is_cancelled)
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(child.pid, signal.SIGKILL)  # with the shell commands of its script
-            child.wait()
+            kill(child)  # with the shell commands of its script
 
 
 def _send(child: subprocess.Popen[bytes], script: str) -> None:
@@ -104,33 +72,13 @@ def _watched(
     peak = 0.0
     while True:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            status = child.wait(timeout=_SECONDS_BETWEEN_LOOKS)
+            status = child.wait(timeout=SECONDS_BETWEEN_LOOKS)
             return ChildEnd(status, peak / 1e9, is_over_memory=False, is_cancelled=False)
         peak = max(peak, resident_bytes(child.pid))
         is_over = 0.0 < limit_bytes < peak
         if is_over or is_cancelled():
             child.kill()
             return ChildEnd(child.wait(), peak / 1e9, is_over, not is_over)
-
-
-def _threads(order: Order) -> int:
-    return order.threads or max(1, _processors() // max(1, order.tasks_per_host))
-
-
-def thread_environment(threads: int) -> dict[str, str]:
-    """Return the environment of a child that may use some threads and ends with this process."""
-    return {
-        **os.environ,
-        **dict.fromkeys(_THREAD_VARIABLES, str(threads)),
-        PARENT_VARIABLE: str(os.getpid()),
-        "PYTHONUNBUFFERED": "1",
-    }
-
-
-def _processors() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def first_error(log: Path) -> str:

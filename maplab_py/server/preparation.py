@@ -22,8 +22,8 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.atomic import write_file
+from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, start
 from maplab_py.errors import MapError, MaplabError, UserError
-from maplab_py.pipeline.child import thread_environment
 from maplab_py.pipeline.fingerprint import program_version
 from maplab_py.pipeline.orders import Ending, Outcome
 from maplab_py.server.journal import Journal, MergedSubmap
@@ -128,7 +128,6 @@ def check_submap(submap: VIMap) -> None:
         )
 
 
-_SECONDS_BETWEEN_LOOKS = 0.1
 _IDLE_S = 60.0
 _MOST_ORDERS = 200
 """A worker is replaced after so many submaps, so that its memory cannot grow without end."""
@@ -196,13 +195,12 @@ class _Worker:
 
     def __init__(self, threads: int, idle_s: float) -> None:
         self.orders = 0
-        self._process = subprocess.Popen(
+        self._process = start(
             [sys.executable, "-m", "maplab_py.server.worker", repr(idle_s)],
+            threads=threads,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=thread_environment(threads),
-            start_new_session=True,
         )
 
     @property
@@ -218,7 +216,7 @@ class _Worker:
         with contextlib.suppress(BrokenPipeError):
             stdin.write(order.as_line().encode("utf-8", "surrogateescape"))
             stdin.flush()
-        while not select.select([stdout], [], [], _SECONDS_BETWEEN_LOOKS)[0]:
+        while not select.select([stdout], [], [], SECONDS_BETWEEN_LOOKS)[0]:
             if is_cancelled():
                 self.kill()
                 return Outcome(order.title, Ending.CANCELLED, "cancelled")
@@ -239,13 +237,7 @@ class _Worker:
 
     def kill(self) -> None:
         """End the process, and wait for its end."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    stream.close()
+        kill(self._process)
 
 
 _ATTEMPTS = 3

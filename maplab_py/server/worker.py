@@ -18,9 +18,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from maplab_py.child_processes import end_with_parent
 from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
 from maplab_py.memory import says_not_enough
-from maplab_py.pipeline.child import end_with_parent
 from maplab_py.pipeline.orders import Ending
 
 logger = logging.getLogger(__name__)

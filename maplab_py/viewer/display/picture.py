@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import shutil
-import signal
 import subprocess
 import tempfile
 import time
@@ -20,6 +18,7 @@ import numpy as np
 
 from maplab_py.array_types import U8
 from maplab_py.cancellation import check_cancelled, cleaned_up
+from maplab_py.child_processes import kill, start
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.viewer.display import text
@@ -129,24 +128,15 @@ def headless_browser(
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
         width, height = size_px
-        process = subprocess.Popen(
+        process = start(
             [
                 browser, *HEADLESS_FLAGS, *sandbox, f"--user-data-dir={profile}",
                 f"--window-size={width},{height + 120}", url,
             ],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            start_new_session=True,
         )  # fmt: skip
-        with cleaned_up(partial(_end, process)):
+        with cleaned_up(partial(kill, process)):
             yield process
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and those that it has started."""
-    if process.poll() is None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 def save_picture(picture: U8, path: Path) -> None:
