@@ -11,7 +11,7 @@ from pathlib import Path
 
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, processors, start
 from maplab_py.memory import resident_bytes
-from maplab_py.pipeline.orders import Order
+from maplab_py.pipeline.messages import Order
 
 STARTS = " starts "
 """Stands in the first line of an attempt in a log."""

@@ -15,8 +15,8 @@ from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import available_bytes
 from maplab_py.pipeline.execution import execute
+from maplab_py.pipeline.messages import Ending, Order, Outcome
 from maplab_py.pipeline.options import PipelineOptions
-from maplab_py.pipeline.orders import Ending, Order, Outcome
 
 _SECONDS_TO_CONNECT = 10.0
 _SECONDS_TO_CLOSE = 10.0

@@ -12,8 +12,8 @@ from pathlib import Path
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.pipeline.engines import Engine, engine_of
 from maplab_py.pipeline.fingerprint import folder_hash, program_version
+from maplab_py.pipeline.messages import Ending, Order, Outcome
 from maplab_py.pipeline.options import PipelineOptions
-from maplab_py.pipeline.orders import Ending, Order, Outcome
 from maplab_py.pipeline.plan import MAPS, Pipeline, Stage, ordered
 from maplab_py.pipeline.progress import (
     FailedTask,

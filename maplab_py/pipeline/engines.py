@@ -7,8 +7,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from maplab_py.pipeline.execution import execute
+from maplab_py.pipeline.messages import Order, Outcome
 from maplab_py.pipeline.options import PipelineOptions
-from maplab_py.pipeline.orders import Order, Outcome
 
 
 class Engine(Protocol):

@@ -17,7 +17,7 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import says_not_enough
 from maplab_py.pipeline.child import STARTS, ChildEnd, first_error, run_child
 from maplab_py.pipeline.fingerprint import program_version
-from maplab_py.pipeline.orders import Ending, Order, Outcome
+from maplab_py.pipeline.messages import Ending, Order, Outcome
 from maplab_py.pipeline.plan import RESULT_TEMPLATE
 
 _USER_ERROR = 2

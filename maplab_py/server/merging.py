@@ -32,7 +32,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.server.cloud_loops import OpenAlignments, with_cloud_loops
+from maplab_py.server.alignments import OpenAlignments, with_cloud_loops
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.spool import with_resources_taken_in
 from maplab_py.vimap import VIMap

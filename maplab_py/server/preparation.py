@@ -25,7 +25,7 @@ from maplab_py.atomic import write_file
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, start
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.pipeline.fingerprint import program_version
-from maplab_py.pipeline.orders import Ending, Outcome
+from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.server.journal import Journal, MergedSubmap
 from maplab_py.server.options import SubmapOptions
 from maplab_py.server.publishing import Publisher

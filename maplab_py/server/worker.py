@@ -21,7 +21,7 @@ from typing import Any
 from maplab_py.child_processes import end_with_parent
 from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
 from maplab_py.memory import says_not_enough
-from maplab_py.pipeline.orders import Ending
+from maplab_py.pipeline.messages import Ending
 
 logger = logging.getLogger(__name__)
 _FORMAT = "%(asctime)s  process %(process)d  %(message)s"

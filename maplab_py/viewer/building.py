@@ -13,10 +13,10 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_drawing, spread_rows
 from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.layers import (
-    beside,
     cameras,
     closures,
     clouds,
+    comparison,
     covariances,
     landmarks,
     localization,
@@ -106,7 +106,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     if subject.truth is not None:
         layers += references.ground_truth(drawing, subject.truth)
     if subject.other is not None and subject.side_by_side:
-        layers += beside.beside(drawing, subject.other, (subject.title, subject.other_name))
+        layers += comparison.beside(drawing, subject.other, (subject.title, subject.other_name))
     elif subject.other is not None:
         layers += references.compared(drawing, subject.other)
     remembered, unreadable = closures.recorded_closures(drawing)
@@ -131,7 +131,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
 
 def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:
     """Return the extent of the map together with the path of another state of it."""
-    shift = beside.shift_beside(drawing, other) if side_by_side else -drawing.origin_G
+    shift = comparison.shift_beside(drawing, other) if side_by_side else -drawing.origin_G
     return _widened(drawing.extent, other.T_G_I[:, 4:] + shift)
 
 

@@ -71,7 +71,7 @@ def anchor_mission(
         T_G_M: Pose of the mission's frame in the global frame: x y z [m] and yaw [deg], "1 2 0 90".
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-    from maplab_py.algorithms.anchoring.by_hand import choice_near, place_mission
+    from maplab_py.algorithms.anchoring.manual import choice_near, place_mission
 
     row = context.mission_row(map_mission)
     choice = None

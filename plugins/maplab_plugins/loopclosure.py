@@ -374,7 +374,7 @@ def _relax(
     merge: bool,
 ) -> RelaxReport:
     from maplab_py.algorithms.loop_closure.workflow import close_loops
-    from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
+    from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
 
     result, search_report, relaxed = relax_over_loops(
         context.vi_map, options, loop_options, missions=missions, progress=context.progress

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MaplabError
-from maplab_py.pipeline.orders import Ending, Outcome
+from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
 from maplab_py.server.preparation import WorkerPool
 from maplab_py.server.server import MapServer

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.pipeline.orders import Ending, Outcome
+from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.sensors import SensorSet
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Arrival, Entry, Spool, push

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from maplab_py.algorithms.anchoring.reports import AnchoringReport, MissionAlignment
-from maplab_py.server.cloud_loops import OpenAlignments
+from maplab_py.server.alignments import OpenAlignments
 
 A, B, C, D = (letter * 32 for letter in "abcd")
 NAMES = {id_[:8]: id_ for id_ in (A, B, C, D)}

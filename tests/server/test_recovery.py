@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.pipeline.orders import Outcome
+from maplab_py.pipeline.messages import Outcome
 from maplab_py.server.journal import Journal, MergedSubmap, read_journal, write_journal
 from maplab_py.server.merging import Stretch
 from maplab_py.server.publishing import Publisher

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.pipeline.orders import Ending
+from maplab_py.pipeline.messages import Ending
 from maplab_py.server import worker as worker_module
 from maplab_py.server.preparation import WorkerPool
 from maplab_py.server.worker import SubmapOrder, answer

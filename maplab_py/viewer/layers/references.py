@@ -15,7 +15,7 @@ from maplab_py.geometry.alignment import align_yaw_position
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
-from maplab_py.viewer.layers.beside import reference_landmarks
+from maplab_py.viewer.layers.comparison import reference_landmarks
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
 from maplab_py.vimap import VIMap
 

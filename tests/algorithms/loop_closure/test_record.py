@@ -11,8 +11,8 @@ from maplab_py.algorithms.loop_closure.listing import find_closures, list_closur
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.removal import remove_closures
 from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
+from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.over_loops import relax_over_loops
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.extension_fields import with_extension
 from maplab_py.storage.native import load_map, save_map
