@@ -25,7 +25,8 @@ def test_ply(tmp_path: Path) -> None:
 
 def test_obj(tmp_path: Path) -> None:
     write_mesh(P, FACES, tmp_path / "mesh.obj")
-    words = [line.split() for line in (tmp_path / "mesh.obj").read_text().splitlines()]
+    text = (tmp_path / "mesh.obj").read_text()
+    words = [line.split() for line in text.splitlines() if line]
     vertices = [list(map(float, line[1:])) for line in words if line[0] == "v"]
     np.testing.assert_array_equal(vertices, P)
     faces = [list(map(int, line[1:])) for line in words if line[0] == "f"]
@@ -50,12 +51,18 @@ def test_glb(tmp_path: Path) -> None:
     assert header[2] == len(data)
     scene = json.loads(data[20 : 20 + header[3]])
     body = data[20 + int(header[3]) + 8 :]
-    views = scene["bufferViews"]
-    positions = np.frombuffer(body, dtype="<f4", count=12).reshape(4, 3)
+    primitive = scene["meshes"][0]["primitives"][0]
+    place, rows = (
+        scene["accessors"][k] for k in (primitive["attributes"]["POSITION"], primitive["indices"])
+    )
+    views = [scene["bufferViews"][accessor["bufferView"]] for accessor in (place, rows)]
+    start = views[0]["byteOffset"]
+    positions = np.frombuffer(body, dtype="<f4", count=12, offset=start).reshape(4, 3)
     np.testing.assert_array_equal(positions, np.stack([P[:, 0], P[:, 2], -P[:, 1]], axis=1))
-    indices = np.frombuffer(body, dtype="<u4", offset=views[1]["byteOffset"]).reshape(-1, 3)
+    start = views[1]["byteOffset"]
+    indices = np.frombuffer(body, dtype="<u4", count=6, offset=start).reshape(-1, 3)
     np.testing.assert_array_equal(indices, FACES)
-    assert scene["accessors"][0]["max"] == [1.0, 3.0, 0.0]
+    assert place["max"] == [1.0, 3.0, 0.0]
     assert len(data) % 4 == 0
 
 
