@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.algorithms.loop_closure.ambiguity import AmbiguityRule, rival_shares
+from maplab_py.algorithms.loop_closure.gates import AmbiguityRule, rival_shares
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.geometry import se3
 from tests.algorithms.loop_closure.rooms import Walk, make_map
