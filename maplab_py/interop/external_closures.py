@@ -54,7 +54,10 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
             numbers = np.array(entry["covariance"], dtype=np.float64)
             covariance[i] = numbers.reshape(6, 6)
             switch[i] = float(entry["switch_variable"]), float(entry["switch_variable_variance"])
-        except (KeyError, TypeError, ValueError) as error:
+            values = (T_G_S[i], T_S_T[i], covariance[i], switch[i])
+            if not all(np.isfinite(part).all() for part in values):
+                raise ValueError("has entries that are not finite numbers")
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             what = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
             raise MapError(f"{path}: entry {i + 1}: {what}") from None
     vertex, near = _nearest(vi_map, time_ns)

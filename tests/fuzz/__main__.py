@@ -1,0 +1,90 @@
+"""Fuzz one reader with atheris: python -m tests.fuzz READER [--seconds=20] [--corpus=FOLDER].
+
+The corpus grows in its folder; an input that fails is written beside it as `crash-...`, and belongs into
+tests/fuzz/findings/READER once it is mended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+_WORDS = (
+    *(
+        "nan",
+        "inf",
+        "-1",
+        "0",
+        "1e308",
+        "1e400",
+        "9223372036854775808",
+        "-9223372036854775809",
+        "0x1",
+    ),
+    *(
+        "null",
+        "true",
+        "[",
+        "]",
+        "[]",
+        "{",
+        "}",
+        "{}",
+        ": ",
+        "- ",
+        "&a ",
+        "*a",
+        "!!",
+        "---\\x0a",
+        "\\x0a",
+    ),
+    *(
+        "\\x00",
+        "\\xff\\xff\\xff\\xff",
+        "\\xff\\xff\\xff\\xff\\xff\\xff\\xff\\x7f",
+        ",",
+        ";",
+        "\\x09",
+    ),
+)
+"""Pieces that mutations put in, in libFuzzer's notation."""
+
+
+def main() -> None:
+    """Run libFuzzer on a reader; the process ends with its status."""
+    import atheris
+
+    with atheris.instrument_imports(include=["maplab_py"]):
+        from tests.fuzz.readers import READERS, check
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("reader", choices=sorted(READERS))
+    parser.add_argument("--seconds", type=int, default=20)
+    parser.add_argument("--corpus", type=Path)
+    options = parser.parse_args()
+    reader = READERS[options.reader]
+    home = Path(tempfile.mkdtemp(prefix=f"fuzz_{options.reader}_"))
+    corpus = options.corpus or home / "corpus"
+    for folder in (corpus, home / "seeds", home / "work"):
+        folder.mkdir(parents=True, exist_ok=True)
+    for row, seed in enumerate(reader.seeds(home / "seeds")):
+        (corpus / f"seed_{row}").write_bytes(seed)
+    words = home / "words"
+    words.write_text("".join(f'"{word}"\n' for word in _WORDS))
+    longest = 2 * max(path.stat().st_size for path in corpus.iterdir())
+    arguments = [
+        f"-max_total_time={options.seconds}",
+        f"-max_len={max(longest, 4096)}",
+        *("-timeout=30", "-rss_limit_mb=4000", "-print_final_stats=1", "-len_control=0"),
+        f"-dict={words}",
+        f"-artifact_prefix={corpus.parent}/",
+        str(corpus),
+    ]
+    atheris.Setup([sys.argv[0], *arguments], lambda data: check(reader, home / "work", data))
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""Readers on their valid inputs, on mutations of them, and on what fuzzing once found."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.readers import READERS, check
+
+FINDINGS = Path(__file__).parent / "findings"
+_MUTATIONS = 4
+_WORDS = (
+    b"nan",
+    b"-1",
+    b"1e400",
+    b"999999999999999999999",
+    b"\xff\xff\xff\xff",
+    b"\0" * 8,
+    b"{",
+    b"\n",
+)
+
+
+def mutated(rng: random.Random, data: bytes) -> bytes:
+    """Return data with one piece cut, repeated, exchanged or overwritten; the first byte stays."""
+    if len(data) < 3:
+        return data
+    a, b = sorted(rng.sample(range(1, len(data)), 2))
+    b = min(b, a + 64)
+    kind = rng.randrange(4)
+    if kind == 0:
+        return data[:a] + data[b:]
+    if kind == 1:
+        return data[:b] + data[a:]
+    if kind == 2:
+        return data[:a]
+    return data[:a] + rng.choice(_WORDS) + data[min(b, a + 8) :]
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_valid_inputs_are_read_and_mutated_ones_refused(name: str, tmp_path: Path) -> None:
+    reader, rng = READERS[name], random.Random(name)
+    for folder in ("seeds", "work"):
+        (tmp_path / folder).mkdir()
+    seeds = reader.seeds(tmp_path / "seeds")
+    for seed in seeds:
+        if name != "requests":  # without a robot there is nothing to find
+            reader.read(tmp_path / "work", seed)
+    for _ in range(_MUTATIONS):
+        for seed in seeds:
+            check(reader, tmp_path / "work", mutated(rng, seed))
+
+
+@pytest.mark.parametrize(
+    "path", sorted(FINDINGS.glob("*/*")), ids=lambda p: f"{p.parent.name}-{p.name}"
+)
+def test_findings_stay_mended(path: Path, tmp_path: Path) -> None:
+    check(READERS[path.parent.name], tmp_path, path.read_bytes())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_nothing_is_found_in_20_s(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("atheris")
+    command = [
+        sys.executable,
+        "-m",
+        "tests.fuzz",
+        name,
+        "--seconds=20",
+        f"--corpus={tmp_path / 'c'}",
+    ]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=root, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(list((tmp_path / "c").iterdir())) > 1
