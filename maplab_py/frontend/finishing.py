@@ -152,10 +152,11 @@ def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> tuple[Path, Di
     except UserError as error:
         rescue = Path(tempfile.gettempdir()) / f"maplab-{uuid.uuid4().hex[:8]}" / folder.name
         try:
-            saved = save_map(vi_map, rescue)
+            saved = save_map(vi_map, rescue, repair=True)
         except UserError:
             raise error from None
-        problem = f"{error}; the map is saved to {rescue} instead"
+        repaired = f" ({'; '.join(saved.notes)})" if saved.notes else ""
+        problem = f"{error}; the map is saved to {rescue} instead{repaired}"
         return rescue, DiskCopy(rescue.resolve(), saved.fingerprint), problem
 
 

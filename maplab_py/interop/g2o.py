@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import TooLarge, inflate, read_bytes
@@ -26,6 +26,7 @@ from maplab_py.output_files import write_text
 _POSE, _PLANAR_POSE = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 _EDGE, _PLANAR_EDGE = "EDGE_SE3:QUAT", "EDGE_SE2"
 _WIDTH = {_POSE: 8, _EDGE: 30, _PLANAR_POSE: 4, _PLANAR_EDGE: 11}
+_LARGEST_ID = (1 << 64) - 1
 _MAX_BYTES = 500_000_000
 _GZIP, _GZIP_WINDOW = b"\x1f\x8b", 31
 _OUT_OF_PLANE = 1e4
@@ -37,7 +38,7 @@ _PLANAR = np.array([0, 1, 5])
 class PoseGraph:
     """Poses and measurements between them; planar files are read as graphs in the plane z = 0."""
 
-    id: I64  # (V,) sorted
+    id: U64  # (V,) sorted
     T_G_V: F64  # (V, 7)
     first: I64  # (E,) rows of poses
     second: I64  # (E,)
@@ -78,7 +79,7 @@ def read_g2o(path: Path) -> PoseGraph:
     missing = np.flatnonzero(ids[rows] != ends)
     if len(missing):
         raise MapError(f"{path}: an edge names pose {ends.ravel()[missing[0]]}, which is not there")
-    fixed = np.array([int(words[1]) for _, words in sections.get("FIX", [])], dtype=np.int64)
+    fixed = _ids(sections.get("FIX", []), None, path)
     information, num_repaired = positive_definite(
         np.concatenate(
             [_symmetric(edges[0][1][:, 7:], 6), _lifted(_symmetric(edges[1][1][:, 3:], 3))]
@@ -153,28 +154,45 @@ def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]
 
 def _numbers(
     sections: dict[str, list[tuple[int, list[str]]]], kind: str, path: Path
-) -> tuple[I64, F64]:
+) -> tuple[U64, F64]:
     """Return the ids (N, 1 or 2) and the values of the lines of one kind."""
     ids = 2 if kind in (_EDGE, _PLANAR_EDGE) else 1
     lines = sections.get(kind, [])
     try:
-        names = [[int(word) for word in words[1 : 1 + ids]] for _, words in lines]
-        values = [[float(word) for word in words[1 + ids :]] for _, words in lines]
+        rows = [[float(word) for word in words[1 + ids :]] for _, words in lines]
     except ValueError:
         for number, words in lines:
-            _check_line(number, words, ids, path)
+            _check_numbers(number, words[1 + ids :], path)
         raise
-    width = _WIDTH[kind] - ids
-    return (
-        np.array(names, dtype=np.int64).reshape(-1, ids),
-        np.array(values, dtype=np.float64).reshape(-1, width),
-    )
+    values = np.array(rows, dtype=np.float64).reshape(-1, _WIDTH[kind] - ids)
+    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(wrong):
+        raise MapError(f"{path}:{lines[wrong[0]][0]}: a value is not a finite number")
+    if kind in (_POSE, _EDGE):
+        wrong = np.flatnonzero(~values[:, 3:7].any(axis=1))
+        if len(wrong):
+            raise MapError(f"{path}:{lines[wrong[0]][0]}: the quaternion is zero")
+    return _ids(lines, ids, path).reshape(-1, ids), values
 
 
-def _check_line(number: int, words: list[str], ids: int, path: Path) -> None:
+def _ids(lines: list[tuple[int, list[str]]], count: int | None, path: Path) -> U64:
+    """Return the ids of lines, whole numbers of 64 bits without sign; `count` = None: all words are ids."""
+    end = None if count is None else 1 + count
     try:
-        [int(word) for word in words[1 : 1 + ids]]
-        [float(word) for word in words[1 + ids :]]
+        return np.array([int(word) for _, words in lines for word in words[1:end]], dtype=np.uint64)
+    except (ValueError, OverflowError):
+        for number, words in lines:
+            for word in words[1:end]:
+                if not word.isdecimal() or int(word) > _LARGEST_ID:
+                    raise MapError(
+                        f"{path}:{number}: '{word}' is not an id: wants 64 bits without sign"
+                    ) from None
+        raise
+
+
+def _check_numbers(number: int, words: list[str], path: Path) -> None:
+    try:
+        [float(word) for word in words]
     except ValueError as error:
         raise MapError(f"{path}:{number}: {error}") from None
 

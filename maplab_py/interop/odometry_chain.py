@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, U64
 from maplab_py.geometry import se3
 
 
-def chained_poses(id: I64, first: I64, second: I64, T_A_B: F64) -> F64:
+def chained_poses(id: U64, first: I64, second: I64, T_A_B: F64) -> F64:
     """Return poses T_G_V (V, 7) along a spanning forest of the edges, odometry before other edges.
 
     The first pose of every connected part is the identity.
@@ -33,7 +33,7 @@ def chained_poses(id: I64, first: I64, second: I64, T_A_B: F64) -> F64:
     return np.asarray(step[:root])
 
 
-def _spanning_forest(id: I64, first: I64, second: I64) -> tuple[I64, I64, np.ndarray]:
+def _spanning_forest(id: U64, first: I64, second: I64) -> tuple[I64, I64, np.ndarray]:
     """Return for every pose its parent, the edge that joins them (-1 = root), and its direction.
 
     A root's parent is V. Forward edges run from the parent to the pose.

@@ -23,7 +23,7 @@ from maplab_py.storage.map_files import COPY_AGAIN, METADATA, RESOURCE_INFO, SEN
 from maplab_py.storage.message_ids import ids_of, unknown_bytes
 from maplab_py.storage.tables_from_messages import Content
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import Violation, check_loaded
+from maplab_py.vimap.consistency import Violation, check_loaded, check_saved
 from maplab_py.vimap.ids import IdIndex, to_hex
 
 _FIELDS = {
@@ -38,6 +38,8 @@ _PAIRS = (
     ("missions", "mission_ids"),
     ("baseframes", "baseframe_ids"),
 )
+_NO_NUMBER = "non-finite"
+_REPAIR = "load with --repair to drop what is no number"
 _NAMED = 3
 """Ids that a note names."""
 
@@ -194,8 +196,27 @@ def consistency_notes(vi_map: VIMap) -> list[str]:
     """
     refused, tolerated = check_loaded(vi_map)
     if refused:
-        raise MapError(f"{_said(refused[0])}; check_map_consistency lists such rules")
+        remedy = (
+            _REPAIR if _NO_NUMBER in refused[0].rule else "check_map_consistency lists such rules"
+        )
+        raise MapError(f"{_said(refused[0])}; {remedy}")
     return [_said(violation) for violation in tolerated]
+
+
+def check_loadable(vi_map: VIMap, folder: Path) -> None:
+    """Check that a map could be loaded after it was saved.
+
+    Raises:
+        MapError: It could not; names the rule and an id.
+    """
+    refused = check_saved(vi_map)
+    if refused:
+        remedy = "save with --repair to drop what is no number"
+        if _NO_NUMBER not in refused[0].rule:
+            remedy = "check_map_consistency lists such rules"
+        raise MapError(
+            f"{folder}: not saved, as it could not be loaded: {_said(refused[0])}; {remedy}"
+        )
 
 
 def _said(violation: Violation) -> str:

@@ -52,6 +52,7 @@ from maplab_py.storage.vertex_parts import (
 )
 from maplab_py.vimap import TransformationKind, VIMap
 from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
+from maplab_py.vimap.number_repair import without_bad_numbers
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.tables import Frames
 
@@ -91,7 +92,8 @@ def load_map(
     Args:
         folder: Map folder.
         max_size_megabytes: Bound of the unpacked size of one file.
-        repair: Where the two copies of an observation disagree, keep what both say.
+        repair: Where the two copies of an observation disagree, keep what both say, and drop what is no
+            number.
         progress: Shown while reading.
         listed: Checksums of its files (`checksums.listing`) if they are known already.
 
@@ -180,6 +182,9 @@ def _load(
     vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
     vi_map = vi_map.replace(sensors=sensors)
     vi_map = with_names(vi_map, folder)
+    if repair:
+        vi_map, dropped = without_bad_numbers(vi_map)
+        notes += dropped
     notes += absent_parts(folder, vi_map) + consistency_notes(vi_map)
     progress.step(1, 1, "read files")
     return vi_map, len(files), parts.unpacked_bytes, notes

@@ -24,6 +24,7 @@ from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.storage import checksums, mission_names, tables_to_messages
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.descriptor_layout import LayoutChoice, with_layout
+from maplab_py.storage.load_checks import check_loadable
 from maplab_py.storage.map_files import (
     METADATA,
     MISSIONS,
@@ -38,6 +39,7 @@ from maplab_py.storage.new_resources import copied_files, with_staged_in_place
 from maplab_py.storage.tables_to_messages import Partition
 from maplab_py.storage.written_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.number_repair import without_bad_numbers
 
 RESOURCES = "resources"
 _GZIP_LEVEL = 1
@@ -52,6 +54,7 @@ class SaveReport(Report):
     megabytes: float  # on disk, resources left out
     fingerprint: str  # of the files; equal maps have equal ones
     seconds: float
+    notes: tuple[str, ...] = ()  # what was repaired
 
 
 def save_map(
@@ -65,6 +68,7 @@ def save_map(
     descriptor_layout: LayoutChoice = "as_loaded",
     resource_files: Sequence[tuple[Path, Path]] = (),
     written: WrittenFiles | None = None,
+    repair: bool = False,
     progress: Progress = SILENT,
 ) -> SaveReport:
     """Save a map atomically: the folder always holds the complete old or the complete new map.
@@ -87,13 +91,17 @@ def save_map(
         resource_files: Files that come into the map's own resource folder, with their paths in it.
         written: What the folder had after its last save, and where it is noted for the next one:
             files that would not change are taken over, in a partition of its own.
+        repair: Drop what is no number instead of refusing it; see `number_repair`.
         progress: Shown while writing.
 
     Raises:
+        MapError: The map violates a rule without which it could not be loaded.
         UserError: The folder holds a map that must not be replaced, or something else than a map,
             or it cannot be written; or the layout cannot hold the descriptors.
     """
     began = time.perf_counter()
+    vi_map, notes = without_bad_numbers(vi_map) if repair else (vi_map, [])
+    check_loadable(vi_map, folder)
     resources = with_staged_in_place(with_layout(vi_map, descriptor_layout))
     folder = Path(folder).absolute()
     recover(folder)
@@ -112,7 +120,9 @@ def save_map(
     for line in _unknown_models(vi_map):
         progress.line(line)
     seconds = time.perf_counter() - began
-    return SaveReport(str(folder), files, size / 1e6, checksums.fingerprint_of(listed), seconds)
+    return SaveReport(
+        str(folder), files, size / 1e6, checksums.fingerprint_of(listed), seconds, tuple(notes)
+    )
 
 
 def _unknown_models(vi_map: VIMap) -> list[str]:

@@ -122,6 +122,19 @@ def check_loaded(vi_map: VIMap) -> tuple[list[Violation], list[Violation]]:
     return findings.refused, [v for v in findings.errors if v not in findings.refused]
 
 
+def check_saved(vi_map: VIMap) -> list[Violation]:
+    """Return the violations of a map in memory that would prevent loading it."""
+    findings = _Findings()
+    _check_references(vi_map, findings)
+    if findings.errors:
+        return findings.errors
+    _check_ids(vi_map, findings)
+    twice = list(findings.errors)
+    _check_numbers(vi_map, findings)
+    _check_edges(vi_map, findings)
+    return [*twice, *findings.refused]
+
+
 def _check_all(vi_map: VIMap) -> _Findings:
     findings = _Findings()
     _check_references(vi_map, findings)

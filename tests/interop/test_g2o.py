@@ -5,6 +5,7 @@ import gzip
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.relaxation.graph_files import is_odometry, map_of_graph
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph, read_g2o, write_g2o
@@ -18,7 +19,7 @@ def small_graph() -> PoseGraph:
     first, second = np.array([0, 1, 2, 0]), np.array([1, 2, 3, 3])
     root = rng.normal(size=(4, 6, 6))
     information = root @ root.transpose(0, 2, 1) + np.eye(6)
-    ids = np.array([3, 4, 5, (97 << 56) + 1])
+    ids = np.array([3, 4, 5, (97 << 56) + 1], dtype=np.uint64)
     measured = se3.relative(T[first], T[second])
     return PoseGraph(ids, T, first, second, measured, information, np.array([2]))
 
@@ -61,6 +62,15 @@ def test_planar_poses_and_edges_lie_in_the_plane(tmp_path):
         ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 0 0 0\n", "pose 0 occurs twice"),
         (f"VERTEX_SE2 0 0 0 0\nEDGE_SE3:QUAT 0 7 0 0 0 0 0 0 1 {IDENTITY}\n", "pose 7"),
         ("", "no poses"),
+        ("VERTEX_SE2 -1 0 0 0\n", r":1: '-1' is not an id"),
+        (
+            "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 18446744073709551616 0 0 0\n",
+            r":2: '18446744073709551616' is not",
+        ),
+        ("VERTEX_SE2 1.0 0 0 0\n", r":1: '1.0' is not an id"),
+        ("VERTEX_SE2 0 0 0 nan\n", r":1: a value is not a finite number"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 0\n", r":1: the quaternion is zero"),
+        ("VERTEX_SE2 0 0 0 0\nFIX x\n", r":2: 'x' is not an id"),
     ],
 )
 def test_errors_name_file_and_line(tmp_path, text, message):
@@ -69,6 +79,22 @@ def test_errors_name_file_and_line(tmp_path, text, message):
     with pytest.raises(MapError, match=message) as caught:
         read_g2o(path)
     assert "bad.g2o" in str(caught.value)
+
+
+@pytest.mark.parametrize("highest", [(1 << 63) + 1, (1 << 64) - 1])
+def test_ids_have_64_bits_without_sign(tmp_path, highest):
+    path, again = tmp_path / "a.g2o", tmp_path / "b.g2o"
+    path.write_text(
+        f"VERTEX_SE2 {highest - 1} 0 0 0\nVERTEX_SE2 {highest} 1 0 0\nVERTEX_SE2 7 1 0 0\n"
+        f"FIX {highest} 7\nFIX\nEDGE_SE2 {highest - 1} {highest} 1 0 0 1 0 0 1 0 1\n"
+    )
+    graph = read_g2o(path)
+    assert graph.id.tolist() == [7, highest - 1, highest]
+    assert graph.fixed.tolist() == [0, 2]
+    assert is_odometry(graph).tolist() == [True]
+    write_g2o(graph, again)
+    assert read_g2o(again).id.tolist() == graph.id.tolist()
+    assert len(map_of_graph(graph).transformation_edges) == 1
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -99,7 +125,13 @@ def test_edges_alone_give_the_poses_along_the_odometry(tmp_path):
     information = np.tile(np.eye(6), (9, 1, 1))
     path = tmp_path / "edges.g2o"
     graph = PoseGraph(
-        np.arange(9) * 1, T, first, second, measured, information, np.zeros(0, dtype=np.int64)
+        np.arange(9, dtype=np.uint64),
+        T,
+        first,
+        second,
+        measured,
+        information,
+        np.zeros(0, dtype=np.int64),
     )
     write_g2o(graph, path)
     lines = [line for line in path.read_text().splitlines() if line.startswith("EDGE")]

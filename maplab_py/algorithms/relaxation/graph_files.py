@@ -37,13 +37,15 @@ from maplab_py.vimap.ids import random_ids
 
 _ROBOT_SHIFT = 56
 """Ids above 2^56 are a robot's letter and a number (GTSAM's symbols)."""
+_MOST_ROBOTS = 256 - ord("a")
 _STEP_NS = 1_000_000_000
 
 
 def is_odometry(graph: PoseGraph) -> Mask:
     """Tell which edges (E,) join a pose with the next one of the same robot; first of each pair."""
-    a, b = graph.id[graph.first], graph.id[graph.second]
-    chain = (b - a == 1) & (a >> _ROBOT_SHIFT == b >> _ROBOT_SHIFT)
+    a, b = (graph.id[rows].astype(np.uint64) for rows in (graph.first, graph.second))
+    shift = np.uint64(_ROBOT_SHIFT)
+    chain = (b - a == 1) & (a >> shift == b >> shift)
     _, earliest = np.unique(np.where(chain, graph.first, -1), return_index=True)
     is_first = np.zeros(len(a), dtype=np.bool_)
     is_first[earliest] = True
@@ -177,10 +179,15 @@ def graph_of_map(vi_map: VIMap, options: RelaxationOptions) -> PoseGraph:
     covariance = np.linalg.inv(np.swapaxes(W, 1, 2) @ W)
     back = _split_covariance(covariance, parts.T_A_B, back=True)
     information = np.asarray(np.linalg.inv(back), dtype=np.float64)
-    robot = vi_map.vertices.mission.astype(np.int64)
-    number = np.arange(len(robot)) - vi_map.vertex_start[robot]
-    single_mission = len(vi_map.missions) == 1
-    ids = number if single_mission else ((robot + ord("a")) << _ROBOT_SHIFT) + number
+    robot = vi_map.vertices.mission
+    ids = (np.arange(len(robot)) - vi_map.vertex_start[robot]).astype(np.uint64)
+    if len(vi_map.missions) > _MOST_ROBOTS:
+        raise MapError(
+            f"g2o's ids have room for {_MOST_ROBOTS} robots, the map has {len(vi_map.missions)} missions: "
+            "export parts of it"
+        )
+    if len(vi_map.missions) > 1:
+        ids += (robot.astype(np.uint64) + np.uint64(ord("a"))) << np.uint64(_ROBOT_SHIFT)
     return PoseGraph(
         id=ids,
         T_G_V=vi_map.T_G_I,

@@ -23,7 +23,7 @@ def compile_relaxation() -> None:
     T_A_B = se3.compose(se3.inverse(T_G_V[first]), T_G_V[second])
     T_A_B[-1, 4] += 0.01
     graph = PoseGraph(
-        id=np.arange(_POSES),
+        id=np.arange(_POSES, dtype=np.uint64),
         T_G_V=T_G_V,
         first=first,
         second=second,

@@ -115,7 +115,8 @@ class ReadingOptions(CacheOptions, SizeOptions):
 
     repair: bool = option(
         False,
-        help="Keep the observations that both of their copies agree on instead of refusing the map.",
+        help="Keep the observations that both of their copies agree on and drop what is no number instead of "
+        "refusing the map.",
     )
 
 

@@ -96,6 +96,11 @@ class SaveOptions:
         help="Replace the map that is there even if another program has changed it since this one "
         "was loaded or saved.",
     )
+    repair: bool = option(
+        False,
+        help="Drop what is no number, in memory too, instead of refusing to save a map that could not be "
+        "loaded.",
+    )
     descriptor_layout: LayoutChoice = option(
         "as_loaded",
         help="Layout of the descriptors: as_loaded (every frame as it was loaded, new frames as 2.2), "
@@ -277,9 +282,11 @@ def _save_map(
 ) -> tuple[Report, list[Path]]:
     """Save one map; return the writer's report and the resource files to delete now."""
     from maplab_py.storage.native import DiskCopy, save_map
+    from maplab_py.vimap.number_repair import without_bad_numbers
 
     entry = context.maps.get(key)
-    vi_map, files, leaving = migration.prepare(entry.vi_map, entry.folder, folder)
+    repaired, notes = without_bad_numbers(entry.vi_map) if options.repair else (entry.vi_map, [])
+    vi_map, files, leaving = migration.prepare(repaired, entry.folder, folder)
     report = save_map(
         vi_map,
         folder,
@@ -292,4 +299,4 @@ def _save_map(
     )
     context.maps.update(entry.with_value(vi_map, "save"))
     context.mark_saved(key, folder, DiskCopy(folder.resolve(), report.fingerprint))
-    return report, leaving
+    return dataclasses.replace(report, notes=tuple(notes)), leaving
