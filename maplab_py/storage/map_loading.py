@@ -19,7 +19,12 @@ from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
-from maplab_py.storage import frames_from_messages, resources_from_messages, tables_from_messages
+from maplab_py.storage import (
+    frames_from_messages,
+    message_numbers,
+    resources_from_messages,
+    tables_from_messages,
+)
 from maplab_py.storage.checksums import verify
 from maplab_py.storage.file_parts import FileParts
 from maplab_py.storage.load_checks import (
@@ -174,7 +179,18 @@ def _load(
     """Return the map, the number of its files and their unpacked bytes, and notes."""
     files = listed_files(folder, budget.max_bytes)
     verify(folder, listed)
-    parts = _read_files(files, budget, progress)
+    with message_numbers.accept_bad_numbers() if repair else contextlib.nullcontext():
+        return _loaded(folder, files, budget, repair, progress)
+
+
+def _loaded(
+    folder: Path,
+    files: Sequence[tuple[FileKind, Path]],
+    budget: MemoryBudget,
+    repair: bool,
+    progress: Progress,
+) -> tuple[VIMap, int, int, list[str]]:
+    parts = _read_files(files, budget, progress, in_processes=not repair)
     check_empty_files(parts.facts)
     sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, budget.max_bytes)
     content = parts.content()
@@ -191,11 +207,15 @@ def _load(
 
 
 def _read_files(
-    files: Sequence[tuple[FileKind, Path]], budget: MemoryBudget, progress: Progress
+    files: Sequence[tuple[FileKind, Path]],
+    budget: MemoryBudget,
+    progress: Progress,
+    *,
+    in_processes: bool,
 ) -> FileParts:
     """Read all files; those of vertices in other processes where that saves time."""
     parts = FileParts()
-    with parts_ahead(files) as ahead:
+    with parts_ahead(files if in_processes else []) as ahead:
         if ahead is not None:
             ahead.start(budget)
             files = sorted(files, key=lambda file: file[0] is FileKind.VERTICES)  # others meanwhile

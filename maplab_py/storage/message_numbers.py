@@ -5,17 +5,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
+from maplab_py.vimap.consistency import LOADED_UNIT_TOLERANCE
 
 Name = Callable[[int], str]
 
-_UNIT_TOLERANCE = 1e-4
+_ACCEPTS_ALL: ContextVar[bool] = ContextVar("accepts all", default=False)
+
+
+@contextlib.contextmanager
+def accept_bad_numbers() -> Iterator[None]:
+    """Accept entries that are no numbers meanwhile; `number_repair` has to remove them."""
+    token = _ACCEPTS_ALL.set(True)
+    try:
+        yield
+    finally:
+        _ACCEPTS_ALL.reset(token)
 
 
 def rows(fields: Sequence[Any], width: int, where: str, name: Name) -> F64:
@@ -47,8 +60,10 @@ def finite(values: F64, where: str, name: Name) -> F64:
         MapError: A value is not finite.
     """
     bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
-    if len(bad):
-        raise MapError(f"{name(int(bad[0]))}: {where} has an entry that is not a number")
+    if len(bad) and not _ACCEPTS_ALL.get():
+        raise MapError(
+            f"{name(int(bad[0]))}: {where} has an entry that is not a number; load with --repair to drop it"
+        )
     return values
 
 
@@ -73,8 +88,8 @@ def check_poses(values: F64, where: str, name: Name) -> None:
     """
     finite(values, where, name)
     length = np.linalg.norm(values[:, :4], axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT_TOLERANCE)
-    if len(bad):
+    bad = np.flatnonzero(np.abs(length - 1.0) > LOADED_UNIT_TOLERANCE)
+    if len(bad) and not _ACCEPTS_ALL.get():
         raise MapError(
             f"{name(int(bad[0]))}: the quaternion of {where} has length {length[bad[0]]:.6g}, not 1"
         )

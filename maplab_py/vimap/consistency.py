@@ -17,6 +17,7 @@ from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import has_link, mission_sensor_id
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.tables import (
+    NO_ROW,
     MissionSensor,
     ResourceOwner,
     TransformationEdges,
@@ -27,6 +28,9 @@ from maplab_py.vimap.vi_map import VIMap
 _LISTED = 5
 """Ids that one violation names."""
 _UNIT_TOLERANCE = 1e-6
+_NO_ROOT = "mission without root vertex"
+LOADED_UNIT_TOLERANCE = 1e-4
+"""Largest deviation of a quaternion's length from 1 in a map that is loaded."""
 _MAX_TWICE_IN_FRAME = 5
 """maplab: a landmark seen more often in one frame is an error ..."""
 _MAX_SPREAD_PX = 75.0
@@ -126,6 +130,9 @@ def check_saved(vi_map: VIMap) -> list[Violation]:
     """Return the violations of a map in memory that would prevent loading it."""
     findings = _Findings()
     _check_references(vi_map, findings)
+    rootless = np.flatnonzero(vi_map.missions.root_vertex == NO_ROW)
+    if not np.isin(vi_map.vertices.mission, rootless).any():  # empty missions need none
+        findings.errors = [v for v in findings.errors if v.rule != _NO_ROOT]
     if findings.errors:
         return findings.errors
     _check_ids(vi_map, findings)
@@ -158,7 +165,7 @@ def _check_references(vi_map: VIMap, findings: _Findings) -> None:
 
     m, v, f = vi_map.missions, vi_map.vertices, vi_map.frames
     refer("mission without base frame", m.baseframe, len(vi_map.baseframes), m.id)
-    refer("mission without root vertex", m.root_vertex, vertices, m.id)
+    refer(_NO_ROOT, m.root_vertex, vertices, m.id)
     refer("vertex without mission", v.mission, len(m), v.id)
     refer("frame without vertex", f.vertex, vertices, f.id)
     refer(
@@ -229,10 +236,12 @@ def _check_numbers(vi_map: VIMap, findings: _Findings) -> None:
             )
             if name.startswith("T_"):
                 length = np.linalg.norm(values[:, :4], axis=1)
+                error = np.abs(length - 1.0)
                 findings.check(
                     f"{noun} whose {name} has a quaternion that is not of unit length",
-                    np.abs(length - 1.0) > _UNIT_TOLERANCE,
+                    error > _UNIT_TOLERANCE,
                     ids,
+                    refused=bool(np.any(error > LOADED_UNIT_TOLERANCE)),
                 )
     covariances: tuple[tuple[str, Any, NDArray[np.float64]], ...] = (
         ("base frame", vi_map.baseframes, vi_map.baseframes.T_G_M_covariance),

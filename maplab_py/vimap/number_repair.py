@@ -9,11 +9,20 @@ import numpy as np
 from maplab_py.array_types import Mask
 from maplab_py.geometry import se3
 from maplab_py.report import counted
+from maplab_py.vimap.consistency import LOADED_UNIT_TOLERANCE
 from maplab_py.vimap.edits import remove_landmarks, remove_missions, remove_vertices
 from maplab_py.vimap.keypoint_removal import remove_keypoints
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.vi_map import VIMap
 
+_POSES = {
+    "baseframes": "T_G_M",
+    "vertices": "T_M_I",
+    "transformation_edges": "T_A_B",
+    "loop_closure_edges": "T_A_B",
+    "absolute_poses": "T_G_S",
+}
+_DROPPED = "without finite numbers dropped"
 _STATE = ("v_M", "gyro_bias", "accel_bias")
 
 
@@ -27,23 +36,39 @@ def without_bad_numbers(vi_map: VIMap) -> tuple[VIMap, list[str]]:
 
     def note(bad: Mask, noun: str, done: str, plural: str = "") -> bool:
         if bad.any():
-            number = "it is no number" if bad.sum() == 1 else "they are no numbers"
-            notes.append(f"{counted(int(bad.sum()), noun, plural)} {done}: {number}")
+            notes.append(f"{counted(int(bad.sum()), noun, plural)} {done}")
         return bool(bad.any())
 
+    for field, name in _POSES.items():
+        table: Any = getattr(vi_map, field)
+        length = np.linalg.norm(table.columns()[name][:, :4], axis=1)
+        scaled = (
+            np.isfinite(length) & (length > 0.0) & (np.abs(length - 1.0) > LOADED_UNIT_TOLERANCE)
+        )
+        if note(
+            scaled,
+            f"quaternion of {field.replace('_', ' ')}",
+            "scaled to unit length",
+            f"quaternions of {field.replace('_', ' ')}",
+        ):
+            T = np.array(table.columns()[name])
+            T[scaled, :4] /= length[scaled, None]
+            vi_map = vi_map.replace(**{field: table.replace(**{name: T})})
     frames = vi_map.baseframes
     bad = _bad(frames, "T_G_M")
-    if note(bad, "base frame", "taken as unknown"):
+    if note(bad, "base frame", "without a finite pose taken as unknown"):
         T_G_M = np.where(bad[:, None], se3.identity(), frames.T_G_M)
         frames = frames.replace(T_G_M=T_G_M, is_known=frames.is_known & ~bad)
         vi_map = vi_map.replace(baseframes=frames)
     for name in _STATE:
         bad = _bad(vi_map.vertices, name)
-        if note(bad, f"vertex with {name}", "set to zero", f"vertices with {name}"):
+        if note(
+            bad, f"vertex with a {name}", "that is no number set to zero", f"vertices with a {name}"
+        ):
             values = np.where(bad[:, None], 0.0, getattr(vi_map.vertices, name))
             vi_map = vi_map.replace(vertices=vi_map.vertices.replace(**{name: values}))
     bad = _bad(vi_map.imu_samples, "accel_gyro")
-    if note(bad, "IMU sample", "dropped"):
+    if note(bad, "IMU sample", _DROPPED):
         edge = np.repeat(np.arange(len(vi_map.imu_edges)), vi_map.imu_edges.sample_count)
         count = np.bincount(edge[~bad], minlength=len(vi_map.imu_edges))
         count = count.astype(vi_map.imu_edges.sample_count.dtype)
@@ -57,18 +82,18 @@ def without_bad_numbers(vi_map: VIMap) -> tuple[VIMap, list[str]]:
         ("absolute_poses", "absolute pose", ("T_G_S",)),
     )
     for field, noun, names in edges:
-        table: Any = getattr(vi_map, field)
+        table = getattr(vi_map, field)
         bad = _bad(table, *names)
-        if note(bad, noun, "dropped"):
+        if note(bad, noun, _DROPPED):
             vi_map = vi_map.replace(**{field: table.take(~bad)})
     bad = _bad(vi_map.keypoints, "uv_px", "sigma_px", "scale")
-    if note(bad, "keypoint", "dropped"):
+    if note(bad, "keypoint", _DROPPED):
         vi_map = remove_keypoints(vi_map, bad)
     bad = _bad(vi_map.vertices, "T_M_I")
     stored = bad[vi_map.landmarks.vertex]
-    note(bad, "vertex", "dropped", "vertices")
+    note(bad, "vertex", _DROPPED, "vertices")
     bad = _bad(vi_map.landmarks, "p_I") | stored  # their place is relative to that of the vertex
-    note(bad, "landmark", "dropped")
+    note(bad, "landmark", _DROPPED)
     return _without_vertices(remove_landmarks(vi_map, bad)), notes
 
 

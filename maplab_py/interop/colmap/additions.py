@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import U8
+from maplab_py.array_types import F64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.colmap.database_reading import ColmapDatabase
+from maplab_py.interop.colmap.database_reading import SCALED, UNDISTORTED, ColmapDatabase
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.storage.new_resources import NewResources
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id
@@ -21,13 +22,14 @@ _MAX_IMAGE_BYTES = 1_000_000_000
 
 
 def with_features(
-    vi_map: VIMap, names: list[str], database: Path, *, progress: Progress = SILENT
-) -> VIMap:
-    """Return the map with the descriptors and scales of a database.
+    vi_map: VIMap, names: list[str], uv: F64, database: Path, *, progress: Progress = SILENT
+) -> tuple[VIMap, list[str]]:
+    """Return the map with the descriptors and scales of a database, and notes.
 
     Args:
         vi_map: Map.
         names: Name of the image of each frame (F).
+        uv: Keypoints (K, 2) as the model has them.
         database: COLMAP's database.
         progress: Is told about every image.
 
@@ -38,10 +40,10 @@ def with_features(
     store = ColmapDatabase(database)
     features = []
     try:
-        counts = vi_map.frames.keypoint_count.tolist()
-        for row, (name, count) in enumerate(zip(names, counts, strict=True)):
+        start = vi_map.keypoint_start.tolist()
+        for row, name in enumerate(names):
             progress.step(row, len(names), "descriptors")
-            features.append(store.features(name, count))
+            features.append(store.features(name, uv[start[row] : start[row + 1]]))
     finally:
         store.close()
     width = max((part.descriptor.shape[1] for part in features), default=0)
@@ -53,7 +55,12 @@ def with_features(
     frames = vi_map.frames.replace(descriptor_blocks=object_column(blocks))
     scale = np.concatenate([part.scale for part in features] or [np.zeros(0)])
     keypoints = vi_map.keypoints.replace(descriptor=descriptor, scale=scale)
-    return _with_landmark_types(vi_map.replace(frames=frames, keypoints=keypoints))
+    notes = [
+        f"the keypoints of {counted(count, 'image')} are {kind} against those of the database"
+        for kind in (SCALED, UNDISTORTED)
+        if (count := sum(part.agreement == kind for part in features))
+    ]
+    return _with_landmark_types(vi_map.replace(frames=frames, keypoints=keypoints)), notes
 
 
 def _with_landmark_types(vi_map: VIMap) -> VIMap:

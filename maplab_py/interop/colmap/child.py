@@ -14,6 +14,8 @@ import numpy as np
 
 BINARY, TEXT = "binary", "text"
 """Folders of models below the folder of a job."""
+SYSTEM = "system: "
+"""Begins the last line of a job that the disk refused."""
 
 
 def write_text(folder: Path) -> None:
@@ -122,9 +124,11 @@ def main(arguments: list[str]) -> int:
     name, folder = arguments
     try:
         JOBS[name](Path(folder))
+    except OSError as error:
+        sys.stderr.write(f"{SYSTEM}{error.strerror}\n")
+        return 1
     except Exception as error:  # noqa: BLE001  (pycolmap raises its own types)
-        lines = str(error).strip().splitlines()
-        sys.stderr.write((lines[0] if lines else type(error).__name__) + "\n")
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
         return 1
     return 0
 

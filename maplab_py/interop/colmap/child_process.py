@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,17 @@ from pathlib import Path
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError
 from maplab_py.interop.colmap.binary_writing import binary_files
-from maplab_py.interop.colmap.child import BINARY
+from maplab_py.interop.colmap.child import BINARY, SYSTEM
 from maplab_py.interop.colmap.model import ColmapModel
 
+logger = logging.getLogger(__name__)
+
+_FAILURES = {
+    "write_binary": "is damaged: a line of its text files is no record; copy or write the model again",
+    "write_text": "the model cannot be written as text: give --colmap_format=binary",
+    "undistort": "a camera of the model cannot be undistorted: let COLMAP undistort it (image_undistorter)",
+    "database": "the database cannot be written: leave out --colmap_database",
+}
 _POLL_S = 0.05
 _SILENT_END_S = 5.0
 
@@ -51,9 +60,13 @@ def run_job(job: str, folder: Path, source: Path) -> None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_POLL_S)
     if process.returncode:
-        lines = log.read_text(errors="replace").strip().splitlines()
-        reason = lines[-1] if lines else f"it ended with status {process.returncode}"
-        raise MapError(f"{source}: pycolmap cannot do {job}: {reason}")
+        text = log.read_text(errors="replace").strip()
+        logger.info(
+            "pycolmap cannot do %s of %s (status %d): %s", job, source, process.returncode, text
+        )
+        last = text.rpartition("\n")[2]
+        reason = last.removeprefix(SYSTEM) if last.startswith(SYSTEM) else _FAILURES[job]
+        raise MapError(f"{source}: {reason}")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -16,6 +16,12 @@ from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, Featur
 _SIFT, _UNDEFINED = 0, -1
 """COLMAP's numbers of feature types; `export_colmap` writes binary descriptors without type."""
 _SIFT_BYTES = 128
+SCALED, UNDISTORTED = "scaled", "undistorted"
+_SHARE = 0.99
+_LEAST_SCALED, _LEAST_UNDISTORTED = 6, 60
+"""Keypoints that tell a fit with 2 numbers an axis, or with 21, from chance."""
+_FEW_SHARE = 0.05
+"""Of the extent: how far half of too few keypoints for such a fit may lie apart."""
 _REMEDY = "copy it again, or import without --database"
 
 
@@ -26,6 +32,7 @@ class ImageFeatures:
     scale: F64  # (K,) [px]
     descriptor: U8  # (K, bytes), no columns where there are none
     block: DescriptorBlock | None
+    agreement: str = ""  # of the keypoints with those of the model: "", SCALED or UNDISTORTED
 
 
 class ColmapDatabase:
@@ -54,16 +61,17 @@ class ColmapDatabase:
         """Close the database."""
         self._connection.close()
 
-    def features(self, name: str, count: int) -> ImageFeatures:
+    def features(self, name: str, uv: F64) -> ImageFeatures:
         """Return the features of an image.
 
         Args:
             name: Name of the image.
-            count: Its keypoints in the model.
+            uv: Its keypoints (K, 2) in the model, in COLMAP's pixels.
 
         Raises:
-            MapError: The image is not there, has another number of keypoints, or is damaged.
+            MapError: The image is not there, has other keypoints, or is damaged.
         """
+        count = len(uv)
         image = self._id_of.get(name)
         if image is None:
             raise MapError(f"{self.path}: has no image {name}: name the database of this model")
@@ -74,7 +82,14 @@ class ColmapDatabase:
                 f"{self.path}: image {name} has {rows} keypoints, and {count} in the model: name the "
                 "database of this model"
             )
-        return ImageFeatures(_scales(values), *self._descriptors(image, count, name))
+        scale, kind = agreement(values[:, :2], uv)
+        if kind is None:
+            apart_px = float(np.median(np.linalg.norm(values[:, :2] - uv, axis=1)))
+            raise MapError(
+                f"{self.path}: the keypoints of image {name} are not those of the model (median distance "
+                f"{apart_px:.3g} px): it is of another extraction, name the database of this model"
+            )
+        return ImageFeatures(scale * _scales(values), *self._descriptors(image, count, name), kind)
 
     def _descriptors(self, image: int, count: int, name: str) -> tuple[U8, DescriptorBlock | None]:
         kind_column = "type" if self._has_types else str(_SIFT)
@@ -112,6 +127,42 @@ class ColmapDatabase:
 
     def _damaged(self, reason: str) -> MapError:
         return MapError(f"--database={self.path}: is damaged or no database: {reason}; {_REMEDY}")
+
+
+def agreement(database: F64, model: F64) -> tuple[float, str | None]:
+    """Return the ratio of sizes between keypoints (K, 2) of model and database, and how they agree.
+
+    None if they do not: pixels are the same, or scaled with the image, or a smooth function of each other,
+    as where COLMAP has undistorted the model.
+    """
+    if _is_same(database, model):
+        return 1.0, ""
+    centre, extent = database.mean(axis=0), np.maximum(np.ptp(database, axis=0), 1e-9)
+    x, y = ((database - centre) / extent).T
+    ones = np.ones(len(x))
+    if len(x) >= _LEAST_SCALED:
+        fits = [
+            np.linalg.lstsq(np.stack([ones, z], axis=1), m, rcond=None)[0]
+            for z, m in zip((x, y), model.T, strict=True)
+        ]
+        fitted = np.stack([fits[0][0] + fits[0][1] * x, fits[1][0] + fits[1][1] * y], axis=1)
+        ratio = np.array([fits[0][1], fits[1][1]]) / extent
+        if (ratio > 0.0).all() and _is_same(fitted, model, max(1.0, float(ratio.max()))):
+            return float(np.sqrt(ratio.prod())), SCALED
+    if len(x) >= _LEAST_UNDISTORTED:
+        powers = [x**i * y**j for i in range(6) for j in range(6 - i)]
+        basis = np.stack(powers, axis=1)
+        weights, *_ = np.linalg.lstsq(basis, model, rcond=None)
+        if _is_same(basis @ weights, model, 2.0):
+            return 1.0, UNDISTORTED
+    elif _is_same(database, model, _FEW_SHARE * float(np.linalg.norm(extent)), 0.5):
+        return 1.0, UNDISTORTED
+    return 1.0, None
+
+
+def _is_same(a: F64, b: F64, tolerance_px: float = 1.0, share: float = _SHARE) -> bool:
+    apart = np.linalg.norm(a - b, axis=1)
+    return len(apart) == 0 or float(np.mean(apart <= tolerance_px)) >= share
 
 
 def _scales(values: F64) -> F64:

@@ -17,7 +17,12 @@ from maplab_py.interop.colmap.image_times import image_times
 from maplab_py.interop.colmap.model import ColmapModel
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
 from maplab_py.interop.colmap.perspective import perspective_model
-from maplab_py.interop.colmap.placing import Placing, place_by_flags, place_by_trajectory
+from maplab_py.interop.colmap.placing import (
+    Placing,
+    place_by_flags,
+    place_by_trajectory,
+    with_poses,
+)
 from maplab_py.interop.colmap.reading import read_model
 from maplab_py.interop.colmap.side_file import SideFile
 from maplab_py.interop.colmap.to_map import BodyFrames, body_frames, map_of_model, side_images
@@ -45,7 +50,8 @@ def import_colmap(
     options = options or ColmapImportOptions()
     if options.align_to and (options.scale or options.gravity):
         raise UserError("--align_to gives scale and gravity: leave --scale and --gravity out")
-    model = read_model(folder)
+    model, differing = with_poses(read_model(folder), options.colmap_poses)
+    notes, recorded_uv = [differing] if differing else [], model.images.uv
     if options.undistort and not all(has_model(camera) for camera in model.cameras):
         if options.images:
             raise UserError(
@@ -73,7 +79,9 @@ def import_colmap(
     vi_map, attached = imported.vi_map, 0
     names = [model.images.name[row] for row in imported.images.tolist()]
     if database is not None:
-        vi_map = with_features(vi_map, names, database, progress=progress)
+        uv = recorded_uv[imported.keypoints]
+        vi_map, said = with_features(vi_map, names, uv, database, progress=progress)
+        notes += said
     if options.images:
         vi_map, attached = with_images(
             vi_map, names, Path(options.images), link=options.link_images, progress=progress
@@ -90,7 +98,7 @@ def import_colmap(
         scale=placing.scale,
         aligned_vertices=placing.matched,
         alignment_rmse_m=placing.rmse_m if placing.matched else None,
-        notes=_notes(vi_map, side),
+        notes=(*notes, *_notes(vi_map, side)),
     )
 
 

@@ -82,6 +82,11 @@ class ColmapImportOptions:
     undistort: bool = option(
         False, help="Import cameras that maplab has no model of as perspective cameras"
     )
+    colmap_poses: str = option(
+        "",
+        help="Poses that hold where images differ from rigs and frames; empty = the images, with a note",
+        choices=("", "images", "frames"),
+    )
     images: str = option("", help="Folder of the images, which become resources; empty = none")
     link_images: bool = option(
         False, help="Refer to the images by symbolic links instead of copying them"

@@ -11,8 +11,12 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.interop.colmap.model import ColmapModel, SensorType
 from maplab_py.interop.trajectories import Trajectory
+from maplab_py.report import counted
 
+_SAME_RAD, _SAME_SHARE = 2e-4, 1e-4
+"""Differences between poses that rounded text makes; of positions: share of their spread."""
 _LONGEST_GAP_NS = 500_000_000
 _MIN_MATCHED = 3
 _LEVER_ROUNDS = 10
@@ -28,6 +32,49 @@ class Placing:
     is_metric: bool  # scale and gravity are known
     matched: int = 0  # vertices that the trajectory has
     rmse_m: float = float("nan")  # of their positions after the alignment
+
+
+def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
+    """Return the model with the poses of frames that hold, and a clause on what differs.
+
+    Args:
+        model: Model, whose images and whose frames with their rigs both have poses.
+        choice: images, frames, or empty = the images that differ from what rigs and frames say.
+    """
+    images, frames = model.images, model.frames
+    of_camera = {
+        number: (row, pose)
+        for rig in model.rigs
+        for row, ((kind, number), pose) in enumerate(zip(rig.sensors, rig.T_S_R, strict=True))
+        if kind == SensorType.CAMERA
+    }
+    sensor = np.array([of_camera[camera][0] for camera in images.camera.tolist()], dtype=np.int64)
+    T_S_R = np.array([of_camera[camera][1] for camera in images.camera.tolist()]).reshape(-1, 7)
+    order = np.argsort(frames.image_id, kind="stable")
+    frame = frames.image_frame[order][np.searchsorted(frames.image_id[order], images.id)]
+    T_R_W = se3.compose(se3.inverse(T_S_R), images.T_C_W)
+    apart = se3.local(frames.T_R_W[frame], T_R_W)
+    turned, moved = (np.linalg.norm(apart[:, k : k + 3], axis=1) for k in (3, 0))
+    spread = float(np.sqrt(np.sum(np.var(frames.T_R_W[:, 4:], axis=0))))
+    differs = (turned > _SAME_RAD) | (moved > _SAME_SHARE * max(spread, 1.0))
+    if not differs.any():
+        return model, ""
+    said = (
+        f"the poses of {counted(int(differs.sum()), 'image')} differ from those of rigs and frames by up to "
+        f"{np.degrees(turned[differs].max()):.3g} deg and {moved[differs].max():.3g} units"
+    )
+    if choice == "frames":
+        return model, f"{said}: those of the frames are taken"
+    known = np.isfinite(T_R_W).all(axis=1) & (differs | (choice == "images"))
+    rows = np.flatnonzero(known)
+    rows = rows[np.lexsort((sensor[rows], frame[rows]))]
+    changed, first = np.unique(frame[rows], return_index=True)
+    poses = frames.T_R_W.copy()
+    poses[changed] = T_R_W[rows[first]]
+    said += ": those of the images are taken"
+    if not choice:
+        said += ", --colmap_poses=frames takes the others"
+    return dataclasses.replace(model, frames=dataclasses.replace(frames, T_R_W=poses)), said
 
 
 def place_by_trajectory(times_ns: I64, T_W_R: F64, T_R_I: F64, trajectory: Trajectory) -> Placing:

@@ -1,20 +1,25 @@
-"""Read the model of a folder, in either format."""
+"""Read the model of a folder, in either format, and check the references within it."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
+import struct
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.colmap.binary_reading import REMEDY, read_binary
-from maplab_py.interop.colmap.checking import check_model
 from maplab_py.interop.colmap.child import BINARY, TEXT
 from maplab_py.interop.colmap.child_process import run_job
-from maplab_py.interop.colmap.model import FILES, ColmapModel
+from maplab_py.interop.colmap.model import FILES, NO_POINT, ColmapModel, SensorType
 
 _ANNOUNCED = re.compile(r"# Number of \w+: (\d+)")
 _HEADER_BYTES = 4096
+_NEEDED = ("cameras", "images", "points3D")
 
 
 def read_model(folder: Path) -> ColmapModel:
@@ -31,33 +36,83 @@ def read_model(folder: Path) -> ColmapModel:
     elif (folder / "images.txt").exists():
         model = _read_text(folder)
     else:
-        inner = sorted(path.parent.name for path in folder.glob("*/images.bin"))
-        hint = f"; it has models in {', '.join(inner)}" if inner else ""
         raise UserError(
-            f"--colmap_folder={folder}: has no COLMAP model (cameras, images, points3D as .bin or .txt){hint}"
+            f"--colmap_folder={folder}: has no COLMAP model (cameras, images, points3D as .bin or .txt)"
+            f"{_models_below(folder)}"
         )
     check_model(model, folder)
     return model
 
 
+def _models_below(folder: Path) -> str:
+    """Return a clause on the models in folders below, with what they have; empty without any."""
+    below = [path for path in (*folder.glob("*"), *folder.glob("sparse/*")) if path.is_dir()]
+    models: list[tuple[int, str]] = []
+    for path in sorted(below):
+        suffixes = [
+            s for s in (".bin", ".txt") if any((path / f"{kind}{s}").is_file() for kind in _NEEDED)
+        ]
+        if not suffixes:
+            continue
+        name, suffix = path.relative_to(folder).as_posix(), suffixes[0]
+        missing = [
+            f"{kind}{suffix}" for kind in _NEEDED if not (path / f"{kind}{suffix}").is_file()
+        ]
+        counts = [_count(path / f"{kind}{suffix}") for kind in ("images", "points3D")]
+        said = (
+            f"incomplete: no {', '.join(missing)}"
+            if missing
+            else f"{counts[0]} images, {counts[1]} points"
+        )
+        images = 0 if missing or counts[0] == "?" else int(counts[0])
+        models.append((images, f"{name} ({said})"))
+    if not models:
+        return ""
+    models.sort(key=lambda model: -model[0])
+    largest = f"; the largest is {folder / models[0][1].split(' (')[0]}" if models[0][0] else ""
+    return f"; it has models in {', '.join(text for _, text in models)}{largest}"
+
+
+def _count(path: Path) -> str:
+    """Return the number of records that a file announces, ? where it does not."""
+    try:
+        if path.suffix == ".txt":
+            announced = _announced(path)
+            return "?" if announced is None else str(announced)
+        with path.open("rb") as stream:
+            return str(*struct.unpack("<Q", stream.read(8)))
+    except (OSError, struct.error):
+        return "?"
+
+
 def _read_text(folder: Path) -> ColmapModel:
-    """Let pycolmap convert the text, and compare the result with what the files announce."""
+    """Let pycolmap convert the text, and compare the result with what the files announce.
+
+    Names and poses of images are read here: pycolmap cuts names at blanks, and takes poses from the frames.
+    """
+    for kind in _NEEDED:
+        path = folder / f"{kind}.txt"
+        if not path.is_file():
+            raise MapError(f"cannot read {path}: it is not there; {REMEDY}")
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
         (work / TEXT).mkdir()
         for kind in FILES:
             path = folder / f"{kind}.txt"
-            if path.is_file():
+            if kind != "images" and path.is_file():
                 (work / TEXT / path.name).symlink_to(path.resolve())
-            elif kind not in ("rigs", "frames"):
-                raise MapError(f"cannot read {path}: it is not there; {REMEDY}")
+        names, poses = _text_images(folder / "images.txt", work / TEXT / "images.txt")
         run_job("write_binary", work, folder)
         model = read_binary(work / BINARY)
+    images = model.images
+    ids = images.id.tolist()
+    T_C_W = np.array([poses[number] for number in ids]).reshape(-1, 7)
+    images = dataclasses.replace(images, name=tuple(names[number] for number in ids), T_C_W=T_C_W)
     counts = {
         "cameras": len(model.cameras),
         "rigs": len(model.rigs),
         "frames": len(model.frames.id),
-        "images": len(model.images.id),
+        "images": len(images.id),
         "points3D": len(model.points.id),
     }
     for kind, count in counts.items():
@@ -67,7 +122,41 @@ def _read_text(folder: Path) -> ColmapModel:
             raise MapError(
                 f"{path}: is damaged: it announces {wanted} records and has {count}; {REMEDY}"
             )
-    return model
+    return dataclasses.replace(model, images=images)
+
+
+def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]]:
+    """Return names and poses T_C_W (7,) by the ids of images, and write a copy with names without blanks.
+
+    Raises:
+        MapError: A line is no image; names it.
+    """
+    names: dict[int, str] = {}
+    poses: dict[int, F64] = {}
+    try:
+        with path.open(encoding="utf-8") as stream, copy.open("w", encoding="utf-8") as target:
+            for number, line in enumerate(stream, start=1):
+                words = line.split(maxsplit=9)
+                if not words or words[0].startswith("#"):
+                    continue
+                try:
+                    image, values = int(words[0]), np.array(words[1:8], dtype=np.float64)
+                    name = words[9].strip()
+                except (ValueError, IndexError):
+                    raise MapError(
+                        f"{path}:{number}: is no image: wants IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+                    ) from None
+                length = np.linalg.norm(values[:4])
+                if not np.isfinite(values).all() or length == 0.0:
+                    raise MapError(f"{path}:{number}: the pose of image {image} is none; {REMEDY}")
+                names[image] = name
+                poses[image] = np.concatenate([values[[1, 2, 3, 0]] / length, values[4:]])
+                target.write(" ".join(words[:9]) + f" {image}\n" + next(stream, "\n"))
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path}: is damaged: it is not UTF-8 text; {REMEDY}") from error
+    return names, poses
 
 
 def _announced(path: Path) -> int | None:
@@ -77,3 +166,54 @@ def _announced(path: Path) -> int | None:
     with path.open("rb") as stream:
         match = _ANNOUNCED.search(stream.read(_HEADER_BYTES).decode("utf-8", errors="replace"))
     return int(match[1]) if match else None
+
+
+def check_model(model: ColmapModel, source: Path) -> None:
+    """Check that ids are unique, that what is named exists, and that there are images.
+
+    Raises:
+        MapError: A check fails; names the source and the id.
+    """
+    images, frames, points = model.images, model.frames, model.points
+    if not len(images.id):
+        raise MapError(f"{source}: the model has no images with a pose: nothing can be imported")
+    cameras = np.array([camera.id for camera in model.cameras], dtype=np.int64)
+    rigs = np.array([rig.id for rig in model.rigs], dtype=np.int64)
+    sensors = np.array(
+        [number for rig in model.rigs for kind, number in rig.sensors if kind == SensorType.CAMERA],
+        dtype=np.int64,
+    )
+    for noun, ids in (
+        ("camera", cameras),
+        ("rig", rigs),
+        ("camera in a rig", sensors),
+        ("frame", frames.id),
+        ("image", images.id),
+        ("image in a frame", frames.image_id),
+        ("point", points.id),
+    ):
+        values, counts = np.unique(ids, return_counts=True)
+        _refuse(source, f"{noun} {{}} is there twice", values, counts > 1)
+    names, counts = np.unique(np.array(images.name), return_counts=True)
+    if np.any(counts > 1):
+        raise MapError(
+            f"{source}: two images are called '{names[counts > 1][0]}': give each its own name"
+        )
+    _known(source, "an image names camera {}", images.camera, cameras)
+    _known(source, "a frame names rig {}", frames.rig, rigs)
+    _known(source, "no frame has image {}", images.id, frames.image_id)
+    _known(source, "no rig has camera {}", images.camera, sensors)
+    observed = images.point[images.point != NO_POINT]
+    _known(source, "a keypoint names point {}", observed, points.id)
+
+
+def _known(source: Path, sentence: str, named: I64, known: I64) -> None:
+    _refuse(source, f"{sentence}, which is not there", named, ~np.isin(named, known))
+
+
+def _refuse(source: Path, sentence: str, ids: I64, wrong: Mask) -> None:
+    if np.any(wrong):
+        text = sentence.format(int(ids[wrong][0]))
+        if text.startswith("no "):
+            text = text.removesuffix(", which is not there")
+        raise MapError(f"{source}: is damaged: {text}; {REMEDY}")
