@@ -37,6 +37,15 @@ class TextTable:
     has_commas: bool
     note: str = ""  # one line on the unit, where it was concluded against header or custom
 
+    def take(self, rows: NDArray[np.bool_]) -> TextTable:
+        """Return some of the rows."""
+        return dataclasses.replace(
+            self,
+            times_ns=self.times_ns[rows],
+            values=self.values[rows],
+            line_numbers=self.line_numbers[rows],
+        )
+
     @property
     def is_nanoseconds(self) -> bool:
         """The file's time stamps were nanoseconds."""
@@ -193,7 +202,23 @@ def _named_cells(
     about = [line for line in others if re.search(r"time|stamp", line.lower())]
     telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
     names = (re.sub(r"[\[(].*?[\])]", "", word).strip(" \t\"'").lower() for word in chosen)
-    return tuple(names), telling[0] if telling else "", [cells(line) for line in lines]
+    header, rows = tuple(names), [cells(line) for line in lines]
+    place = _time_place(header) if fitting and not timed and "," in lines[0] else 0
+    if place:  # the stamp comes first
+        about = [chosen[place], *about]
+        telling = [name for name in about if header_unit(name)]
+        rows = [
+            [row[place], *row[:place], *row[place + 1 :]] if len(row) > place else row
+            for row in rows
+        ]
+        header = (header[place], *header[:place], *header[place + 1 :])
+    return header, telling[0] if telling else "", rows
+
+
+def _time_place(header: tuple[str, ...]) -> int:
+    """Return the only column whose name says that it has time stamps, 0 if none or several do."""
+    places = [place for place, name in enumerate(header) if re.search(r"time|stamp", name)]
+    return places[0] if len(places) == 1 else 0
 
 
 def _numeric(header: tuple[str, ...], rows: list[list[str]]) -> list[int]:

@@ -48,7 +48,9 @@ _NAME = re.compile(
 _TURN = re.compile(r"^q|quat|orient|rotation")
 _EUROC_ORDER = ("px", "py", "pz", "qw", "qx", "qy", "qz")
 _EUROC_STATE = ("vx", "vy", "vz", *(f"b_g{i}" for i in "xyz"), *(f"b_a{i}" for i in "xyz"))
-_M_AND_G = frozenset(f"{kind}_{frame}_i{axis}" for kind in "pq" for frame in "mg" for axis in "xyz")
+_VERTEX_TABLE, _IN_M = "p_m_ix", ("q_m_i{}", "q_mi_{}")
+LOCALIZED = "is_localized"
+"""Column of rovioli's poses in a map: 0 where the frame was not localised and has no pose."""
 _TUM_ORDER = ("px", "py", "pz", "qx", "qy", "qz", "qw")
 _EUROC_HEADER = (
     "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
@@ -108,6 +110,8 @@ def read_trajectory(
             are positions only and `needs_orientation` is set; names file and line.
     """
     table = read_text_table(path, POSES, unit=time_unit)
+    if LOCALIZED in table.header:
+        table = table.take(table.values[:, table.header.index(LOCALIZED) - 1] > 0.0)
     trajectory = trajectory_of_table(table, keep_repeated=keep_repeated)[0]
     if needs_orientation and not trajectory.has_orientation:
         raise MapError(
@@ -132,10 +136,15 @@ def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tup
         q = q / norm[:, None]
     rows = np.arange(len(p))
     v_R = _optional(table, names, "v")
-    if set(table.header) >= _M_AND_G:  # the program's own table of missions one after the other
+    if _VERTEX_TABLE in table.header:  # the program's own table, of missions one after the other
         rows = np.argsort(table.times_ns, kind="stable")
-        q_M = table.values[:, [table.header.index(f"q_m_i{i}") - 1 for i in "xyzw"]]
-        v_R = None if v_R is None else so3.rotate(so3.multiply(q, so3.inverse(q_M)), v_R)
+    in_M = [
+        [table.header.index(name.format(i)) - 1 for i in "xyzw"]
+        for name in _IN_M
+        if name.format("w") in table.header
+    ]
+    if in_M and v_R is not None:  # poses are in G and velocities in M
+        v_R = so3.rotate(so3.multiply(q, so3.inverse(table.values[:, in_M[0]])), v_R)
     backwards = np.diff(table.times_ns[rows], prepend=table.times_ns[rows[0]]) < 0
     _refuse(table, backwards, "the time stamp lies before that of the row above")
     trajectory = Trajectory(

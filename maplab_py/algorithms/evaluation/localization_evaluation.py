@@ -14,12 +14,11 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.text_table import read_text_table
-from maplab_py.interop.trajectories import Trajectory, trajectory_of_table
+from maplab_py.interop.trajectories import LOCALIZED, Trajectory, trajectory_of_table
 from maplab_py.vimap import VIMap
 
 _MAX_GAP_NS = 500_000_000
 _MIN_PAIRS = 3
-_FLAG_COLUMN = "is_localized"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,8 +41,8 @@ def read_localized(path: Path) -> LocalizedTrajectory:
     table = read_text_table(path)
     trajectory, rows = trajectory_of_table(table)
     is_localized = np.ones(len(trajectory), dtype=np.bool_)
-    if _FLAG_COLUMN in table.header:
-        is_localized = table.values[rows, table.header.index(_FLAG_COLUMN) - 1] > 0.0
+    if LOCALIZED in table.header:
+        is_localized = table.values[rows, table.header.index(LOCALIZED) - 1] > 0.0
     return LocalizedTrajectory(
         str(path),
         trajectory.times_ns,
