@@ -144,6 +144,10 @@ class MapBuilder:
         vi_map = mission_map(self._device, part, self._images)
         return init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)[0]
 
+    def forget_before(self, mission: int, first: int) -> None:
+        """Remove the vertices of a mission before a row; they are elsewhere."""
+        self._missions[mission].forget_before(first)
+
     def count(self, mission: int) -> int:
         """Return the number of vertices of a mission."""
         return len(self._missions[mission])

@@ -87,6 +87,13 @@ class RecordedMission:
         self._samples = []
         self._row_of_time = {t: row for t, row in self._row_of_time.items() if row < kept}
 
+    def forget_before(self, first: int) -> None:
+        """Remove the vertices before a row, with the samples up to it."""
+        for column in (self.states, self.frames, self.image_rows):
+            del column[:first]
+        del self.edges[:first]
+        self._row_of_time = {int(s.times_ns[0]): row for row, s in enumerate(self.states)}
+
     def part(self, first: int) -> RecordedMission:
         """Return the vertices from a row on, with the samples between them."""
         result = RecordedMission()

@@ -21,18 +21,24 @@ class SubmapWriter:
     """Observes a run and pushes the map in parts; neighbouring parts share a vertex.
 
     The states of a part are those that the odometry has when it is pushed. The vertices of a mission that
-    was given up after a failure of the odometry are not pushed any more.
+    was given up after a failure of the odometry are not pushed any more. On runs of hours the map's memory is
+    bounded: what was pushed is removed from it.
 
     Attributes:
         pushed: How many parts were pushed.
         is_whole: No vertices were left out.
     """
 
-    def __init__(self, output: SubmapOutput) -> None:
-        """Prepare; the spool is made at the first part."""
+    def __init__(self, output: SubmapOutput, *, forgets: bool = False) -> None:
+        """Prepare; the spool is made at the first part.
+
+        Args:
+            output: Where parts go, and how long they are.
+            forgets: Remove the vertices of a part from the map of the run when it is pushed.
+        """
         assert output.submap_spool is not None
         self.pushed, self.is_whole = 0, True
-        self._spool, self._output = Spool(output.submap_spool), output
+        self._spool, self._output, self._forgets = Spool(output.submap_spool), output, forgets
         self._mission, self._first, self._begin_ns = -1, 0, 0
         self._start_ns = 0
 
@@ -51,6 +57,10 @@ class SubmapWriter:
             builder.refine(mapping.odometry.window_states())
             self._push(mapping)
             self._begin_ns = update.time_ns
+            if self._forgets and self._first > 1:
+                # two vertices stay, so that there is always a map
+                builder.forget_before(self._mission, self._first - 1)
+                self._first = 1
 
     def finish(self, mapping: Mapping) -> None:
         """Push what is left at the end of a run."""

@@ -104,7 +104,10 @@ def rovioli(
     observers: list[Observer] = []
     if rovioli_visualize_map:
         observers.append(_observer(context, key, map_publish_interval_s))
-    writer = SubmapWriter(submaps) if submaps.submap_spool is not None else None
+    writer = None
+    if submaps.submap_spool is not None:
+        # runs of hours: the map is at the server, and what is there need not stay in memory
+        writer = SubmapWriter(submaps, forgets=data.type in TRANSPORTS and folder is None)
     if writer is not None:
         observers.append(writer)
     with contextlib.ExitStack() as stack:

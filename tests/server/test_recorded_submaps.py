@@ -10,6 +10,10 @@ import pytest
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError
+from maplab_py.frontend.data_source import open_source
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
+from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.server.options import SubmapOutput
 from maplab_py.server.recorded_submaps import SubmapWriter
 from maplab_py.storage.native import find_maps, load_map, save_map
@@ -60,3 +64,28 @@ def test_vertices_of_a_mission_that_was_given_up_are_missing(tmp_path: Path) -> 
     builder.missions = 2
     writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
     assert not writer.is_whole
+
+
+def test_what_was_pushed_leaves_the_memory(tmp_path: Path) -> None:
+    walk = tmp_path / "walk"
+    save_map(replayed(REST_FIRST, 1)[0], walk)
+    parts, left = [], []
+    for forgets in (False, True):
+        spool = tmp_path / f"spool_{forgets}"
+        recording = open_source(walk, DataSourceOptions(), SourceOptions())
+        writer = SubmapWriter(
+            SubmapOutput(submap_spool=spool, submap_interval_s=3.0), forgets=forgets
+        )
+        mapping = Mapping(recording, RunOptions(), observer=writer)
+        mapping.run()
+        writer.finish(mapping)
+        assert mapping.builder is not None
+        left.append(mapping.builder.count(0))
+        folders = find_maps(spool / "incoming" / "robot")
+        parts.append([load_map(folder)[0].vertices for folder in folders])
+    whole, rest = parts
+    assert left[1] < left[0] / 2
+    assert len(whole) == len(rest) >= 3
+    for one, other in zip(whole, rest, strict=True):
+        assert np.array_equal(one.timestamp_ns, other.timestamp_ns)
+        assert np.array_equal(one.T_M_I, other.T_M_I)
