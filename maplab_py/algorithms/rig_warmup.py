@@ -12,10 +12,8 @@ import numpy as np
 from maplab_py.algorithms.vi_optimization.calibration_states import rig_cameras
 from maplab_py.compilation import is_missing_on_disk
 from maplab_py.estimation.codegen.kernels import (
-    CameraModel,
     residual_kernel,
     visual_kernels,
-    visual_module_name,
 )
 from maplab_py.estimation.codegen.modules import is_generated
 from maplab_py.estimation.imu import preintegration
@@ -40,7 +38,7 @@ _SHARED: dict[str, tuple[Callable[[], None], Callable[..., Any]]] = {
 class RigKernels:
     """The kernels for some camera models, with the models in the order of `rig_cameras`."""
 
-    models: tuple[CameraModel, ...]
+    models: tuple[tuple[Projection, Distortion], ...]
     moving: bool  # images have a delay, or rows are read one after the other
 
     @classmethod
@@ -67,9 +65,7 @@ class RigKernels:
 
     def jobs(self) -> dict[str, Callable[[], None]]:
         """Return by name what compiles the kernels, in the order in which it is started."""
-        reprojection = partial(
-            visual.compile_kernels, self.models, calibrating=False, moving=self.moving
-        )
+        reprojection = partial(visual.compile_kernels)
         return {
             REPROJECTION: reprojection,
             INERTIAL: lambda: residual_kernel(INERTIAL, sources.inertial).compile_kernel(),
@@ -81,10 +77,10 @@ class RigKernels:
         if not self.models:
             return ()
         missing = {name for name, (_, kernel) in _SHARED.items() if is_missing_on_disk(kernel)}
-        if not is_generated(visual_module_name(self.models)):
+        if not is_generated("visual"):
             missing.add(REPROJECTION)
         else:
-            kernels = visual_kernels(self.models)
+            kernels = visual_kernels()
             wanted = [kernels.evaluate, *([kernels.pixel_motion] if self.moving else [])]
             if any(is_missing_on_disk(kernel) for kernel in wanted):
                 missing.add(REPROJECTION)

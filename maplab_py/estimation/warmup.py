@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from maplab_py.estimation.codegen.kernels import CameraModel, residual_kernel
+from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu import preintegration
 from maplab_py.estimation.linear import block_cholesky
 from maplab_py.estimation.problem import iterative
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.terms import factor, visual
-from maplab_py.sensors.camera import CAMERA_MODELS, is_known_to_maplab
 
 _RESIDUALS = (
     "inertial",
@@ -36,12 +35,7 @@ def optimizer_jobs() -> dict[str, Callable[[], None]]:
     jobs["block Cholesky"] = block_cholesky.compile_kernels
     jobs["conjugate gradients"] = iterative.compile_without_images
     jobs["preintegration"] = preintegration.compile_kernels
-    for projection, distortion in filter(lambda model: is_known_to_maplab(*model), CAMERA_MODELS):
-        model = f"{projection.name} {distortion.name}"
-        models = ((projection, distortion),)
-        jobs[f"reprojection {model}"] = partial(_compile_reprojection, models)
-        calibration = partial(visual.compile_kernels, models, calibrating=True)
-        jobs[f"camera calibration {model}"] = calibration
+    jobs["reprojection"] = _compile_reprojection
     return jobs
 
 
@@ -49,6 +43,6 @@ def _compile_residual(name: str) -> None:
     residual_kernel(name, getattr(sources, name)).compile_kernel()
 
 
-def _compile_reprojection(models: tuple[CameraModel, ...]) -> None:
-    visual.compile_kernels(models, calibrating=False)
-    iterative.compile_kernels(models)
+def _compile_reprojection() -> None:
+    visual.compile_kernels()
+    iterative.compile_kernels()

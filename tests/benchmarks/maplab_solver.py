@@ -20,7 +20,7 @@ from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT
-from maplab_py.sensors import Distortion, Imu, Projection
+from maplab_py.sensors import Imu
 from tests.benchmarks.problems import (
     CENTRE_PX,
     F64,
@@ -118,7 +118,7 @@ def _observations(problem: VisualProblem) -> Observations:
 
 
 def _visual_terms(problem: VisualProblem, observed: Observations) -> VisualTerms:
-    kernels = visual_kernels(((Projection.PINHOLE, Distortion.NONE),))
+    kernels = visual_kernels()
     parameters = np.array([[0.0, FOCAL_PX, FOCAL_PX, *CENTRE_PX]])
     cameras = Cameras(se3.identity(1), parameters)
     return VisualTerms(kernels, observed, cameras, len(problem.T_G_I), loss=Loss.NONE)

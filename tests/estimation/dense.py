@@ -67,3 +67,21 @@ def system_matrix(problem: Problem, linear: Linearization, damping: float) -> F6
     matrix = np.tril(matrix) + np.tril(matrix, -1).T
     clipped = np.clip(linear.diagonal, 1e-6, 1e32).reshape(-1)
     return np.asarray(matrix + damping * np.diag(clipped))
+
+
+def assert_relative(jacobian: F64, wanted: F64) -> None:
+    """Compare to 1e-6 of the largest entry of each row."""
+    size = np.abs(wanted).max(axis=1, keepdims=True)
+    assert np.all(np.abs(jacobian - wanted) <= 1e-6 * size)
+
+
+def differences(function: Callable[[F64], F64], count: int) -> F64:
+    """Return the Jacobian by central differences of fourth order."""
+    columns = []
+    for k in range(count):
+        d = np.zeros(count)
+        d[k] = 1e-3
+        columns.append(
+            (8 * (function(d) - function(-d)) - function(2 * d) + function(-2 * d)) / 0.012
+        )
+    return np.stack(columns, axis=1)

@@ -15,7 +15,6 @@ from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.terms.visual import NodeSystem, Observations, VisualTerms
 from maplab_py.geometry import se3
-from maplab_py.sensors import Distortion, Projection
 
 SCALE = 1.7
 RESIDUALS = np.array([0.0, 1e-3, 0.3, 1.0, 1.69999, 1.70001, 2.5, 10.0, 300.0])
@@ -129,5 +128,5 @@ def one_landmark_each(loss: Loss) -> VisualTerms:
         loss_scale=np.full(count, SCALE),
     )
     cameras = Cameras(se3.identity(1), np.array([[0.0, 50.0, 50.0, 50.0, 50.0]]))
-    kernels = visual_kernels(((Projection.PINHOLE, Distortion.NONE),))
+    kernels = visual_kernels()
     return VisualTerms(kernels, observations, cameras, count, loss=loss, move_points=False)

@@ -159,27 +159,16 @@ def dense_problem(
     )
     visual = None
     if include_visual:
-        models = tuple(dict.fromkeys((c.projection, c.distortion) for c in rig.cameras))
         visual = VisualTerms(
-            visual_kernels(models),
+            visual_kernels(),
             observations,
-            Cameras(rig.T_B_C, _parameters(rig)),
+            Cameras.of(rig.cameras, rig.T_B_C),
             len(vi_map.vertices),
             loss=loss,
             move_points=move_points,
         )
     factors = _inertial(vi_map, imu) if include_inertial else []
     return DenseProblem(rig, observations, visual, factors, states)
-
-
-def _parameters(rig: CameraRig) -> F64:
-    models = list(dict.fromkeys((c.projection, c.distortion) for c in rig.cameras))
-    rows = [
-        [models.index((c.projection, c.distortion)), *c.intrinsics, *c.distortion_parameters]
-        for c in rig.cameras
-    ]
-    widest = max(len(row) for row in rows)
-    return np.array([[*row, *[0.0] * (widest - len(row))] for row in rows])
 
 
 def _inertial(vi_map: VIMap, imu: Imu) -> list[FactorTerm]:

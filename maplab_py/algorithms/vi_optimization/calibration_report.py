@@ -14,8 +14,7 @@ from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATION
 from maplab_py.estimation.terms.pose import MOUNTING
 from maplab_py.estimation.terms.wheel import WHEEL_SCALE
-from maplab_py.sensors import Projection
-from maplab_py.sensors.camera import DISTORTION_NAMES
+from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 
 _MATRIX = ["[0,0]", "[1,1]", "[2,2]", "[0,1]", "[0,2]", "[1,2]"]
 _ROTATION = ["rotation x [rad]", "rotation y [rad]", "rotation z [rad]"]
@@ -81,12 +80,9 @@ def parameter_names(map_problem: MapProblem, block: ParameterBlock) -> list[list
     assert map_problem.rig is not None
     names = []
     for row in range(len(block)):
-        projection, distortion = map_problem.rig.models[
-            int(map_problem.rig.cameras.parameters[row, 0])
-        ]
-        camera_names = ["fu [px]", "fv [px]", "cu [px]", "cv [px]"]
-        camera_names = ["xi", *camera_names] if projection is Projection.UNIFIED else camera_names
-        names.append([*camera_names, *DISTORTION_NAMES[distortion]])
+        projection, distortion = map_problem.rig.models[row]
+        pinhole = ["fu [px]", "fv [px]", "cu [px]", "cv [px]"]
+        names.append([*MIRROR_NAMES[projection], *pinhole, *DISTORTION_NAMES[distortion]])
     return names
 
 

@@ -8,14 +8,13 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.estimation.codegen.kernels import CameraModel
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING, Cameras
 from maplab_py.estimation.terms.inertial_calibration import GYRO, intrinsics_of
 from maplab_py.estimation.terms.pose import MOUNTING
 from maplab_py.estimation.terms.wheel import WHEEL_SCALE
 from maplab_py.geometry import se3
-from maplab_py.sensors import Camera, CameraRig, Imu, SensorSet
+from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, Projection, SensorSet
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.wheels import with_wheel_scale
 from maplab_py.vimap import MissionSensor, VIMap
@@ -27,7 +26,7 @@ class RigCameras:
     """Distinct cameras of missions; missions with the same IMU and rig share rows."""
 
     cameras: Cameras
-    models: tuple[CameraModel, ...]
+    models: tuple[tuple[Projection, Distortion], ...]  # (C,)
     first_of_mission: I64  # (M,) row of each mission's first camera; -1 = not among the missions
     owner: tuple[tuple[str, str, int], ...]  # per row: IMU id, rig id, camera index
     timing_s: F64  # (C, 2) image delay, and time between two rows
@@ -58,23 +57,17 @@ def rig_cameras(vi_map: VIMap, missions: I64) -> RigCameras:
             used += vi_map.sensors.camera_rig(rig_id).cameras
             owner += [(imu_id, rig_id, k) for k in range(len(poses[-1]))]
         first[mission] = start_of[imu_id, rig_id]
-    models = {(camera.projection, camera.distortion) for camera in used}
-    ordered = tuple(sorted(models, key=lambda model: (model[0].value, model[1].value)))
-    values = [[*camera.intrinsics, *camera.distortion_parameters] for camera in used]
-    parameters = np.zeros((len(used), 1 + max(map(len, values), default=0)))
-    for row, (camera, numbers) in enumerate(zip(used, values, strict=True)):
-        parameters[row, 0] = ordered.index((camera.projection, camera.distortion))
-        parameters[row, 1 : 1 + len(numbers)] = numbers
-    T_I_C = np.ascontiguousarray(np.concatenate(poses)) if poses else np.zeros((0, 7))
+    T_I_C = np.concatenate(poses) if poses else np.zeros((0, 7))
     timing_s = [(camera.image_delay_s, 1e-9 * camera.line_delay_ns) for camera in used]
-    cameras = Cameras(T_I_C, parameters)
-    return RigCameras(cameras, ordered, first, tuple(owner), np.array(timing_s).reshape(-1, 2))
+    models = tuple((camera.projection, camera.distortion) for camera in used)
+    timing = np.array(timing_s).reshape(-1, 2)
+    return RigCameras(Cameras.of(used, T_I_C), models, first, tuple(owner), timing)
 
 
 def parameter_count(rig: RigCameras) -> I64:
     """Return the number of intrinsic and distortion parameters (C,) of each camera."""
     sizes = [INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in rig.models]
-    return np.array(sizes, dtype=np.int64)[rig.cameras.parameters[:, 0].astype(np.int64)]
+    return np.array(sizes, dtype=np.int64)
 
 
 def with_cameras(sensors: SensorSet, rig: RigCameras, states: States) -> SensorSet:

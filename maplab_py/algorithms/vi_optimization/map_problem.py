@@ -209,12 +209,14 @@ def _visual(
     data, sigma_px = observations(vi_map, selection, options, rig.first_of_mission)
     calibrating, line_delays = is_calibrating(options), not options.fix_ncamera_line_delay
     visual = VisualTerms(
-        visual_kernels(rig.models, progress, calibrating=calibrating, line_delays=line_delays),
+        visual_kernels(progress),
         data,
         rig.cameras,
         len(selection.vertices),
         loss=Loss[options.loss.upper()],
         move_points=not options.fix_landmark_positions,
+        estimate_cameras=calibrating,
+        estimate_line_delays=line_delays,
         landmark_prior=landmark_prior(states, options),
     )
     estimated = calibrating + line_delays  # columns of the timing that are states
@@ -241,7 +243,7 @@ def _visual(
 
 
 def is_calibrating(options: FixedStates) -> bool:
-    """Return whether something of the cameras is estimated, which takes other kernels."""
+    """Return whether something of the cameras is estimated."""
     return not (
         options.fix_ncamera_intrinsics
         and options.fix_ncamera_extrinsics_rotation

@@ -1,4 +1,4 @@
-"""The compiled kernels: visual ones per set of camera models, batch ones per residual."""
+"""The compiled kernels: visual ones for all cameras, batch ones per residual."""
 
 from __future__ import annotations
 
@@ -9,14 +9,7 @@ from typing import Any
 from maplab_py.estimation.codegen.modules import generated_module, template_source
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors.camera import (
-    DISTORTION_SIZE,
-    INTRINSICS_SIZE,
-    Distortion,
-    Projection,
-)
-
-CameraModel = tuple[Projection, Distortion]
+from maplab_py.sensors.camera import DISTORTION_SIZE, MIRROR_NAMES, Distortion, Projection
 
 _HEADER = (
     '"""Generated; do not edit."""\n\n'
@@ -26,45 +19,22 @@ _HEADER = (
 _FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)\n'
 
 
-def visual_kernels(
-    models: tuple[CameraModel, ...],
-    progress: Progress = SILENT,
-    *,
-    calibrating: bool = False,
-    line_delays: bool = False,
-) -> ModuleType:
-    """Return the module with `eliminate`, `substitute` and `evaluate` for these camera models.
+def visual_kernels(progress: Progress = SILENT) -> ModuleType:
+    """Return the module with `eliminate`, `substitute`, `evaluate` and `keep_jacobians`.
 
-    Where cameras are not estimated it has `keep_jacobians` too. The row of a camera's `parameters`
-    begins with the index of its model in `models`.
-
-    Args:
-        models: The models of the cameras.
-        progress: Told when something has to be compiled.
-        calibrating: Whether the cameras' calibration is estimated too (CAMERA_COLUMNS > 0).
-        line_delays: Whether it includes the time between two rows of a rolling shutter.
+    A row of cameras' `parameters` begins with the model's code (`model_code`).
     """
-    return generated_module(
-        visual_module_name(models, calibrating=calibrating, line_delays=line_delays),
-        lambda: _visual_source(models, calibrating=calibrating, line_delays=line_delays),
-        progress,
-    )
+    return generated_module("visual", _visual_source, progress)
 
 
-def visual_module_name(
-    models: tuple[CameraModel, ...], *, calibrating: bool = False, line_delays: bool = False
-) -> str:
-    """Return the name of the module that `visual_kernels` returns."""
-    name = "__".join(f"{p.name.lower()}_{d.name.lower()}" for p, d in models)
-    if line_delays:
-        return f"calibrating_rows_{name}"
-    return f"{'calibrating' if calibrating else 'visual'}_{name}"
+def window_kernels(progress: Progress = SILENT) -> ModuleType:
+    """Return the module of the template `window`, with cameras as `visual_kernels` has them."""
+    return generated_module("window", _window_source, progress)
 
 
-def window_kernels(models: tuple[CameraModel, ...], progress: Progress = SILENT) -> ModuleType:
-    """Return the module of the template `window` for these camera models, as `visual_kernels`."""
-    name = "__".join(f"{p.name.lower()}_{d.name.lower()}" for p, d in models)
-    return generated_module(f"window_{name}", lambda: _window_source(models), progress)
+def model_code(projection: Projection, distortion: Distortion) -> int:
+    """Return the number by which kernels know a camera model."""
+    return (list(Projection).index(projection) << 3) + list(Distortion).index(distortion)
 
 
 def residual_kernel(
@@ -87,50 +57,9 @@ def pose_graph_kernels(error: PoseError, progress: Progress = SILENT) -> ModuleT
     )
 
 
-_REPROJECTION = "poses, k, extrinsics, c, parameters, points, l, uv, o, out"
-
-
 _POSE, _LANDMARK, _CAMERA = 3, 15, 21
 """Where the Jacobian's columns begin in `out`, after residual (2) and depth; two entries a column."""
-
-
-def _visual_source(
-    models: tuple[CameraModel, ...], *, calibrating: bool, line_delays: bool = False
-) -> str:
-    from maplab_py.estimation.codegen.lowering import entries
-    from maplab_py.estimation.symbolic.residuals import reprojection
-
-    widest = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in models)
-    calibrating = calibrating or line_delays
-    columns = camera_columns(widest) if calibrating else 0
-    end = _CAMERA + 2 * columns
-    time_offset = _CAMERA + 2 * CAMERA_TIME_OFFSET_COLUMN
-    intrinsics = _CAMERA + 2 * CAMERA_INTRINSICS_COLUMN
-    parts = [
-        _HEADER,
-        f"POSE, LANDMARK, CAMERA, TIME_OFFSET = {_POSE}, {_LANDMARK}, {_CAMERA}, {time_offset}\n"
-        f"CAMERA_COLUMNS, NUM_OUT = {columns}, {end}\n\n\n",
-    ]
-    for index, (projection, distortion) in enumerate(models):
-        function = reprojection(projection, distortion)
-        places = [entries("out"), entries("out", 2), entries("out", _POSE), None, None]
-        padding: list[int] = []
-        if calibrating:
-            places[3:] = entries("out", _CAMERA), entries("out", intrinsics)
-            used = intrinsics + 2 * (INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion])
-            padding = [*range(time_offset, intrinsics), *range(used, end)]
-        parts.append(_reprojection(f"reproject_{index}", function, places, zero=padding))
-        only = [*places[:2], None, None, None]
-        parts.append(_reprojection(f"reproject_only_{index}", function, only))
-    names = ("reproject", "reproject_only")
-    parts += [_dispatcher(name, _REPROJECTION, len(models)) for name in names]
-    templates = ["visual_common", "visual", *(() if calibrating else ("visual_jacobians",))]
-    if line_delays:
-        templates.append("visual_rows")
-    return "".join(parts) + "\n\n".join(template_source(name) for name in templates)
-
-
-CAMERA_TIME_OFFSET_COLUMN = 6
+CAMERA_DELAY_COLUMN = 6
 CAMERA_INTRINSICS_COLUMN = 9
 """Columns of a camera: position 3, orientation 3, image delay, line delay, 1 of padding, then this."""
 
@@ -140,49 +69,84 @@ def camera_columns(num_parameters: int) -> int:
     return CAMERA_INTRINSICS_COLUMN + 3 * -(-num_parameters // 3)
 
 
-def _reprojection(name: str, function: Any, outputs: list[Any], zero: Sequence[int] = ()) -> str:
-    from maplab_py.estimation.codegen.lowering import function_body, row_entries
-
-    inputs = [
-        row_entries("poses", "k"),
-        row_entries("extrinsics", "c"),
-        row_entries("parameters", "c", offset=1),
-        row_entries("points", "l"),
-        row_entries("uv", "o"),
-    ]
-    lines = function_body(function, inputs, outputs)
-    return _function(name, _REPROJECTION, [*lines, *(f"out[{k}] = 0.0" for k in zero)])
+def _visual_source() -> str:
+    delay, intrinsics = (2 * k for k in (CAMERA_DELAY_COLUMN, CAMERA_INTRINSICS_COLUMN))
+    places = (
+        f"POSE, LANDMARK, CAMERA, NUM_OUT = {_POSE}, {_LANDMARK}, {_CAMERA}, {_CAMERA}\n"
+        f"DELAY, INTRINSICS = CAMERA + {delay}, CAMERA + {intrinsics}\n\n\n"
+    )
+    names = ("camera", "visual_common", "visual", "visual_jacobians")
+    return "\n\n".join([_HEADER + places + _camera_source(), *map(template_source, names)])
 
 
-_ANCHORED = "poses, a, k, extrinsics, d, c, parameters, h, l, uv, o, out"
-
-
-def _window_source(models: tuple[CameraModel, ...]) -> str:
-    from maplab_py.estimation.codegen.lowering import entries, function_body, row_entries
-    from maplab_py.estimation.symbolic.residuals import anchored_reprojection
-
-    inputs = [
-        row_entries("poses", "a"),
-        row_entries("extrinsics", "d"),
-        row_entries("poses", "k"),
-        row_entries("extrinsics", "c"),
-        row_entries("parameters", "c", offset=1),
-        row_entries("h", "l"),
-        row_entries("uv", "o"),
-    ]
+def _window_source() -> str:
     anchor, landmark, end = _POSE + 12, _POSE + 24, _POSE + 30
-    sizes = f"POSE, ANCHOR, LANDMARK, NUM_OUT = {_POSE}, {anchor}, {landmark}, {end}\n\n\n"
-    parts = [_HEADER, sizes]
-    places = [entries("out"), entries("out", 2), entries("out", anchor), entries("out", _POSE)]
-    for index, model in enumerate(models):
-        function = anchored_reprojection(*model)
-        lines = function_body(function, inputs, [*places, entries("out", landmark)])
-        parts.append(_function(f"reproject_{index}", _ANCHORED, lines))
-        lines = function_body(function, inputs, [*places[:2], None, None, None])
-        parts.append(_function(f"reproject_only_{index}", _ANCHORED, lines))
-    names = ("reproject", "reproject_only")
-    parts += [_dispatcher(name, _ANCHORED, len(models)) for name in names]
-    return "".join(parts) + "\n\n".join(template_source(n) for n in ("visual_common", "window"))
+    places = f"POSE, ANCHOR, LANDMARK, NUM_OUT = {_POSE}, {anchor}, {landmark}, {end}\n\n\n"
+    names = ("camera", "visual_common", "window")
+    return "\n\n".join([_HEADER + places + _camera_source(), *map(template_source, names)])
+
+
+def _camera_source() -> str:
+    """Return the functions of all projections and distortions, and those that choose among them."""
+    from maplab_py.estimation.symbolic import cameras
+
+    point = "parameters, c, x, y, z"
+    plane = "parameters, c, k, x, y"
+    parts = []
+    for projection in Projection:
+        function, mirror = cameras.denominator(projection), MIRROR_NAMES[projection]
+        inputs = [["x", "y", "z"], [f"parameters[c, {1 + i}]" for i in range(len(mirror))]]
+        name = projection.name.lower()
+        values = ["D", "Dx", "Dy", "Dz"]
+        lines = _lines(function, inputs, [values[:1], values[1:], None])
+        lines.append(f"return {', '.join(values)}, {1 + len(mirror)}")
+        parts.append(_function(f"denominator_{name}", point, lines))
+        lines = _lines(function, inputs, [None, None, ["a", "b"]])
+        lines.append(f"return {', '.join([*['a', 'b'][: len(mirror)], '0.0', '0.0'][:2])}")
+        parts.append(_function(f"denominator_by_mirror_{name}", point, lines))
+    for distortion in Distortion:
+        function, size = cameras.distort(distortion), DISTORTION_SIZE[distortion]
+        inputs = [["x", "y"], [f"parameters[c, k + {i}]" for i in range(size)]]
+        name = distortion.name.lower()
+        values = ["u", "v", "ux", "vx", "uy", "vy"]
+        lines = _lines(function, inputs, [values[:2], values[2:], None])
+        lines.append(f"return {', '.join(values)}")
+        parts.append(_function(f"distort_{name}", plane, lines))
+        out = [f"out[first + {i}]" for i in range(2 * size)]
+        lines = _lines(function, inputs, [None, None, out])
+        lines.append(f"return first + {2 * size}")
+        parts.append(_function(f"distort_by_parameters_{name}", f"{plane}, out, first", lines))
+    for name, arguments, models in (
+        ("denominator", point, Projection),
+        ("denominator_by_mirror", point, Projection),
+        ("distort", plane, Distortion),
+        ("distort_by_parameters", f"{plane}, out, first", Distortion),
+    ):
+        parts.append(_choice(name, arguments, [model.name.lower() for model in models]))
+    return "".join(parts)
+
+
+def _lines(
+    function: Any, inputs: list[list[str]], outputs: Sequence[list[str] | None]
+) -> list[str]:
+    """Return the body of a function whose inputs and outputs are written as given."""
+    from maplab_py.estimation.codegen.lowering import function_body
+
+    return function_body(
+        function,
+        [places.__getitem__ for places in inputs],
+        [None if places is None else places.__getitem__ for places in outputs],
+    )
+
+
+def _choice(name: str, arguments: str, models: list[str]) -> str:
+    """Return a function that calls the one of the model whose number is `kind`."""
+    lines = []
+    for kind, model in enumerate(models[1:], 1):
+        lines += [f"if kind == {kind}:", f"    return {name}_{model}({arguments})"]
+    return _function(
+        name, f"kind, {arguments}", [*lines, f"return {name}_{models[0]}({arguments})"]
+    )
 
 
 def _batch_source(function: Any) -> str:
@@ -225,13 +189,3 @@ def _pose_graph_source(kind: PoseError) -> str:
 
 def _function(name: str, arguments: str, lines: list[str]) -> str:
     return _FAST + f"def {name}({arguments}):\n    " + "\n    ".join(lines) + "\n\n\n"
-
-
-def _dispatcher(name: str, arguments: str, count: int) -> str:
-    if count == 1:
-        return _function(name, arguments, [f"{name}_0({arguments})"])
-    lines = []
-    for index in range(count):
-        lines.append(f"{'if' if index == 0 else 'elif'} parameters[c, 0] == {index}.0:")
-        lines.append(f"    {name}_{index}({arguments})")
-    return _function(name, arguments, lines)

@@ -1,7 +1,7 @@
 """Generated modules: written once, cached on disk, imported like any other module.
 
 A module's folder is named by a hash over everything that could change what is in it: the sources of
-residuals, templates, generator and losses, and casadi's version. So an edit anywhere gives a new
+residuals, templates, generator, losses and the list of cameras, and casadi's version. So an edit anywhere gives a new
 folder, and a warm start does not import casadi. The modules that a wheel brings are used with every
 version of casadi.
 """
@@ -29,6 +29,7 @@ _SOURCES = (
     *sorted((_PACKAGE / "codegen").glob("*.py")),
     *sorted(_TEMPLATES.glob("*.py")),
     _PACKAGE / "kernels" / "loss.py",
+    _PACKAGE.parent / "sensors" / "camera.py",
 )
 """Everything that decides what is in a generated module."""
 

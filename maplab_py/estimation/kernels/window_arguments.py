@@ -37,7 +37,7 @@ class WindowPoint(NamedTuple):
     T_M_I: F64  # (F, 7)
     h: F64  # (L, 3) [x/z, y/z, 1/z] in the camera of the anchor
     T_I_C: F64  # (C, 7)
-    parameters: F64  # (C, 1 + widest): index of the model, then intrinsics and distortion
+    parameters: F64  # (C, 1 + widest): code of the model, then intrinsics and distortion
 
 
 class WindowRule(NamedTuple):
@@ -47,6 +47,24 @@ class WindowRule(NamedTuple):
     damping: float
     T_M_I: F64  # (F, 7) where Jacobians are evaluated
     is_elsewhere: Mask  # (F,) whether that is not where the frame is
+
+
+class MapData(NamedTuple):
+    """Observations of landmarks of a map."""
+
+    frame: I32  # (O,) of the window
+    camera: I32  # (O,)
+    landmark: I64  # (O,)
+    uv_px: F64  # (O, 2)
+    inverse_sigma: F64  # (O,) [1/px]
+
+
+class MapCameras(NamedTuple):
+    """Cameras that see a map."""
+
+    T_I_C: F64  # (C, 7)
+    parameters: F64  # (C, 1 + widest), as `WindowPoint` has them
+    limits: F64  # (C, 4) see `sensors.projection.visibility_limits`
 
 
 class DenseSystem(NamedTuple):

@@ -16,7 +16,6 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.codegen.kernels import CameraModel
 from maplab_py.estimation.kernels.schur_products import multiply_factors
 from maplab_py.estimation.linear.assembled import AssembledSolver
 from maplab_py.estimation.linear.conjugate_gradients import CGResult, conjugate_gradients
@@ -366,9 +365,9 @@ def _write(blocks: F64, values: F64, first: int) -> None:
     blocks[first : first + len(values)] = values
 
 
-def compile_kernels(models: tuple[CameraModel, ...]) -> None:
-    """Compile products and preconditioner for a rig of camera models."""
-    visual, states = sample_terms(models, calibrating=False)
+def compile_kernels() -> None:
+    """Compile products and preconditioner."""
+    visual, states = sample_terms()
     problem = IterativeProblem(states, visual, [])
     problem.fix(np.array([0, 1]))
     problem.try_step(states, problem.linearize(states, 1e-4), 1e-4)

@@ -11,7 +11,6 @@ from typing import Any
 
 import casadi
 
-from maplab_py.estimation.symbolic.cameras import project
 from maplab_py.estimation.symbolic.manifold import (
     PerturbedPose,
     PerturbedVector,
@@ -19,66 +18,10 @@ from maplab_py.estimation.symbolic.manifold import (
     exp,
     log,
     multiply,
-    rotation_matrix,
     with_jacobian,
 )
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE, Distortion, Projection
 
 ca: Any = casadi  # its stubs do not know mixed arguments
-
-
-def reprojection(projection: Projection, distortion: Distortion) -> Any:
-    """Return f(T_G_I, T_I_C, parameters, p_G, uv) -> r (2), depth (1), three Jacobians.
-
-    r = projection of the landmark - measured pixel; depth is the camera-frame z coordinate. The
-    Jacobians are by pose and landmark (2 x 9), by the extrinsics (2 x 6, tangent [dp, dtheta] of
-    T_I_C) and by the parameters.
-    """
-    T_G_I, p_G = PerturbedPose("T_G_I"), PerturbedVector("p_G", 3)
-    T_I_C = PerturbedPose("T_I_C")
-    size = INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion]
-    parameters = PerturbedVector("parameters", size)
-    uv = ca.SX.sym("uv", 2)
-    p_I = T_G_I.R.T @ (p_G.x - T_G_I.p)
-    p_C = T_I_C.R.T @ (p_I - T_I_C.p)
-    residual = project(projection, distortion, p_C, parameters.x) - uv
-    groups = [[T_G_I.tangent, p_G.tangent], [T_I_C.tangent], [parameters.tangent]]
-    tangents = [tangent for group in groups for tangent in group]
-    value, jacobian = with_jacobian(residual, tangents)
-    every = ca.vertcat(*tangents)
-    depth = ca.substitute(p_C[2], every, ca.SX.zeros(every.numel()))
-    parts = [jacobian[:, :9], jacobian[:, 9:15], jacobian[:, 15:]]
-    arguments = [T_G_I.values, T_I_C.values, parameters.values, p_G.values, uv]
-    return ca.Function("reprojection", arguments, ca.cse([value, depth, *parts]))
-
-
-def anchored_reprojection(projection: Projection, distortion: Distortion) -> Any:
-    """Return f(T_M_A, T_I_CA, T_M_I, T_I_C, parameters, h, uv) -> r (2), depth (1), three Jacobians.
-
-    The landmark h = [x / z, y / z, 1 / z] has the coordinates x, y, z in camera CA of its anchor, the
-    body A; I observes it with camera C. Everything is multiplied by 1 / z, so that landmarks at infinity
-    are regular: depth is the camera-frame z coordinate times 1 / z. Jacobians are by the poses of A and
-    I (2 x 6 each) and by h (2 x 3).
-    Source: Civera et al., Inverse Depth Parametrization for Monocular SLAM, TRO 2008, eq. (3)-(6),
-    with the place in the image instead of two angles.
-    """
-    T_M_A, T_M_I, h = PerturbedPose("T_M_A"), PerturbedPose("T_M_I"), PerturbedVector("h", 3)
-    T_I_CA, T_I_C = PerturbedPose("T_I_CA"), PerturbedPose("T_I_C")
-    size = INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion]
-    parameters, uv = ca.SX.sym("parameters", size), ca.SX.sym("uv", 2)
-    R_I_CA, p_I_CA = rotation_matrix(T_I_CA.values[:4]), T_I_CA.values[4:]
-    R_I_C, p_I_C = rotation_matrix(T_I_C.values[:4]), T_I_C.values[4:]
-    ray_A = R_I_CA @ ca.vertcat(h.x[0], h.x[1], 1) + h.x[2] * p_I_CA
-    ray_I = T_M_I.R.T @ (T_M_A.R @ ray_A + h.x[2] * (T_M_A.p - T_M_I.p))
-    ray_C = R_I_C.T @ (ray_I - h.x[2] * p_I_C)
-    residual = project(projection, distortion, ray_C, parameters) - uv
-    tangents = [T_M_A.tangent, T_M_I.tangent, h.tangent]
-    value, jacobian = with_jacobian(residual, tangents)
-    every = ca.vertcat(*tangents)
-    depth = ca.substitute(ray_C[2], every, ca.SX.zeros(every.numel()))
-    parts = [jacobian[:, :6], jacobian[:, 6:12], jacobian[:, 12:]]
-    arguments = [T_M_A.values, T_I_CA.values, T_M_I.values, T_I_C.values, parameters, h.values, uv]
-    return ca.Function("anchored_reprojection", arguments, ca.cse([value, depth, *parts]))
 
 
 def inertial(*, with_intrinsics: bool = False) -> Any:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.blocks import Manifold, ParameterBlock
+from maplab_py.estimation.codegen.kernels import model_code
 from maplab_py.estimation.kernels.visual_arguments import VisualSums
 from maplab_py.estimation.states import States, pose_nodes
+from maplab_py.sensors import Camera
 
 EXTRINSICS, TIMING, INTRINSICS = "camera extrinsics", "camera timing", "camera intrinsics"
 
@@ -19,7 +22,17 @@ class Cameras:
     """C cameras as the kernels read them."""
 
     T_I_C: F64  # (C, 7)
-    parameters: F64  # (C, 1 + widest): index of the model, then intrinsics and distortion
+    parameters: F64  # (C, 1 + widest): code of the model, then intrinsics and distortion
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], T_I_C: F64) -> Cameras:
+        """Return cameras with poses (C, 7)."""
+        values = [[*camera.intrinsics, *camera.distortion_parameters] for camera in cameras]
+        parameters = np.zeros((len(cameras), 1 + max(map(len, values), default=0)))
+        for row, (camera, numbers) in enumerate(zip(cameras, values, strict=True)):
+            parameters[row, 0] = model_code(camera.projection, camera.distortion)
+            parameters[row, 1 : 1 + len(numbers)] = numbers
+        return cls(np.ascontiguousarray(T_I_C, dtype=np.float64), parameters)
 
 
 def camera_blocks(cameras: Cameras, timing_s: F64) -> tuple[ParameterBlock, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64
-from maplab_py.estimation.codegen.kernels import CameraModel, visual_kernels
+from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
 from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
 from maplab_py.estimation.kernels.visual_arguments import (
     VisualData,
@@ -31,7 +31,6 @@ from maplab_py.estimation.terms.cameras import (
     Cameras,
     border_places,
     border_values,
-    camera_blocks,
     camera_nodes,
     pixel_delay_s,
 )
@@ -41,7 +40,6 @@ from maplab_py.estimation.terms.visual_structure import (
     landmark_chunks,
 )
 from maplab_py.geometry import se3
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.vimap.table import starts_of_counts
 
 _BLOCKS_AT_ONCE = 65_536
@@ -96,9 +94,9 @@ class NodeSystem:
 class VisualTerms:
     """All reprojection errors of a problem.
 
-    With kernels that estimate cameras the states have the blocks of `camera_blocks`. What shall not
-    move is fixed in the problem; columns beyond a camera's own parameters are padding, without
-    effect, and have to be fixed too.
+    Where cameras are estimated the states have the blocks of `camera_blocks`. What shall not move is
+    fixed in the problem; columns beyond a camera's own parameters are padding, without effect, and
+    have to be fixed too.
     """
 
     def __init__(
@@ -110,17 +108,21 @@ class VisualTerms:
         *,
         loss: Loss = Loss.HUBER,
         move_points: bool = True,
+        estimate_cameras: bool = False,
+        estimate_line_delays: bool = False,
         landmark_prior: F64 | None = None,
     ) -> None:
         """Analyse who sees what together.
 
         Args:
-            kernels: Compiled for the cameras' models, and to estimate them or not.
+            kernels: Those of `visual_kernels`.
             observations: Grouped by landmark.
             cameras: As `observations` count them.
             num_vertices: V.
             loss: Robust loss of reprojection errors.
             move_points: Whether landmarks are estimated.
+            estimate_cameras: Whether the cameras' calibration is estimated.
+            estimate_line_delays: Whether it includes the time between two rows of a rolling shutter.
             landmark_prior: Places and inverse standard deviations (L, 4) [m, 1/m]; 0 = none.
         """
         self._kernels, self._cameras = kernels, cameras
@@ -130,7 +132,8 @@ class VisualTerms:
         self.observations = observations
         self.num_vertices = num_vertices
         self.chunk_start = landmark_chunks(observations.start)
-        self.estimates_cameras = kernels.CAMERA_COLUMNS > 0
+        self.estimates_cameras = estimate_cameras or estimate_line_delays
+        self._estimates_line_delays = estimate_line_delays
         self._uv_motion = self._no_motion() if self.estimates_cameras else np.zeros((0, 2))
         self._angular_velocity: F64 | None = None
         self._known_delay_s: F64 | None = None
@@ -191,7 +194,7 @@ class VisualTerms:
 
     @cached_property
     def _sums(self) -> VisualSums:
-        width = self._kernels.CAMERA_COLUMNS
+        width = camera_columns(self._cameras.parameters.shape[1] - 1) * self.estimates_cameras
         return VisualSums.zeros(self.num_chunks, self.num_vertices, len(self._cameras.T_I_C), width)
 
     @property
@@ -212,7 +215,7 @@ class VisualTerms:
         """Let pixels be of other times than their vertices, to first order in the motion.
 
         The pixels' velocities are those of the states at the latest `refresh`. Known delays only move
-        the measurements, so any kernels will do; delays that are states need those for cameras.
+        the measurements.
 
         Args:
             angular_velocity_I: Angular velocities (V, 3) [rad/s] of the vertices.
@@ -225,8 +228,7 @@ class VisualTerms:
     def _no_motion(self) -> F64:
         """Return `VisualData.uv_motion` of pixels that stand still."""
         uv_px = self.observations.uv_px
-        has_rows = getattr(self._kernels, "ESTIMATES_LINE_DELAYS", False)
-        rows = uv_px[:, 1:] if has_rows else uv_px[:, :0]
+        rows = uv_px[:, 1:] if self._estimates_line_delays else uv_px[:, :0]
         return np.concatenate([np.zeros_like(uv_px), rows], axis=1)
 
     def refresh(self, states: States) -> bool:
@@ -386,14 +388,11 @@ def pose_part(by_node: F64, states: States) -> F64:
     return by_vertex[:, :6]
 
 
-def compile_kernels(
-    models: tuple[CameraModel, ...], *, calibrating: bool, moving: bool = False
-) -> None:
-    """Compile reprojection for a rig of camera models, of moving images if need be."""
-    visual, states = sample_terms(models, calibrating=calibrating)
-    if moving:
-        visual.follow_motion(np.zeros((2, 3)), np.zeros(2))
-        visual.refresh(states)
+def compile_kernels() -> None:
+    """Compile reprojection for all cameras, of moving images, too."""
+    visual, states = sample_terms()
+    visual.follow_motion(np.zeros((2, 3)), np.zeros(2))
+    visual.refresh(states)
     rows, cols = visual.block_nodes(states)
     solver = SupernodalCholesky(rows, cols, states.num_nodes, 3)
     solver.clear()
@@ -402,16 +401,8 @@ def compile_kernels(
     visual.errors(states)
 
 
-def sample_terms(
-    models: tuple[CameraModel, ...], *, calibrating: bool
-) -> tuple[VisualTerms, States]:
+def sample_terms() -> tuple[VisualTerms, States]:
     """Return the terms of a landmark that two vertices see, small enough for compilation."""
-    widest = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in models)
-    projection, distortion = models[0]
-    intrinsics = [0.1, 100.0, 100.0, 50.0, 50.0][5 - INTRINSICS_SIZE[projection] :]
-    parameters = np.zeros((1, 1 + widest))
-    used = [*intrinsics, *[0.1] * DISTORTION_SIZE[distortion]]
-    parameters[0, 1 : 1 + len(used)] = used
     T_G_I = se3.identity(2)
     T_G_I[1, 4] = 1.0
     observations = Observations(
@@ -422,11 +413,6 @@ def sample_terms(
         inverse_sigma=np.ones(2),
         loss_scale=np.full(2, 3.0),
     )
-    cameras, zero = Cameras(se3.identity(1), parameters), np.zeros((2, 3))
+    cameras, zero = Cameras(se3.identity(1), np.array([[0.0, 100, 100, 50, 50]])), np.zeros((2, 3))
     states = States(T_G_I, zero, zero, zero, np.array([[0.5, 0.0, 5.0]]))
-    visual = VisualTerms(visual_kernels(models, calibrating=calibrating), observations, cameras, 2)
-    if calibrating:
-        states = states.with_blocks(*camera_blocks(cameras, np.zeros(1)))
-        visual.follow_motion(zero)
-        visual.refresh(states)
-    return visual, states
+    return VisualTerms(visual_kernels(), observations, cameras, 2), states

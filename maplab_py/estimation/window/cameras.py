@@ -1,4 +1,4 @@
-"""Cameras as kernels read them."""
+"""Rays of pixels, for all cameras of a window."""
 
 from __future__ import annotations
 
@@ -7,24 +7,9 @@ from types import ModuleType
 import numpy as np
 
 from maplab_py.array_types import F64, I32, Mask
-from maplab_py.estimation.codegen.kernels import CameraModel
 from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.sensors import Camera
 from maplab_py.sensors.distortion import largest_radius
-
-
-def camera_table(
-    cameras: tuple[Camera, ...], T_I_C: F64
-) -> tuple[tuple[CameraModel, ...], Cameras]:
-    """Return the distinct models, and the cameras with poses (C, 7) whose rows name their model."""
-    models = {(camera.projection, camera.distortion) for camera in cameras}
-    ordered = tuple(sorted(models, key=lambda model: (model[0].value, model[1].value)))
-    values = [[*camera.intrinsics, *camera.distortion_parameters] for camera in cameras]
-    parameters = np.zeros((len(cameras), 1 + max(map(len, values), default=0)))
-    for row, (camera, numbers) in enumerate(zip(cameras, values, strict=True)):
-        parameters[row, 0] = ordered.index((camera.projection, camera.distortion))
-        parameters[row, 1 : 1 + len(numbers)] = numbers
-    return ordered, Cameras(np.ascontiguousarray(T_I_C, dtype=np.float64), parameters)
 
 
 class BackProjection:
@@ -43,7 +28,7 @@ class BackProjection:
         """Return unit rays (N, 3) of pixels (N, 2) in their cameras (N,), and whether they exist."""
         uv = np.ascontiguousarray(uv_px, dtype=np.float64)
         xy = (uv - self._centre[camera]) / self._focal[camera]
-        self._kernels.unproject(camera, uv, self._table.T_I_C, self._table.parameters, xy)
+        self._kernels.unproject(camera, uv, self._table.parameters, xy)
         ray = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
         length = np.sqrt(np.sum(ray * ray, axis=1))
         valid = np.hypot(xy[:, 0], xy[:, 1]) < self._limit[camera]

@@ -9,15 +9,20 @@ several views of a wrong landmark are not independent facts.
 from __future__ import annotations
 
 import dataclasses
-from types import ModuleType
 
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.estimation.codegen.kernels import window_kernels
 from maplab_py.estimation.kernels import map_observations as kernels
-from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
+from maplab_py.estimation.kernels.window_arguments import (
+    FRAME_SIZE,
+    DenseSystem,
+    MapCameras,
+    MapData,
+)
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
+from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
@@ -76,49 +81,6 @@ class MapElimination:
         return p_G + moved, -0.5 * float(np.vdot(self.gradient, moved))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _View:
-    """The observations of a camera, and what the kernel needs of them that no state changes."""
-
-    rows: I64 | slice  # (N,) of the observations
-    seen: kernels.MapView
-    weight: F64  # (N, 2, 2)
-    arguments: (
-        F64  # (N, 26 + parameters) T_M_I, T_G_M, T_I_C, parameters, p_G, uv; states are filled in
-    )
-    visible: Mask  # (N,)
-    kernel: ModuleType
-
-    @classmethod
-    def of(cls, seen: MapObservations, row: int, camera: Camera, T_I_C: F64) -> _View:
-        """Return the view of the camera in a row of the rig."""
-        of_camera = np.flatnonzero(seen.camera == row)
-        rows = slice(None) if len(of_camera) == len(seen) else of_camera
-        parameters = np.concatenate([camera.intrinsics, camera.distortion_parameters])
-        arguments = np.empty((len(of_camera), 26 + len(parameters)))
-        arguments[:, 14:21], arguments[:, 21:-5] = T_I_C, parameters
-        arguments[:, -2:] = seen.uv_px[rows]
-        view = kernels.MapView(
-            seen.frame[rows], seen.landmark[rows], so3.to_matrix(T_I_C[:4]),
-            np.ascontiguousarray(T_I_C[4:]), visibility_limits(camera),
-        )  # fmt: skip
-        return cls(
-            rows, view, np.eye(2) / seen.sigma_px[rows, None, None], arguments,
-            np.empty(len(of_camera), dtype=np.bool_),
-            map_reprojection_kernel(camera.projection, camera.distortion),
-        )  # fmt: skip
-
-    def evaluated(self, T_M_I: F64, R_M_I: F64, T_G_M: F64, p_G: F64, p_M: F64) -> tuple[F64, F64]:
-        """Return residuals (N, 2) and Jacobians (N, 2, 15); fill in what is visible."""
-        kernels.fill_arguments(
-            self.seen, T_M_I, R_M_I, T_G_M, p_G, p_M, self.arguments, self.visible
-        )
-        residual, jacobian = self.kernel.evaluated(self.arguments, self.weight)
-        if not self.visible.all():
-            residual[~self.visible], jacobian[~self.visible] = 0.0, 0.0
-        return residual, jacobian
-
-
 class MapTerms:
     """All residuals that a window localised in a map has beyond those of its odometry."""
 
@@ -141,9 +103,13 @@ class MapTerms:
             tilt_sigma_rad: How level the frames G and M are to each other; infinite = not stated.
         """
         self.observations = observations
-        self._views = [
-            _View.of(observations, row, camera, T_I_C[row]) for row, camera in enumerate(cameras)
-        ]
+        self._data = MapData(
+            observations.frame, observations.camera, observations.landmark,
+            np.ascontiguousarray(observations.uv_px), 1.0 / observations.sigma_px,
+        )  # fmt: skip
+        table = Cameras.of(cameras, T_I_C)
+        limits = np.array([visibility_limits(camera) for camera in cameras]).reshape(-1, 4)
+        self._cameras = MapCameras(table.T_I_C, table.parameters, limits)
         self._huber2, self._tilt_weight = huber_sigmas**2, 1.0 / tilt_sigma_rad
         self._latest: tuple[WindowStates, MapResiduals] | None = None
         self.estimates_landmarks = observations.information_G is not None and len(observations) > 0
@@ -159,11 +125,9 @@ class MapTerms:
         count = len(self.observations)
         residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 15))
         visible: Mask = np.zeros(count, dtype=np.bool_)
-        p_M = (p_G - T_G_M[4:]) @ so3.to_matrix(T_G_M[:4])
-        R_M_I = so3.to_matrix(T_M_I[:, :4])
-        for view in self._views:
-            residual[view.rows], jacobian[view.rows] = view.evaluated(T_M_I, R_M_I, T_G_M, p_G, p_M)
-            visible[view.rows] = view.visible
+        window_kernels().reproject_map(
+            self._data, self._cameras, T_M_I, T_G_M[None], p_G, residual, jacobian, visible
+        )
         of_frame, of_base, of_landmark = jacobian[..., :6], jacobian[..., 6:12], jacobian[..., 12:]
         return MapResiduals(residual, jacobian, of_frame, of_base, of_landmark, visible)
 

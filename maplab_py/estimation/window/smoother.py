@@ -21,8 +21,9 @@ from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, SolverSummary, optimize_states
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection, camera_table
+from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
 from maplab_py.estimation.window.inertial import InertialChain
@@ -59,10 +60,10 @@ class FixedLagSmoother:
         self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu, options: WindowOptions
     ) -> None:
         """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU."""
-        models, self._cameras = camera_table(cameras, T_I_C)
+        self._cameras = Cameras.of(cameras, T_I_C)
         self.options = options
         self._keyframes_kept = options.keyframes_kept(len(cameras))
-        self._kernels = window_kernels(models)
+        self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
         self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
         still = residual_kernel("relative_pose", sources.relative_pose)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -19,27 +18,19 @@ from maplab_py.estimation.kernels.window_arguments import (
     WindowRule,
 )
 from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection, camera_table
-from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
+from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.camera import (
-    CAMERA_MODELS,
-    DISTORTION_SIZE,
-    INTRINSICS_SIZE,
-    is_known_to_maplab,
-)
 
 
 def window_jobs() -> dict[str, Callable[[], None]]:
     """Return by name what compiles one kernel each."""
     jobs: dict[str, Callable[[], None]] = {"window": _run_frames}
-    for projection, distortion in filter(lambda model: is_known_to_maplab(*model), CAMERA_MODELS):
-        name = f"window {projection.name} {distortion.name}"
-        jobs[name] = partial(_run_landmarks, projection, distortion)
+    jobs["window landmarks"] = _run_landmarks
     return jobs
 
 
@@ -49,12 +40,16 @@ def _states() -> WindowStates:
     return WindowStates(T_M_I, np.zeros((2, 9)), np.array([[0.1, 0.0, 0.2]]))
 
 
-def _run_landmarks(projection: Projection, distortion: Distortion) -> None:
-    intrinsics = np.array([0.1, 100.0, 100.0, 50.0, 50.0][5 - INTRINSICS_SIZE[projection] :])
-    parameters = np.full(DISTORTION_SIZE[distortion], 0.1)
-    camera = Camera("0" * 32, projection, distortion, intrinsics, parameters, 100, 100)
-    models, table = camera_table((camera,), se3.identity(1))
-    module, states = window_kernels(models), _states()
+def _camera() -> Camera:
+    return Camera(
+        "0" * 32, Projection.PINHOLE, Distortion.NONE, np.full(4, 50.0), np.zeros(0), 100, 100
+    )
+
+
+def _run_landmarks() -> None:
+    camera = _camera()
+    table = Cameras.of((camera,), se3.identity(1))
+    module, states = window_kernels(), _states()
     frame, row = np.array([0, 1], dtype=np.int32), np.zeros(2, dtype=np.int32)
     uv = np.array([[60.0, 50.0], [50.0, 50.0]])
     data = WindowData(
@@ -76,22 +71,18 @@ def _run_landmarks(projection: Projection, distortion: Distortion) -> None:
     module.substitute(data, at, rule, kept, np.zeros(2 * FRAME_SIZE), new)
     module.evaluate(data, at, np.empty((2, 2)))
     BackProjection(module, (camera,), table).rays(row, uv)
-    map_reprojection_kernel(projection, distortion).compile_kernel()
 
 
 def _run_map() -> None:
     """Compile what all observations of a map need, whatever the camera."""
     states, system = _states(), DenseSystem.zeros(2 * FRAME_SIZE + 6)
     nothing = np.zeros(0, dtype=np.int32)
-    camera = Camera(
-        "0" * 32, Projection.PINHOLE, Distortion.NONE, np.full(4, 50.0), np.zeros(0), 100, 100
-    )
     observations = MapObservations(
         np.zeros(1, dtype=np.int64), nothing, nothing, np.zeros((0, 2)), np.zeros(0),
         np.zeros((0, 3)), None,
     )  # fmt: skip
     localized = dataclasses.replace(states, T_G_M=se3.identity(1))
-    terms = MapTerms(observations, (camera,), se3.identity(1), huber_sigmas=1.0)
+    terms = MapTerms(observations, (_camera(),), se3.identity(1), huber_sigmas=1.0)
     terms.add_to(system, localized, localized)
 
 

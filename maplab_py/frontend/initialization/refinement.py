@@ -13,8 +13,9 @@ from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection, camera_table
+from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions
@@ -132,8 +133,8 @@ class Refinement:
             data_sheet: The IMU with the least noise that it can have.
         """
         self._rig = Rig(cameras, T_I_C)
-        models, self._cameras = camera_table(cameras, T_I_C)
-        self._kernels = window_kernels(models)
+        self._cameras = Cameras.of(cameras, T_I_C)
+        self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
         self._inertial = residual_kernel("inertial", sources.inertial)
         options = WindowOptions(max_landmarks=_MAX_LANDMARKS, gate_chi2=_GATE_CHI2)

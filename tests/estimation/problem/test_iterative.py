@@ -323,14 +323,14 @@ def test_covariances_that_do_not_converge_are_an_error() -> None:
 
 
 def test_estimated_cameras_are_refused() -> None:
-    models = ((Projection.PINHOLE, Distortion.NONE),)
     one = np.zeros(1, dtype=np.int32)
     observations = Observations(
         np.array([0, 1]), one, one, np.zeros((1, 2)), np.ones(1), np.ones(1)
     )
     cameras = Cameras(se3.identity(1), np.array([[0.0, 100.0, 100.0, 50.0, 50.0]]))
-    kernels = visual_kernels(models, calibrating=True)
     states = problem_of().states.with_blocks(*camera_blocks(cameras, np.zeros(1)))
-    visual = VisualTerms(kernels, observations, cameras, len(states.T_G_I))
+    visual = VisualTerms(
+        visual_kernels(), observations, cameras, len(states.T_G_I), estimate_cameras=True
+    )
     with pytest.raises(ValueError, match="cameras that are estimated"):
         IterativeProblem(states, visual, [])

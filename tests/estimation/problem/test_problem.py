@@ -21,8 +21,9 @@ from maplab_py.sensors import Distortion, Projection
 from maplab_py.vimap import VIMap
 from tests.estimation.dense import system_matrix
 from tests.support.dense import DenseProblem, dense_problem
-from tests.support.kernels import TWO_MODELS
 from tests.support.scene import EVERY_MODEL, Scene, corrupted
+
+TWO_MODELS = ((Projection.PINHOLE, Distortion.FOV), (Projection.PINHOLE, Distortion.NONE))
 
 
 def disturbed(scene: Scene, seed: int = 3) -> VIMap:

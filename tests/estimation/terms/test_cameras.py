@@ -16,11 +16,13 @@ from maplab_py.estimation.terms.cameras import Cameras, camera_blocks
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Distortion, Projection
+from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
 from tests.estimation.dense import numeric_jacobian, numeric_point_jacobian, system_matrix
+from tests.support.scene import EVERY_MODEL, make_camera
 
 F64 = NDArray[np.float64]
 
-MODELS = ((Projection.PINHOLE, Distortion.FOV), (Projection.PINHOLE, Distortion.RADTAN))
+TWO_MODELS = ((Projection.PINHOLE, Distortion.FOV), (Projection.PINHOLE, Distortion.RADTAN))
 VERTICES, LANDMARKS, INVERSE_SIGMA, SCALE2 = 4, 12, 1.3, 9.0
 
 
@@ -29,6 +31,7 @@ class Scene:
     visual: VisualTerms
     states: States
     problem: Problem
+    models: tuple[tuple[Projection, Distortion], ...]
 
     def residual(self, states: States) -> F64:
         """Signed residuals [sigmas] from the errors for three shifted measurements."""
@@ -45,37 +48,45 @@ class Scene:
 @pytest.fixture(scope="module", params=[False, True], ids=["offset", "rows"])
 def scene(request: pytest.FixtureRequest) -> Scene:
     """Return a rig whose calibration is estimated, with line delays or without."""
+    return make_scene(TWO_MODELS, line_delays=request.param)
+
+
+def make_scene(models: tuple[tuple[Projection, Distortion], ...], *, line_delays: bool) -> Scene:
+    size = len(models)
     rng = np.random.default_rng(0)
     T_G_I = se3.make(so3.exp(rng.normal(0, 0.05, (VERTICES, 3))), rng.normal(0, 0.2, (VERTICES, 3)))
-    T_I_C = se3.make(so3.exp(rng.normal(0, 0.1, (2, 3))), rng.normal(0, 0.05, (2, 3)))
-    parameters = np.zeros((2, 9))
-    parameters[0, :6] = [0, 250, 251, 320, 240, 0.9]
-    parameters[1] = [1, 300, 301, 320, 240, -0.2, 0.05, 1e-3, -1e-3]
-    cameras = Cameras(T_I_C, parameters)
-    count = LANDMARKS * VERTICES * 2
+    T_I_C = se3.make(so3.exp(rng.normal(0, 0.1, (size, 3))), rng.normal(0, 0.05, (size, 3)))
+    cameras = Cameras.of([make_camera(*model) for model in models], T_I_C)
+    count = LANDMARKS * VERTICES * size
     observations = Observations(
-        start=np.arange(LANDMARKS + 1) * VERTICES * 2,
-        vertex=np.tile(np.repeat(np.arange(VERTICES), 2), LANDMARKS).astype(np.int32),
-        camera=np.tile([0, 1], LANDMARKS * VERTICES).astype(np.int32),
+        start=np.arange(LANDMARKS + 1) * VERTICES * size,
+        vertex=np.tile(np.repeat(np.arange(VERTICES), size), LANDMARKS).astype(np.int32),
+        camera=np.tile(np.arange(size), LANDMARKS * VERTICES).astype(np.int32),
         uv_px=rng.uniform(200, 400, (count, 2)),
         inverse_sigma=np.full(count, INVERSE_SIGMA),
         loss_scale=np.full(count, np.sqrt(SCALE2)),
     )
-    kernels = visual_kernels(MODELS, calibrating=True, line_delays=request.param)
-    visual = VisualTerms(kernels, observations, cameras, VERTICES, loss=Loss.CAUCHY)
+    visual = VisualTerms(
+        visual_kernels(), observations, cameras, VERTICES, loss=Loss.CAUCHY, estimate_cameras=True,
+        estimate_line_delays=line_delays,
+    )  # fmt: skip
     points = rng.uniform([-1, -1, 3], [1, 1, 5], (LANDMARKS, 3))
     zero = np.zeros((VERTICES, 3))
     states = States(T_G_I, rng.normal(0, 1, (VERTICES, 3)), zero, zero, points)
-    timing_s = np.array([[0.01, 4e-5], [-0.02, -3e-5]])[:, : 2 if request.param else 1]
+    timing_s = rng.normal(0.0, [0.01, 3e-5], (size, 2))[:, : 2 if line_delays else 1]
     states = states.with_blocks(*camera_blocks(cameras, timing_s))
     visual.follow_motion(rng.normal(0, 1, (VERTICES, 3)))
     visual.refresh(states)
-    return Scene(visual, states, Problem(states, visual, ()))
+    return Scene(visual, states, Problem(states, visual, ()), models)
 
 
 @pytest.fixture(scope="module")
 def dense(scene: Scene) -> tuple[F64, F64]:
-    """Weighted residuals and Jacobian by nodes, then landmarks."""
+    return dense_equations(scene)
+
+
+def dense_equations(scene: Scene) -> tuple[F64, F64]:
+    """Return weighted residuals and Jacobian by nodes, then landmarks."""
     residual = scene.residual(scene.states)
     weight = np.sqrt(1.0 / (1.0 + (residual**2).sum(axis=1) / SCALE2))
     by_node = numeric_jacobian(scene.residual, scene.states, 1e-5)
@@ -88,6 +99,20 @@ def dense(scene: Scene) -> tuple[F64, F64]:
 def test_the_reduced_system_is_the_schur_complement(
     scene: Scene, dense: tuple[F64, F64], damping: float
 ) -> None:
+    assert_is_schur_complement(scene, dense, damping)
+
+
+def test_a_rig_of_all_models_is_estimated_by_the_same_kernels() -> None:
+    scene = make_scene(EVERY_MODEL, line_delays=True)
+    r, J = dense_equations(scene)
+    assert_is_schur_complement(scene, (r, J), 1e-3)
+    # every column on its own scale
+    linear = scene.problem.linearize(scene.states, 1e-3)
+    diagonal = np.einsum("rc,rc->c", J, J)[: 3 * scene.states.num_nodes]
+    np.testing.assert_allclose(linear.diagonal.reshape(-1), diagonal, rtol=1e-5, atol=1e-12)
+
+
+def assert_is_schur_complement(scene: Scene, dense: tuple[F64, F64], damping: float) -> None:
     r, J = dense
     nodes = 3 * scene.states.num_nodes
     H = J.T @ J
@@ -126,8 +151,11 @@ def test_a_step_moves_landmarks_as_dense_algebra_does(scene: Scene, dense: tuple
 def test_padding_of_narrow_cameras_has_no_effect(scene: Scene) -> None:
     linear = scene.problem.linearize(scene.states, 0.0)
     intrinsics = scene.states.nodes("camera intrinsics")
-    unused = linear.diagonal[intrinsics].reshape(2, -1)[0, 5:]
-    assert not unused.any()
+    diagonal = linear.diagonal[intrinsics].reshape(len(intrinsics), -1)
+    for row, (projection, distortion) in enumerate(scene.models):
+        size = INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion]
+        assert diagonal[row, :size].all()
+        assert not diagonal[row, size:].any()
     offset = scene.states.nodes("camera timing").reshape(-1)
     used = scene.states.blocks["camera timing"].dimension
     assert linear.diagonal[offset, :used].all()
@@ -153,10 +181,11 @@ def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
     delay_s = timing_s[measured.camera, 0].copy()
     if timing_s.shape[1] > 1:
         delay_s += timing_s[measured.camera, 1] * measured.uv_px[:, 1]
-    cameras = Cameras(scene.states.blocks["camera extrinsics"].values, np.zeros((2, 9)))
-    cameras.parameters[:, 0] = [0, 1]
-    cameras.parameters[:, 1:] = scene.states.blocks["camera intrinsics"].values
-    plain = VisualTerms(visual_kernels(MODELS), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    cameras = Cameras.of(
+        [make_camera(*model) for model in scene.models],
+        scene.states.blocks["camera extrinsics"].values,
+    )
+    plain = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=Loss.CAUCHY)
     velocity = rng.normal(0, 1, (VERTICES, 3))
     plain.follow_motion(velocity, delay_s)
     assert plain.refresh(scene.states)
@@ -165,6 +194,6 @@ def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
     np.testing.assert_allclose(
         plain.errors(scene.states)[0], scene.visual.errors(scene.states)[0], rtol=1e-12
     )
-    without = VisualTerms(visual_kernels(MODELS), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    without = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=Loss.CAUCHY)
     assert not without.refresh(scene.states)
     assert np.abs(without.errors(scene.states)[0] - plain.errors(scene.states)[0]).max() > 0.1

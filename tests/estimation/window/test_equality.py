@@ -15,11 +15,11 @@ from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.terms.prior import PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import camera_table
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.inertial import InertialChain
@@ -71,7 +71,7 @@ def general_problem(
     """State the smoother's window with landmarks in M through the general problem."""
     rows = smoother.tracks.landmark_rows
     data, _ = smoother.tracks.data(rows, smoother.options.huber_sigmas)
-    models, cameras = camera_table(tracks.cameras, tracks.T_I_C)
+    cameras = Cameras.of(tracks.cameras, tracks.T_I_C)
     v_M, b_g, b_a = (np.ascontiguousarray(window.motion[:, k : k + 3]) for k in (0, 3, 6))
     states = States(window.T_M_I, v_M, b_g, b_a, places(tracks, smoother, window))
     observations = Observations(
@@ -100,9 +100,7 @@ def general_problem(
         PosePrior(first, start.T_M_I[None], np.diag(1.0 / SIGMA[:6])),
         *(VertexVectorPrior(kind, first, x[None], s) for kind, x, s in vectors),
     ]
-    visual = VisualTerms(
-        visual_kernels(models), observations, cameras, len(window), loss=Loss.HUBER
-    )
+    visual = VisualTerms(visual_kernels(), observations, cameras, len(window), loss=Loss.HUBER)
     return Problem(states, visual, terms), states
 
 
@@ -111,7 +109,7 @@ def window_problem(
 ) -> WindowProblem:
     """State the smoother's window at other states, inertial edges integrated there."""
     data, _ = smoother.tracks.data(smoother.tracks.landmark_rows, smoother.options.huber_sigmas)
-    models, cameras = camera_table(tracks.cameras, tracks.T_I_C)
+    cameras = Cameras.of(tracks.cameras, tracks.T_I_C)
     chain = InertialChain(residual_kernel("inertial", sources.inertial), tracks.imu)
     for frame, motion in zip(tracks.frames[1:], window.motion[:-1], strict=False):
         chain.append(frame.imu_times_ns, frame.accel_gyro, motion, is_resting=False)
@@ -122,7 +120,7 @@ def window_problem(
     prior = WindowPrior.of_state(start.T_M_I, motion, SIGMA)
     for T_M_I, motion in zip(window.T_M_I[1:], window.motion[1:], strict=True):
         prior = prior.with_frame(T_M_I, motion)
-    return WindowProblem(window_kernels(models), data, cameras, factors, prior)
+    return WindowProblem(window_kernels(), data, cameras, factors, prior)
 
 
 def places(tracks: SimulatedTracks, smoother: FixedLagSmoother, window: WindowStates) -> F64:

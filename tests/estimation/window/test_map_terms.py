@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64
+from maplab_py.estimation.codegen.kernels import window_kernels
 from maplab_py.estimation.kernels import map_observations as kernels
 from maplab_py.estimation.kernels.window_arguments import DenseSystem
 from maplab_py.estimation.window.alignment import AlignmentProblem, aligned
 from maplab_py.estimation.window.localized import composition_jacobian
-from maplab_py.estimation.window.map_reprojection import map_reprojection_kernel
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.warmup import window_jobs
@@ -252,11 +252,11 @@ def test_residuals_are_those_of_the_camera_models() -> None:
 
 def test_the_warmup_compiles_what_terms_evaluate() -> None:
     jobs = window_jobs()
-    jobs["window PINHOLE RADTAN"]()
+    jobs["window landmarks"]()
     jobs["window"]()
-    by_hand = (kernels.fill_arguments, kernels.weigh, kernels.sum_observations, kernels.add_square)
+    by_hand = (kernels.weigh, kernels.sum_observations, kernels.add_square)
     ahead_by_hand = [set(k.signatures) for k in by_hand]
-    kernel = map_reprojection_kernel(Projection.PINHOLE, Distortion.RADTAN).evaluate
+    kernel = window_kernels().reproject_map
     ahead = set(kernel.signatures)
     terms, states = window()
     terms.add_to(DenseSystem.zeros(15 * FRAMES + 6), states, states)

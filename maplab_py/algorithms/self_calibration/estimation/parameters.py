@@ -14,8 +14,7 @@ from maplab_py.estimation.blocks import Manifold, ParameterBlocks
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATION
-from maplab_py.sensors import Projection
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE, parameter_names
+from maplab_py.sensors.camera import DISTORTION_SIZE, MIRROR_NAMES, parameter_names
 from maplab_py.sensors.imu import TRIANGLE_NAMES
 
 _PRIOR_MIRROR = 0.2
@@ -127,10 +126,9 @@ def _imu(row: int, number: str, options: SelfCalibrationOptions) -> list[Paramet
 def _intrinsics(
     rig: RigCameras, row: int, number: str, options: SelfCalibrationOptions
 ) -> list[Parameter]:
-    model, *values = rig.cameras.parameters[row]
-    projection, distortion = rig.models[int(model)]
-    mirrors = INTRINSICS_SIZE[projection] - INTRINSICS_SIZE[Projection.PINHOLE]
-    focal = options.prior_focal_relative * float(values[mirrors])
+    projection, distortion = rig.models[row]
+    mirrors = len(MIRROR_NAMES[projection])
+    focal = options.prior_focal_relative * float(rig.cameras.parameters[row, 1 + mirrors])
     sigma = [_PRIOR_MIRROR] * mirrors + [focal] * 2 + [options.prior_centre_px] * 2
     sigma += [options.prior_distortion] * DISTORTION_SIZE[distortion]
     names = parameter_names(projection, distortion)

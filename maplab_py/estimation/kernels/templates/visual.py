@@ -27,8 +27,8 @@ those of a fixed number of chunks, added in a fixed order; a row is summed in th
 A landmark may have a prior, a place and the inverse of its standard deviation, which adds to H, to
 Q'r and to the cost.
 
-Where cameras are estimated, an observation touches the CAMERA_COLUMNS numbers of its camera too:
-extrinsics, time offset, intrinsics. With their Jacobian C_o (2 x CAMERA_COLUMNS), V_c = sum Q_o' C_o
+Where cameras are estimated, an observation touches the W numbers of its camera, too: extrinsics,
+delays, intrinsics. With their Jacobian C_o (2 x W), V_c = sum Q_o' C_o
 over the landmark's observations by camera c, and Z_c = L^-1 V_c, eliminating the landmark leaves
 
     C_o' P_o - Z_c' Y_o   between camera c and pose k(o): the border,
@@ -38,17 +38,70 @@ over the landmark's observations by camera c, and Z_c = L^-1 V_c, eliminating th
 A camera whose clock is late by t sees a landmark where its pixel was t earlier: the residual gets
 uv_motion t, where uv_motion is the pixel's velocity from the states' velocities (Qin and Shen,
 Online Temporal Calibration for Monocular Visual-Inertial Systems, IROS 2018, with the velocity
-from the states instead of from the neighbouring image). Without cameras to estimate CAMERA_COLUMNS
-is zero and the compiler leaves all this out.
+from the states instead of from the neighbouring image). Row v of a rolling shutter is read v line
+delays l after the first one: t becomes t + v l, and a row of uv_motion is [px/s, px/s, v] (Li, Kim and
+Mourikis, Real-time motion tracking on a cellphone using inertial sensing and a rolling-shutter camera,
+ICRA 2013, section IV, to first order in the time within an image). Without cameras to estimate W is zero.
 
-This file is a template: `reproject` is generated for the camera models in use, and both are
-compiled as one module (see `codegen.modules`).
+This file is a template: it is compiled as one module with `camera` and the camera models (see
+`codegen.kernels`).
 """
 
 
 # ruff: noqa: F821
 # mypy: ignore-errors
 # --- kernels ---
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns):
+    """Write residual, depth and Jacobian of one observation to `out`; the camera's if it has columns."""
+    R = rotation(poses, k)
+    x, y, z = (
+        points[landmark, 0] - poses[k, 4],
+        points[landmark, 1] - poses[k, 5],
+        points[landmark, 2] - poses[k, 6],
+    )
+    b0 = R[0] * x + R[3] * y + R[6] * z
+    b1 = R[1] * x + R[4] * y + R[7] * z
+    b2 = R[2] * x + R[5] * y + R[8] * z
+    c0, c1, c2 = from_axes(axes, c, b0 - axes[c, 9], b1 - axes[c, 10], b2 - axes[c, 11])
+    u, v, u0, u1, u2, v0, v1, v2 = project(parameters, c, c0, c1, c2)
+    out[0], out[1], out[2] = u - uv[o, 0], v - uv[o, 1], c2
+    for i in range(2):
+        if i == 1:
+            u0, u1, u2 = v0, v1, v2
+        p0, p1, p2 = to_axes(axes, c, u0, u1, u2)
+        g0 = R[0] * p0 + R[1] * p1 + R[2] * p2
+        g1 = R[3] * p0 + R[4] * p1 + R[5] * p2
+        g2 = R[6] * p0 + R[7] * p1 + R[8] * p2
+        t0, t1, t2 = cross(p0, p1, p2, b0, b1, b2)
+        write_row(out, POSE + i, -g0, -g1, -g2)
+        write_row(out, POSE + 6 + i, t0, t1, t2)
+        write_row(out, LANDMARK + i, g0, g1, g2)
+        if columns > 0:
+            t0, t1, t2 = cross(u0, u1, u2, c0, c1, c2)
+            write_row(out, CAMERA + i, -p0, -p1, -p2)
+            write_row(out, CAMERA + 6 + i, t0, t1, t2)
+    if columns > 0:
+        project_by_parameters(parameters, c, c0, c1, c2, out, INTRINSICS)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def reproject_only(poses, k, axes, c, parameters, points, landmark, uv, o, out):
+    """Write residual and depth of one observation to `out`."""
+    R = rotation(poses, k)
+    x, y, z = (
+        points[landmark, 0] - poses[k, 4],
+        points[landmark, 1] - poses[k, 5],
+        points[landmark, 2] - poses[k, 6],
+    )
+    b0 = R[0] * x + R[3] * y + R[6] * z - axes[c, 9]
+    b1 = R[1] * x + R[4] * y + R[7] * z - axes[c, 10]
+    b2 = R[2] * x + R[5] * y + R[8] * z - axes[c, 11]
+    c0, c1, c2 = from_axes(axes, c, b0, b1, b2)
+    pixel = project(parameters, c, c0, c1, c2)
+    out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def add_pose(out, n, k, Y, square, grad, diag):
     """Write W = Q'P of one observation to Y[n]; add P'P to square[k], its diagonal and P'r."""
@@ -192,18 +245,29 @@ def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def add_time_offset(out, uv_motion, time_offset, o, c):
-    """Shift the residual by the time offset and write its column."""
-    out[0] += uv_motion[o, 0] * time_offset[c, 0]
-    out[1] += uv_motion[o, 1] * time_offset[c, 0]
-    out[TIME_OFFSET] = uv_motion[o, 0]
-    out[TIME_OFFSET + 1] = uv_motion[o, 1]
+def add_delay(out, uv_motion, timing, o, c):
+    """Shift the residual by the delay of the pixel's row."""
+    delay = timing[c, 0]
+    if timing.shape[1] > 1:
+        delay += timing[c, 1] * uv_motion[o, 2]
+    out[0] += uv_motion[o, 0] * delay
+    out[1] += uv_motion[o, 1] * delay
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def add_camera(out, c, k, s, V, border, square, camera_gradient, camera_diagonal):
+def add_delay_columns(out, uv_motion, timing, o):
+    """Write the columns of the image delay and of the line delay, zero where it is not estimated."""
+    row = uv_motion[o, 2] if timing.shape[1] > 1 else 0.0
+    for i in range(2):
+        out[DELAY + i] = uv_motion[o, i]
+        out[DELAY + 2 + i] = uv_motion[o, i] * row
+        out[DELAY + 4 + i] = 0.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def add_camera(out, columns, c, k, s, V, border, square, camera_gradient, camera_diagonal):
     """Add one observation's share to V[s] of its camera c, border, square, gradient, diagonal."""
-    for w in range(CAMERA_COLUMNS):
+    for w in range(columns):
         a, b = out[CAMERA + 2 * w], out[CAMERA + 2 * w + 1]
         if a == 0.0 and b == 0.0:
             continue
@@ -213,19 +277,19 @@ def add_camera(out, c, k, s, V, border, square, camera_gradient, camera_diagonal
         camera_diagonal[c, w] += a * a + b * b
         for e in range(6):
             border[c, k, w, e] += a * out[POSE + 2 * e] + b * out[POSE + 2 * e + 1]
-        for x in range(CAMERA_COLUMNS):
+        for x in range(columns):
             square[c, c, w, x] += a * out[CAMERA + 2 * x] + b * out[CAMERA + 2 * x + 1]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def eliminate_cameras(cameras, count, V, f, g, square, camera_gradient):
+def eliminate_cameras(cameras, count, columns, V, f, g, square, camera_gradient):
     """Turn V of the landmark's cameras into Z = L^-1 V and subtract Z'Z and Z'z."""
     z0 = g[0] * f[0]
     z1 = (g[1] - f[1] * z0) * f[2]
     z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
     for s in range(count):
         c = cameras[s]
-        for w in range(CAMERA_COLUMNS):
+        for w in range(columns):
             y0 = V[s, 0, w] * f[0]
             y1 = (V[s, 1, w] - f[1] * y0) * f[2]
             y2 = (V[s, 2, w] - f[3] * y0 - f[4] * y1) * f[5]
@@ -234,20 +298,20 @@ def eliminate_cameras(cameras, count, V, f, g, square, camera_gradient):
     for s in range(count):
         for t in range(count):
             c, d = cameras[s], cameras[t]
-            for w in range(CAMERA_COLUMNS):
+            for w in range(columns):
                 y0, y1, y2 = V[s, 0, w], V[s, 1, w], V[s, 2, w]
-                for x in range(CAMERA_COLUMNS):
+                for x in range(columns):
                     square[c, d, w, x] -= y0 * V[t, 0, x] + y1 * V[t, 1, x] + y2 * V[t, 2, x]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def subtract_border(first, last, base, pose_of, cameras, count, Y, V, border):
+def subtract_border(first, last, base, pose_of, cameras, count, columns, Y, V, border):
     """Subtract Z'Y of a landmark's observations after `eliminate_cameras` has turned V into Z."""
     for s in range(count):
         c = cameras[s]
         for o in range(first, last):
             n, k = o - base, pose_of[o]
-            for w in range(CAMERA_COLUMNS):
+            for w in range(columns):
                 y0, y1, y2 = V[s, 0, w], V[s, 1, w], V[s, 2, w]
                 for e in range(6):
                     border[c, k, w, e] -= y0 * Y[n, 0, e] + y1 * Y[n, 1, e] + y2 * Y[n, 2, e]
@@ -264,7 +328,7 @@ def slot_of(camera, cameras, count):
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
-    """Form the reduced normal equations of poses and, with CAMERA_COLUMNS > 0, cameras.
+    """Form the reduced normal equations of poses and, where cameras have columns, cameras.
 
     In: `data`, `at` and `rule` as in `kernels.visual_arguments`. Room: Y (observations of the largest
     slab, 3, 6).
@@ -275,18 +339,20 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
     array unpacked from a tuple.
     """
     start, pose_of, camera_of, uv, inverse_sigma, scale2, uv_motion = data
-    poses, extrinsics, parameters, points, time_offset = at
+    poses, extrinsics, parameters, points, timing = at
     loss_kind, damping, move_points = rule
     square, gradient, diagonal, border, camera_square, camera_gradient, camera_diagonal = sums
+    axes, columns = camera_axes(extrinsics), camera_gradient.shape[2]
     for slab in range(len(plan.slab_start) - 1):
         base = start[plan.slab_start[slab]]
         for chunk in prange(len(cost)):
             grad, diag, pose_square = gradient[chunk], diagonal[chunk], square[chunk]
             B, C = border[chunk], camera_square[chunk]
             cgrad, cdiag = camera_gradient[chunk], camera_diagonal[chunk]
-            V = np.empty((len(extrinsics), 3, CAMERA_COLUMNS))
+            V = np.empty((len(extrinsics), 3, columns))
             cameras = np.empty(len(extrinsics), dtype=np.int64)
-            out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
+            out = np.empty(NUM_OUT + 2 * columns)
+            h, f, g = np.empty(6), np.empty(6), np.empty(3)
             total = 0.0
             for landmark in range(plan.chunk_start[slab, chunk], plan.chunk_start[slab, chunk + 1]):
                 first, last = start[landmark], start[landmark + 1]
@@ -297,26 +363,32 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
                         Y[n] = 0.0
                         continue
                     k, c = pose_of[o], camera_of[o]
-                    reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
-                    if CAMERA_COLUMNS > 0:
-                        add_time_offset(out, uv_motion, time_offset, o, c)
-                    rho += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                    reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns)
+                    if columns > 0:
+                        add_delay(out, uv_motion, timing, o, c)
+                    loss, factor = weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                    rho += loss
                     add_landmark_sums(out, h, g)
                     add_pose(out, n, k, Y, pose_square, grad, diag)
-                    if CAMERA_COLUMNS > 0:
+                    if columns > 0:
+                        add_delay_columns(out, uv_motion, timing, o)
+                        for w in range(CAMERA, CAMERA + 2 * columns):
+                            out[w] *= factor
                         s = slot_of(c, cameras, count)
                         if s == count:
                             cameras[s] = c
                             V[s] = 0.0
                             count += 1
-                        add_camera(out, c, k, s, V, B, C, cgrad, cdiag)
+                        add_camera(out, columns, c, k, s, V, B, C, cgrad, cdiag)
                 total += rho
                 if move_points:
                     factor_3x3(h, damping, f)
                     eliminate_landmark(first, last, base, pose_of, grad, Y, f, g)
-                    if CAMERA_COLUMNS > 0:
-                        eliminate_cameras(cameras, count, V, f, g, C, cgrad)
-                        subtract_border(first, last, base, pose_of, cameras, count, Y, V, B)
+                    if columns > 0:
+                        eliminate_cameras(cameras, count, columns, V, f, g, C, cgrad)
+                        subtract_border(
+                            first, last, base, pose_of, cameras, count, columns, Y, V, B
+                        )
             cost[chunk] += total
         if move_points:
             subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers)
@@ -325,19 +397,21 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, sums):
-    """Step the landmarks for given steps of poses (P, 6) and cameras (C, CAMERA_COLUMNS).
+    """Step the landmarks for given steps of poses (P, 6) and cameras (C, W).
 
     In: `new` is what `at` becomes with these steps. Out: new.points (L, 3); sums (chunks, 2): new
     sum of rho, and twice the decrease of the quadratic model. Row 0 of sums holds the sum over all
     chunks at the end.
     """
     start, pose_of, camera_of, uv, inverse_sigma, scale2, uv_motion = data
-    poses, extrinsics, parameters, points, time_offset = at
-    new_poses, new_extrinsics, new_parameters, new_points, new_time_offset = new
+    poses, extrinsics, parameters, points, timing = at
+    new_poses, new_extrinsics, new_parameters, new_points, new_timing = new
     loss_kind, damping, move_points = rule
-    chunks = sums.shape[0]
+    chunks, columns = sums.shape[0], camera_step.shape[1]
+    axes, new_axes = camera_axes(extrinsics), camera_axes(new_extrinsics)
     for chunk in prange(chunks):
-        out, h, f, g = np.empty(NUM_OUT), np.empty(6), np.empty(6), np.empty(3)
+        out = np.empty(NUM_OUT + 2 * columns)
+        h, f, g = np.empty(6), np.empty(6), np.empty(3)
         d = np.zeros(3)
         new_cost, decrease = 0.0, 0.0
         for landmark in range(chunk_start[chunk], chunk_start[chunk + 1]):
@@ -347,17 +421,18 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
                 if inverse_sigma[o] == 0.0:
                     continue
                 k, c = pose_of[o], camera_of[o]
-                reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
-                if CAMERA_COLUMNS > 0:
-                    add_time_offset(out, uv_motion, time_offset, o, c)
-                weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns)
+                if columns > 0:
+                    add_delay(out, uv_motion, timing, o, c)
+                    add_delay_columns(out, uv_motion, timing, o)
+                _, factor = weighted(out, inverse_sigma[o], loss_kind, scale2[o])
                 decrease += out[0] * out[0] + out[1] * out[1]
                 for e in range(6):
                     out[0] += out[POSE + 2 * e] * pose_step[k, e]
                     out[1] += out[POSE + 2 * e + 1] * pose_step[k, e]
-                for w in range(CAMERA_COLUMNS):
-                    out[0] += out[CAMERA + 2 * w] * camera_step[c, w]
-                    out[1] += out[CAMERA + 2 * w + 1] * camera_step[c, w]
+                for w in range(columns):
+                    out[0] += factor * out[CAMERA + 2 * w] * camera_step[c, w]
+                    out[1] += factor * out[CAMERA + 2 * w + 1] * camera_step[c, w]
                 decrease -= out[0] * out[0] + out[1] * out[1]
                 add_landmark_sums(out, h, g)
             d[:] = 0.0
@@ -372,19 +447,10 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
                     continue
                 k, c = pose_of[o], camera_of[o]
                 reproject_only(
-                    new_poses,
-                    k,
-                    new_extrinsics,
-                    c,
-                    new_parameters,
-                    new_points,
-                    landmark,
-                    uv,
-                    o,
-                    out,
+                    new_poses, k, new_axes, c, new_parameters, new_points, landmark, uv, o, out
                 )
-                if CAMERA_COLUMNS > 0:
-                    add_time_offset(out, uv_motion, new_time_offset, o, c)
+                if columns > 0:
+                    add_delay(out, uv_motion, new_timing, o, c)
                 s = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma[o] * inverse_sigma[o]
                 new_cost += rho_and_weight(loss_kind, s, scale2[o])[0]
         sums[chunk, 0] = new_cost
@@ -399,11 +465,12 @@ def evaluate(data, at, error_depth):
     """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
     start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px
     poses, extrinsics, parameters, points, _ = at
+    axes = camera_axes(extrinsics)
     for landmark in prange(len(start) - 1):
         out = np.empty(NUM_OUT)
         for o in range(start[landmark], start[landmark + 1]):
             k, c = pose_of[o], camera_of[o]
-            reproject_only(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+            reproject_only(poses, k, axes, c, parameters, points, landmark, uv, o, out)
             error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
             error_depth[o, 1] = out[2]
 
@@ -413,11 +480,12 @@ def pixel_motion(data, at, tangent, motion):
     """Write the velocity (O, 2) [px/s] of every projection for velocities (P, 6) of the poses."""
     start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px
     poses, extrinsics, parameters, points, _ = at
+    axes = camera_axes(extrinsics)
     for landmark in prange(len(start) - 1):
         out = np.empty(NUM_OUT)
         for o in range(start[landmark], start[landmark + 1]):
             k, c = pose_of[o], camera_of[o]
-            reproject(poses, k, extrinsics, c, parameters, points, landmark, uv, o, out)
+            reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, 0)
             a, b = 0.0, 0.0
             for e in range(6):
                 a += out[POSE + 2 * e] * tangent[k, e]

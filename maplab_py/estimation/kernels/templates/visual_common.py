@@ -1,8 +1,8 @@
 """What the visual kernels share: weights, and the 3 x 3 system of one landmark.
 
 `out` holds one observation: residual (2), depth, and the Jacobian's columns of two entries each:
-pose (6) from POSE on, landmark (3) from LANDMARK on and, where cameras are estimated, theirs
-(CAMERA_COLUMNS) from CAMERA on; NUM_OUT entries in all.
+pose (6) from POSE on, landmark (3) from LANDMARK on; NUM_OUT entries in all, after which those of an
+estimated camera may follow.
 """
 
 # ruff: noqa: F821
@@ -14,7 +14,7 @@ LARGEST_DAMPED = 1e32
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 def weighted(out, inverse_sigma, loss_kind, scale2):
-    """Whiten residual and Jacobian in `out` and apply the robust weight; return rho."""
+    """Whiten residual and Jacobian in `out`, apply the robust weight; return rho and the factor."""
     s = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma * inverse_sigma
     rho, weight = rho_and_weight(loss_kind, s, scale2)
     factor = inverse_sigma * math.sqrt(weight)
@@ -22,7 +22,7 @@ def weighted(out, inverse_sigma, loss_kind, scale2):
     out[1] *= factor
     for k in range(POSE, NUM_OUT):
         out[k] *= factor
-    return rho
+    return rho, factor
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)

@@ -61,6 +61,7 @@ def keep_jacobians(data, at, prior, loss_kind, chunk_start, kept, sums, cost):
     """
     start, pose_of, camera_of, uv, inverse_sigma, scale2, _ = data
     poses, extrinsics, parameters, points, _ = at
+    axes = camera_axes(extrinsics)
     jacobian, landmark_square, landmark_gradient, _ = kept
     square, gradient = sums
     for chunk in prange(len(chunk_start) - 1):
@@ -73,11 +74,9 @@ def keep_jacobians(data, at, prior, loss_kind, chunk_start, kept, sums, cost):
                     for c in range(12):
                         jacobian[o, c] = 0.0
                     continue
-                k = pose_of[o]
-                reproject(
-                    poses, k, extrinsics, camera_of[o], parameters, points, landmark, uv, o, out
-                )
-                rho += weighted(out, inverse_sigma[o], loss_kind, scale2[o])
+                k, c = pose_of[o], camera_of[o]
+                reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, 0)
+                rho += weighted(out, inverse_sigma[o], loss_kind, scale2[o])[0]
                 add_gradients(out, chunk, k, gradient, g)
                 keep_rounded(out, o, jacobian)
                 add_squares(out, chunk, k, square, h)

@@ -1,12 +1,14 @@
 """The landmarks of a window: eliminated one after the other into one dense system.
 
-A landmark h in the camera of its anchor frame a (`symbolic.residuals.anchored_reprojection`) is seen by
-frames k. An observation from the anchor frame itself, with whichever camera, moves with the frame and
-depends on h only. All others have Jacobians A_o by the anchor's pose, P_o by their own frame's and Q_o
-by h. With H = sum Q_o' Q_o = L L' and W_f = sum Q_o' (A_o or P_o) by frame f, eliminating h subtracts
-Y_f' Y_g, Y_f = L^-1 W_f, from the block of frames f, g, as in the template `visual`. There are few
-frames, so the system is a dense matrix and every landmark a dense row of it; what it takes to step a
-landmark is kept, since it is small, and no Jacobian is evaluated a second time.
+A landmark h = [x / z, y / z, 1 / z] has the coordinates x, y, z in the camera of its anchor frame a and is
+seen by frames k. Everything is multiplied by 1 / z, so that landmarks at infinity are regular (Civera et
+al., Inverse Depth Parametrization for Monocular SLAM, TRO 2008, eq. (3)-(6), with the place in the image
+instead of two angles). An observation from the anchor frame itself, with whichever camera, moves with
+the frame and depends on h only. All others have Jacobians A_o by the anchor's pose, P_o by their own
+frame's and Q_o by h. With H = sum Q_o' Q_o = L L' and W_f = sum Q_o' (A_o or P_o) by frame f,
+eliminating h subtracts Y_f' Y_g, Y_f = L^-1 W_f, from the block of frames f, g, as in the template
+`visual`. There are few frames, so the system is a dense matrix and every landmark a dense row of it;
+what it takes to step a landmark is kept, since it is small, and no Jacobian is evaluated a second time.
 
 Frames of the prior keep the linearisation point they had when they entered it. There Jacobians are
 evaluated, residuals where the frame is (first-estimate Jacobians: Huang, Mourikis and Roumeliotis,
@@ -29,6 +31,70 @@ BEHIND = 1e4
 """Squared whitened residual of a landmark behind a camera."""
 SMALLEST_INVERSE_DEPTH = 1e-6
 MOST_NEWTON_STEPS, CONVERGED = 50, 1e-10
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def anchored_ray(poses, a, k, axes, d, h, n):
+    """Return the landmark's ray in the body A of its anchor, in M, and from I in M, times 1 / z."""
+    w = h[n, 2]
+    a0, a1, a2 = to_axes(axes, d, h[n, 0], h[n, 1], 1.0)
+    a0, a1, a2 = a0 + w * axes[d, 9], a1 + w * axes[d, 10], a2 + w * axes[d, 11]
+    R = rotation(poses, a)
+    return (
+        a0, a1, a2,
+        R[0] * a0 + R[1] * a1 + R[2] * a2 + w * (poses[a, 4] - poses[k, 4]),
+        R[3] * a0 + R[4] * a1 + R[5] * a2 + w * (poses[a, 5] - poses[k, 5]),
+        R[6] * a0 + R[7] * a1 + R[8] * a2 + w * (poses[a, 6] - poses[k, 6]),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def reproject(poses, a, k, axes, d, c, parameters, h, n, uv, o, out):
+    """Write residual, depth times 1 / z, and Jacobians by frame k, anchor a and h to `out`."""
+    w = h[n, 2]
+    a0, a1, a2, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
+    A, R = rotation(poses, a), rotation(poses, k)
+    b0 = R[0] * x + R[3] * y + R[6] * z
+    b1 = R[1] * x + R[4] * y + R[7] * z
+    b2 = R[2] * x + R[5] * y + R[8] * z
+    c0, c1, c2 = from_axes(axes, c, b0 - w * axes[c, 9], b1 - w * axes[c, 10], b2 - w * axes[c, 11])
+    u, v, u0, u1, u2, v0, v1, v2 = project(parameters, c, c0, c1, c2)
+    out[0], out[1], out[2] = u - uv[o, 0], v - uv[o, 1], c2
+    for i in range(2):
+        if i == 1:
+            u0, u1, u2 = v0, v1, v2
+        p0, p1, p2 = to_axes(axes, c, u0, u1, u2)
+        m0 = R[0] * p0 + R[1] * p1 + R[2] * p2
+        m1 = R[3] * p0 + R[4] * p1 + R[5] * p2
+        m2 = R[6] * p0 + R[7] * p1 + R[8] * p2
+        write_row(out, ANCHOR + i, w * m0, w * m1, w * m2)
+        write_row(out, POSE + i, -w * m0, -w * m1, -w * m2)
+        t0, t1, t2 = cross(p0, p1, p2, b0, b1, b2)
+        write_row(out, POSE + 6 + i, t0, t1, t2)
+        by_w = m0 * (poses[a, 4] - poses[k, 4]) + m1 * (poses[a, 5] - poses[k, 5])
+        by_w += m2 * (poses[a, 6] - poses[k, 6])
+        by_w -= p0 * axes[c, 9] + p1 * axes[c, 10] + p2 * axes[c, 11]
+        q0 = A[0] * m0 + A[3] * m1 + A[6] * m2
+        q1 = A[1] * m0 + A[4] * m1 + A[7] * m2
+        q2 = A[2] * m0 + A[5] * m1 + A[8] * m2
+        by_w += q0 * axes[d, 9] + q1 * axes[d, 10] + q2 * axes[d, 11]
+        t0, t1, t2 = cross(a0, a1, a2, q0, q1, q2)
+        write_row(out, ANCHOR + 6 + i, t0, t1, t2)
+        t0, t1, _ = from_axes(axes, d, q0, q1, q2)
+        write_row(out, LANDMARK + i, t0, t1, by_w)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+def reproject_only(poses, a, k, axes, d, c, parameters, h, n, uv, o, out):
+    """Write residual, and depth times 1 / z, to `out`."""
+    w, R = h[n, 2], rotation(poses, k)
+    _, _, _, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
+    b0 = R[0] * x + R[3] * y + R[6] * z - w * axes[c, 9]
+    b1 = R[1] * x + R[4] * y + R[7] * z - w * axes[c, 10]
+    b2 = R[2] * x + R[5] * y + R[8] * z - w * axes[c, 11]
+    c0, c1, c2 = from_axes(axes, c, b0, b1, b2)
+    pixel = project(parameters, c, c0, c1, c2)
+    out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
@@ -110,6 +176,7 @@ def eliminate(data, at, rule, system, kept):
     """
     start, frame, camera, uv, inverse_sigma, scale2, anchor_frame, anchor_camera, expected = data
     poses, points, extrinsics, parameters = at
+    axes = camera_axes(extrinsics)
     loss, damping, poses_0, is_elsewhere = rule
     matrix, reduced_gradient, full_gradient, diagonal = system
     num_slots, slots, Y, factor, square, gradient = kept
@@ -121,15 +188,15 @@ def eliminate(data, at, rule, system, kept):
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
             if is_elsewhere[a] or is_elsewhere[k]:
-                reproject_only(poses, a, k, extrinsics, d, c, parameters, points, n, uv, o, now)
-                reproject(poses_0, a, k, extrinsics, d, c, parameters, points, n, uv, o, out)
+                reproject_only(poses, a, k, axes, d, c, parameters, points, n, uv, o, now)
+                reproject(poses_0, a, k, axes, d, c, parameters, points, n, uv, o, out)
                 out[0], out[1], out[2] = now[0], now[1], now[2]
             else:
-                reproject(poses, a, k, extrinsics, d, c, parameters, points, n, uv, o, out)
+                reproject(poses, a, k, axes, d, c, parameters, points, n, uv, o, out)
             if not out[2] > 0.0:
                 total += rho_and_weight(loss, BEHIND, scale2[o])[0]
                 continue
-            total += weighted(out, inverse_sigma[o], loss, scale2[o])
+            total += weighted(out, inverse_sigma[o], loss, scale2[o])[0]
             add_landmark_sums(out, h, g)
             if k == a:
                 continue
@@ -168,6 +235,7 @@ def substitute(data, at, rule, kept, step, new):
     start, frame, camera, uv, inverse_sigma, scale2, anchor_frame, anchor_camera, expected = data
     points, damping, loss = at.h, rule.damping, rule.loss
     poses, new_points, extrinsics, parameters = new
+    axes = camera_axes(extrinsics)
     num_slots, slots, Y, factor, square, gradient = kept
     f, g, dh, out = np.empty(6), np.empty(3), np.empty(3), np.empty(NUM_OUT)
     promised, norm2, total = 0.0, 0.0, 0.0
@@ -198,7 +266,7 @@ def substitute(data, at, rule, kept, step, new):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, a, k, extrinsics, d, c, parameters, new_points, n, uv, o, out)
+            reproject_only(poses, a, k, axes, d, c, parameters, new_points, n, uv, o, out)
             e2 = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma[o] * inverse_sigma[o]
             total += rho_and_weight(loss, e2 if out[2] > 0.0 else BEHIND, scale2[o])[0]
         r = expected[n, 1] * (new_points[n, 2] - expected[n, 0])
@@ -211,37 +279,89 @@ def evaluate(data, at, error_depth):
     """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
     start, frame, camera, uv, _, _, anchor_frame, anchor_camera, _ = data
     poses, points, extrinsics, parameters = at
+    axes = camera_axes(extrinsics)
     out = np.empty(NUM_OUT)
     for n in range(len(start) - 1):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, a, k, extrinsics, d, c, parameters, points, n, uv, o, out)
+            reproject_only(poses, a, k, axes, d, c, parameters, points, n, uv, o, out)
             error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
             error_depth[o, 1] = out[2] / points[n, 2]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def unproject(camera, uv, extrinsics, parameters, xy):
+def unproject(camera, uv, parameters, xy):
     """Find the places xy (N, 2) on the plane z = 1 of pixels (N, 2) by Newton's method.
 
-    A landmark h = [x, y, 0] seen by the camera of its anchor has the pixel as residual. xy is given
-    near the solution; what does not converge becomes not-a-number.
+    xy is given near the solution; what does not converge becomes not-a-number.
     """
-    pose, h, out = np.zeros((1, 7)), np.zeros((1, 3)), np.empty(NUM_OUT)
-    pose[0, 3] = 1.0
     for o in range(len(uv)):
-        c = camera[o]
-        h[0, 0], h[0, 1] = xy[o, 0], xy[o, 1]
+        c, x, y = camera[o], xy[o, 0], xy[o, 1]
         xy[o, 0], xy[o, 1] = np.nan, np.nan
         for _ in range(MOST_NEWTON_STEPS):
-            reproject(pose, 0, 0, extrinsics, c, c, parameters, h, 0, uv, o, out)
-            a, b, d, e = out[LANDMARK], out[LANDMARK + 2], out[LANDMARK + 1], out[LANDMARK + 3]
+            u, v, a, b, _, d, e, _ = project(parameters, c, x, y, 1.0)
+            u, v = u - uv[o, 0], v - uv[o, 1]
             determinant = a * e - b * d
-            dx = (e * out[0] - b * out[1]) / determinant
-            dy = (a * out[1] - d * out[0]) / determinant
-            h[0, 0] -= dx
-            h[0, 1] -= dy
+            dx = (e * u - b * v) / determinant
+            dy = (a * v - d * u) / determinant
+            x -= dx
+            y -= dy
             if dx * dx + dy * dy < CONVERGED * CONVERGED:
-                xy[o, 0], xy[o, 1] = h[0, 0], h[0, 1]
+                xy[o, 0], xy[o, 1] = x, y
                 break
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def reproject_map(seen, cameras, T_M_I, T_G_M, p_G, residual, jacobian, visible):
+    """Project landmarks of a map; the frames' mission M has the pose T_G_M (1, 7) in the map's frame G.
+
+    Out: whitened residuals (O, 2), their Jacobian (O, 2, 15) by the tangents of T_M_I and T_G_M and by
+    p_G, and whether the landmark is visible (O,); both are zero where it is not.
+    Source: Schneider 2019, Paper I, eq. (4.4).
+    """
+    frame, camera, landmark, uv, inverse_sigma = seen
+    extrinsics, parameters, limits = cameras
+    axes, G = camera_axes(extrinsics), rotation(T_G_M, 0)
+    for o in range(len(frame)):
+        k, c, n = frame[o], camera[o], landmark[o]
+        x, y, z = p_G[n, 0] - T_G_M[0, 4], p_G[n, 1] - T_G_M[0, 5], p_G[n, 2] - T_G_M[0, 6]
+        m0 = G[0] * x + G[3] * y + G[6] * z
+        m1 = G[1] * x + G[4] * y + G[7] * z
+        m2 = G[2] * x + G[5] * y + G[8] * z
+        R = rotation(T_M_I, k)
+        x, y, z = m0 - T_M_I[k, 4], m1 - T_M_I[k, 5], m2 - T_M_I[k, 6]
+        b0 = R[0] * x + R[3] * y + R[6] * z
+        b1 = R[1] * x + R[4] * y + R[7] * z
+        b2 = R[2] * x + R[5] * y + R[8] * z
+        c0, c1, c2 = from_axes(axes, c, b0 - axes[c, 9], b1 - axes[c, 10], b2 - axes[c, 11])
+        length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+        depth = c2 + limits[c, 0] * length
+        visible[o] = (
+            depth > limits[c, 1]
+            and c2 > -limits[c, 2] * length
+            and math.sqrt(c0 * c0 + c1 * c1) < limits[c, 3] * depth
+        )
+        if not visible[o]:
+            residual[o] = 0.0
+            jacobian[o] = 0.0
+            continue
+        u, v, u0, u1, u2, v0, v1, v2 = project(parameters, c, c0, c1, c2)
+        s = inverse_sigma[o]
+        residual[o, 0], residual[o, 1] = s * (u - uv[o, 0]), s * (v - uv[o, 1])
+        for i in range(2):
+            if i == 1:
+                u0, u1, u2 = v0, v1, v2
+            p0, p1, p2 = to_axes(axes, c, s * u0, s * u1, s * u2)
+            q0 = R[0] * p0 + R[1] * p1 + R[2] * p2
+            q1 = R[3] * p0 + R[4] * p1 + R[5] * p2
+            q2 = R[6] * p0 + R[7] * p1 + R[8] * p2
+            g0 = G[0] * q0 + G[1] * q1 + G[2] * q2
+            g1 = G[3] * q0 + G[4] * q1 + G[5] * q2
+            g2 = G[6] * q0 + G[7] * q1 + G[8] * q2
+            J = jacobian[o, i]
+            J[0], J[1], J[2] = -q0, -q1, -q2
+            J[3], J[4], J[5] = cross(p0, p1, p2, b0, b1, b2)
+            J[6], J[7], J[8] = -g0, -g1, -g2
+            J[9], J[10], J[11] = cross(q0, q1, q2, m0, m1, m2)
+            J[12], J[13], J[14] = g0, g1, g2
