@@ -44,7 +44,7 @@ class Imager:
         v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
         radius2 = ((u - centre[0]) ** 2 + (v - centre[1]) ** 2) / np.sum(centre**2)
         vignette = (1.0 - options.vignette * radius2).astype(np.float32)
-        focal_px = float(np.mean(camera.intrinsics[-4:-2]))
+        focal_px = float(np.mean(camera.central_focal_px))
         caster = RayCaster.of(painted, pixel_rays(camera), focal_px)
         return cls(caster, options, brightness, line_delay_s, at_time, vignette)
 
@@ -98,8 +98,7 @@ def pixel_rays(camera: Camera) -> F64:
     """
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
     wanted = np.stack([u.ravel(), v.ravel()], axis=1)
-    focal, centre = camera.intrinsics[-4:-2], camera.intrinsics[-2:]
-    offset = (wanted - centre) / focal
+    offset = (wanted - camera.intrinsics[-2:]) / camera.central_focal_px
     # starts near the centre, where all models are nearly linear, and proceeds outwards
     x = offset / (1.0 + 0.3 * np.sum(offset**2, axis=1, keepdims=True))
     step = 1e-6

@@ -42,9 +42,17 @@ from maplab_py.simulation.surfaces import Surfaces
 from maplab_py.storage.native import save_map
 
 _SCENE_STREAM, _REPAINT_STREAM, _WHEEL_STREAM = 21, 24, 25
+_PROJECTION_NAMES = {
+    Projection.PINHOLE: "pinhole",
+    Projection.UNIFIED: "omni",
+    Projection.DOUBLE_SPHERE: "ds",
+    Projection.EXTENDED_UNIFIED: "eucm",
+}
 _DISTORTION_NAMES = {
     Distortion.NONE: "none",
     Distortion.RADTAN: "radial-tangential",
+    Distortion.RADTAN5: "radial-tangential",
+    Distortion.RATIONAL: "radial-tangential",
     Distortion.EQUIDISTANT: "equidistant",
     Distortion.FOV: "fov",
 }
@@ -164,7 +172,6 @@ def _imu_yaml(imu: Imu, rate_hz: float) -> list[str]:
 
 
 def _camera_yaml(camera: Camera, T_I_C: F64, rate_hz: float) -> list[str]:
-    model = "pinhole" if camera.projection is Projection.PINHOLE else "omni"
     intrinsics = ", ".join(f"{value:.17g}" for value in camera.intrinsics)
     distortion = ", ".join(f"{value:.17g}" for value in camera.distortion_parameters)
     return [
@@ -173,7 +180,7 @@ def _camera_yaml(camera: Camera, T_I_C: F64, rate_hz: float) -> list[str]:
         *_matrix_yaml(T_I_C),
         f"rate_hz: {rate_hz:g}",
         f"resolution: [{camera.width_px}, {camera.height_px}]",
-        f"camera_model: {model}",
+        f"camera_model: {_PROJECTION_NAMES[camera.projection]}",
         f"intrinsics: [{intrinsics}]",
         f"distortion_model: {_DISTORTION_NAMES[camera.distortion]}",
         f"distortion_coefficients: [{distortion}]",

@@ -81,8 +81,9 @@ class ImuOptions:
 class CameraOptions:
     """One camera of the rig, looking along the body's x axis before it is turned."""
 
-    projection: str = "pinhole"  # or unified-projection
-    distortion: str = "radial-tangential"  # none, equidistant, fisheye (= FOV)
+    projection: str = "pinhole"  # unified-projection, double-sphere, extended-unified
+    # none, radial-tangential-5, rational-polynomial, equidistant, fisheye (= FOV)
+    distortion: str = "radial-tangential"
     intrinsics: tuple[float, ...] = (380.0, 380.0, 376.0, 240.0)
     distortion_parameters: tuple[float, ...] = (-0.28, 0.07, 2e-4, 2e-5)
     width_px: int = 752

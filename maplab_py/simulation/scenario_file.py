@@ -14,7 +14,7 @@ from typing import Any
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 from maplab_py.sensors import Distortion, Projection
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.simulation.reports import ScenarioLine, ScenarioList
 from maplab_py.simulation.scenario import (
@@ -442,9 +442,12 @@ def _check_camera(camera: CameraOptions, key: str) -> None:
             raise UserError(
                 f"{key}.{name}: must be one of {', '.join(known)}, not '{getattr(camera, name)}'"
             )
+    model = Projection(camera.projection), Distortion(camera.distortion)
+    if model not in CAMERA_MODELS:
+        raise UserError(f"{key}.distortion: must be none with {camera.projection}")
     sizes = (
-        ("intrinsics", INTRINSICS_SIZE[Projection(camera.projection)]),
-        ("distortion_parameters", DISTORTION_SIZE[Distortion(camera.distortion)]),
+        ("intrinsics", INTRINSICS_SIZE[model[0]]),
+        ("distortion_parameters", DISTORTION_SIZE[model[1]]),
     )
     for name, size in sizes:
         if len(getattr(camera, name)) != size:

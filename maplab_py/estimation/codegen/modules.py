@@ -1,9 +1,9 @@
 """Generated modules: written once, cached on disk, imported like any other module.
 
 A module's folder is named by a hash over everything that could change what is in it: the sources of
-residuals, templates, generator, losses and the list of cameras, and casadi's version. So an edit anywhere gives a new
-folder, and a warm start does not import casadi. The modules that a wheel brings are used with every
-version of casadi.
+residuals, templates, generator, losses and the list of cameras, and casadi's version. So an edit
+anywhere gives a new folder, and a warm start does not import casadi. The modules that a wheel brings
+are used with every version of casadi.
 """
 
 from __future__ import annotations

@@ -59,13 +59,11 @@ def undistorted(vi_map: VIMap, missions: I64) -> tuple[VIMap, int]:
 
 def perspective(camera: Camera) -> Camera:
     """Return the perspective camera on the same axis, with the resolution of the image's centre."""
-    xi = float(camera.intrinsics[0]) if camera.projection is Projection.UNIFIED else 0.0
-    focal, centre = camera.intrinsics[-4:-2] / (1.0 + xi), camera.intrinsics[-2:]
     return dataclasses.replace(
         camera,
         projection=Projection.PINHOLE,
         distortion=Distortion.NONE,
-        intrinsics=np.concatenate([focal, centre]),
+        intrinsics=np.concatenate([camera.central_focal_px, camera.intrinsics[-2:]]),
         distortion_parameters=np.zeros(0),
     )
 

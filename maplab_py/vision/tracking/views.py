@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, U8, Mask
 from maplab_py.geometry import so3
-from maplab_py.sensors import Camera, Projection
+from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project, is_inside_image, project
 from maplab_py.vision.features.images import ImagePreparation
 from maplab_py.vision.features.options import FeatureOptions
@@ -67,10 +67,7 @@ class CameraView:
 
 def focal_length_px(camera: Camera) -> float:
     """Return the pixels per radian at the principal point, undistorted."""
-    focal = float(np.mean(camera.intrinsics[-4:-2]))
-    if camera.projection is Projection.UNIFIED:
-        return focal / (1.0 + float(camera.intrinsics[0]))
-    return focal
+    return float(np.mean(camera.central_focal_px))
 
 
 def leaders(views: tuple[CameraView, ...]) -> list[int]:

@@ -65,7 +65,7 @@ def test_the_rig_of_a_model(rig_map, tmp_path: Path, form: str) -> None:  # type
         (("1 PINHOLE 752 480 1 2 3 nan",), "PINHOLE has 4 parameters that are numbers"),
         (("1 PINHOLE 752 x 1 2 3 4",), "invalid literal"),
         (("1 PINHOLE 0 480 1 2 3 4",), "the images have no pixels"),
-        (("1 EUCM 752 480 1 2 3 4 5 6",), "maplab has no camera model EUCM"),
+        (("1 DIVISION 752 480 1 2 3 4 5",), "maplab has no camera model DIVISION"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:

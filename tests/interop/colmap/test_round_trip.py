@@ -24,7 +24,6 @@ from maplab_py.interop.colmap.point_scan_kernel import compile_kernels
 from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.sensors import Distortion, Projection
-from maplab_py.sensors.camera import CAMERA_MODELS, is_known_to_maplab
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
@@ -33,7 +32,8 @@ from tests.interop.small_map import make_map
 from tests.support.data import shared_data
 from tests.support.scene import Scene
 
-PINHOLES = tuple(m for m in CAMERA_MODELS if m[0] is Projection.PINHOLE and is_known_to_maplab(*m))
+PINHOLES = tuple((Projection.PINHOLE, distortion) for distortion in Distortion)
+SHARED = (*PINHOLES, (Projection.EXTENDED_UNIFIED, Distortion.NONE))
 EVERYTHING = ColmapExportOptions(quality="all")
 # in a process of its own: what pycolmap computes from the files
 ERRORS = """
@@ -61,7 +61,7 @@ def seen_by_pycolmap(folder: Path) -> list[float]:
 
 @pytest.fixture(scope="module")
 def rig_map() -> VIMap:
-    return Scene(missions=2, models=PINHOLES, noise=1.0, landmarks=120).make()
+    return Scene(missions=2, models=SHARED, noise=1.0, landmarks=120).make()
 
 
 @pytest.mark.parametrize("colmap_format", ["binary", "text"])
@@ -70,7 +70,7 @@ def test_everything_that_both_have_comes_back(
 ) -> None:
     options = dataclasses.replace(EVERYTHING, colmap_format=colmap_format, colmap_database=True)
     report = export_colmap(rig_map, tmp_path / "model", options)
-    assert (report.rigs, report.cameras, report.frames) == (1, 4, len(rig_map.vertices))
+    assert (report.rigs, report.cameras, report.frames) == (1, len(SHARED), len(rig_map.vertices))
     again, _ = import_colmap(tmp_path / "model", database=tmp_path / "model" / "database.db")
     compared = compare_maps(rig_map, again)
     rows = {row.what: row for row in compared.rows}
