@@ -41,6 +41,10 @@ class PlyCloud:
     faces: NDArray[np.int32] | None = None  # (F, 3)
 
 
+class EmptyCloud(MapError):
+    """A cloud without a point that is finite."""
+
+
 @dataclasses.dataclass
 class _Element:
     name: str

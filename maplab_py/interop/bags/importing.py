@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,6 @@ from maplab_py.interop.bags.options import BagImportOptions
 from maplab_py.interop.bags.reports import BagImport
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
-from maplab_py.interop.ply import encode_ply
 from maplab_py.interop.recordings.bag_files import (
     all_messages,
     check_bag,
@@ -41,7 +41,12 @@ from maplab_py.interop.resources.matching import (
     matched_files,
     mission_rig,
 )
-from maplab_py.interop.resources.point_clouds import chosen_sensor, cloud_times_ns, cloud_type
+from maplab_py.interop.resources.point_clouds import (
+    add_clouds,
+    chosen_sensor,
+    cloud_times_ns,
+    empty_clouds_note,
+)
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
 from maplab_py.storage.new_resources import NewResources
@@ -310,10 +315,15 @@ def _import_clouds(
         )
     chosen = np.flatnonzero(inside & ~np.isin(times_ns, cloud_times_ns(vi_map, sensor)))
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    for done, (number, message) in enumerate(topic.chosen(chosen)):
-        progress.step(done, len(chosen), "point clouds")
-        cloud = cloud_of(message, f"{topic.name} at {topic.stamps_ns[number]}")
-        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+    chosen, empty = add_clouds(
+        new,
+        chosen,
+        (
+            (number, partial(cloud_of, message, f"{topic.name} at {topic.stamps_ns[number]}"))
+            for number, message in topic.chosen(chosen)
+        ),
+        progress,
+    )
     attached = vi_map
     if len(chosen):
         attached = new.attached(
@@ -331,8 +341,9 @@ def _import_clouds(
         messages=len(topic.stamps_ns),
         resource_types=_types_of(new),
         attached=len(chosen),
-        had_some=int(np.count_nonzero(inside)) - len(chosen),
+        had_some=int(np.count_nonzero(inside)) - len(chosen) - empty,
         messages_outside_mission=int(np.count_nonzero(~inside)),
+        notes=empty_clouds_note(empty),
     )
 
 

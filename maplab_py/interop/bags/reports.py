@@ -52,3 +52,4 @@ class BagImport(Report):
     messages_outside_mission: int = 0
     camera: int | None = None
     calibration_difference_px: float | None = None
+    notes: tuple[str, ...] = ()

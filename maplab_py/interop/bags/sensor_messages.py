@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.interop.ply import PlyCloud
+from maplab_py.interop.ply import EmptyCloud, PlyCloud
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.sensors import Camera, Distortion, Projection
 
@@ -162,6 +162,8 @@ def cloud_of(message: Any, name: str) -> PlyCloud:
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= fields.keys():
         raise MapError(f"{name}: the cloud has no x, y, z: record clouds in Cartesian coordinates")
+    if not int(message.width) * int(message.height):
+        raise EmptyCloud(f"{name}: the cloud is empty: leave its time out, or record it again")
     count, row_bytes = int(message.width) * int(message.height), int(message.row_step)
     step, data = int(message.point_step), np.asarray(message.data, dtype=np.uint8)
     if count > _MAX_POINTS or len(data) < row_bytes * int(message.height):
@@ -187,7 +189,7 @@ def cloud_of(message: Any, name: str) -> PlyCloud:
         ) from error
     valid: NDArray[np.bool_] = np.all(np.isfinite(p), axis=1)
     if not valid.any():
-        raise MapError(f"{name}: the cloud is empty: leave its time out, or record it again")
+        raise EmptyCloud(f"{name}: the cloud is empty: leave its time out, or record it again")
     if float(np.median(np.linalg.norm(p[valid], axis=1))) > _FARTHEST_MEDIAN_M:
         raise MapError(
             f"{name}: half of the points are beyond {_FARTHEST_MEDIAN_M:g} m: coordinates are in "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,11 @@ from maplab_py.array_types import I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.pcd import parse_pcd
-from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
+from maplab_py.interop.ply import EmptyCloud, PlyCloud, encode_ply, parse_ply
 from maplab_py.interop.resources.matching import stamped_files
 from maplab_py.interop.resources.reports import ImportedResources
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.sensors import CameraRig
 from maplab_py.storage.new_resources import NewResources
 from maplab_py.storage.resource_types import resource_type
@@ -60,10 +63,9 @@ def import_point_clouds(
         )
     chosen = np.flatnonzero(inside & ~np.isin(times, cloud_times_ns(vi_map, sensor)))
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    for done, row in enumerate(chosen.tolist()):
-        progress.step(done, len(chosen), "point clouds")
-        cloud = read_cloud(files[row])
-        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+    chosen, empty = add_clouds(
+        new, chosen, ((row, partial(read_cloud, files[row])) for row in chosen.tolist()), progress
+    )
     if len(chosen):
         vi_map = new.attached(
             vi_map,
@@ -76,15 +78,54 @@ def import_point_clouds(
     kinds = sorted({resource_type(new.type_of(row)).name for row in range(len(new))})
     outside = int(np.count_nonzero(~inside))
     notes = (f"{outside} files are of times outside the mission",) if outside else ()
+    notes += empty_clouds_note(empty)
     mission_id = to_hex(vi_map.missions.id[mission])
     return vi_map, ImportedResources(
         mission_id,
         tuple(kinds),
         len(files),
         len(chosen),
-        len(files) - outside - len(chosen),
+        len(files) - outside - len(chosen) - empty,
         notes=notes,
     )
+
+
+def add_clouds(
+    new: NewResources,
+    chosen: I64,
+    clouds: Iterable[tuple[int, Callable[[], PlyCloud]]],
+    progress: Progress,
+) -> tuple[I64, int]:
+    """Add clouds to new resources; return those of the chosen rows that have points, and the number without.
+
+    Args:
+        new: Gets the clouds.
+        chosen: Rows (N,).
+        clouds: Row, and what reads its cloud.
+        progress: Is told about every cloud.
+
+    Raises:
+        MapError: A cloud is damaged, or all are empty.
+    """
+    kept: list[int] = []
+    problem: EmptyCloud | None = None
+    for done, (row, read) in enumerate(clouds):
+        progress.step(done, len(chosen), "point clouds")
+        try:
+            cloud = read()
+        except EmptyCloud as error:
+            problem = problem or error
+            continue
+        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+        kept.append(row)
+    if problem is not None and not kept:
+        raise problem
+    return np.array(kept, dtype=np.int64), len(chosen) - len(kept)
+
+
+def empty_clouds_note(count: int) -> tuple[str, ...]:
+    """Return a note on clouds that were left out."""
+    return (f"{counted(count, 'cloud')} without finite points left out",) if count else ()
 
 
 def cloud_times_ns(vi_map: VIMap, sensor_id: str) -> I64:
@@ -108,10 +149,18 @@ def read_cloud(path: Path) -> PlyCloud:
         raise MapError(f"{path}: the cloud cannot be read ({error.strerror})") from error
     parse = parse_pcd if path.suffix.lower() == ".pcd" else parse_ply
     cloud = parse(data, str(path))
-    if not len(cloud.p) or not np.isfinite(cloud.p).all():
+    valid = np.isfinite(cloud.p).all(axis=1)
+    if not valid.any():
         problem = "is not finite" if len(cloud.p) else "is empty"
-        raise MapError(f"{path}: the cloud {problem}: remove the file, or export it again")
-    return cloud
+        raise EmptyCloud(f"{path}: the cloud {problem}: remove the file, or export it again")
+    if valid.all():
+        return cloud
+    colours, intensity = cloud.colours, cloud.intensity
+    return PlyCloud(
+        cloud.p[valid],
+        None if colours is None else colours[valid],
+        None if intensity is None else intensity[valid],
+    )
 
 
 def cloud_type(cloud: PlyCloud) -> int:

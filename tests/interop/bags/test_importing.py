@@ -216,6 +216,22 @@ def test_wrong_topics_and_bags_are_refused(tmp_path: Path) -> None:
     refused(r"cut\.bag: the bag cannot be read", MapError, path=cut, resource_topic="/cam0/depth")
 
 
+def test_an_empty_cloud_does_not_stop_the_others(tmp_path: Path) -> None:
+    vi_map = with_time_offset(make_map())
+    stamps = vi_map.vertices.timestamp_ns[:4].tolist()
+    places = [np.eye(3), np.zeros((0, 3)), np.full((2, 3), np.nan), 2.0 * np.eye(3)]
+    data = [ROS1.cloud(t, "lidar", PlyCloud(p)) for t, p in zip(stamps, places, strict=True)]
+    path = write_images(tmp_path / "clouds.bag", stamps, data, CLOUD)
+    options = BagImportOptions("/left/image_raw", sensor_id=IMU_ID)
+    attached, report = import_bag_resources(vi_map, 0, path, options)
+    assert (report.attached, report.had_some) == (2, 0)
+    assert report.notes == ("2 clouds without finite points left out",)
+    assert attached.resources.timestamp_ns.tolist() == [stamps[0], stamps[3]]
+    path = write_images(tmp_path / "none.bag", stamps[1:3], data[1:3], CLOUD)
+    with pytest.raises(MapError, match="the cloud is empty"):
+        import_bag_resources(vi_map, 0, path, options)
+
+
 def test_damaged_messages_are_refused(tmp_path: Path) -> None:
     vi_map = with_time_offset(make_map())
     stamps = (vi_map.vertices.timestamp_ns[:2] - OFFSET_NS).tolist()

@@ -205,6 +205,20 @@ def test_clouds_belong_to_a_sensor_at_their_time(vi_map: VIMap, tmp_path: Path) 
     assert (again.attached, again.frames_that_had_some) == (0, 3)
 
 
+def test_empty_clouds_do_not_stop_the_others(vi_map: VIMap, tmp_path: Path) -> None:
+    sensor = mission_sensor_id(vi_map, 0, MissionSensor.IMU)
+    times = vi_map.vertices.timestamp_ns[:3].tolist()
+    half = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]])
+    for time_ns, p in zip(times, (np.zeros((0, 3)), POINTS, half), strict=True):
+        write_ply(
+            PlyCloud(p, intensity=np.arange(len(p), dtype=np.float64)), tmp_path / f"{time_ns}.ply"
+        )
+    attached, report = import_point_clouds(vi_map, 0, tmp_path, sensor)
+    assert (report.attached, report.frames_that_had_some) == (2, 0)
+    assert report.notes == ("1 cloud without finite points left out",)
+    assert sorted(attached.resources.timestamp_ns[-2:].tolist()) == times[1:]
+
+
 def test_wrong_clouds_are_refused(vi_map: VIMap, tmp_path: Path) -> None:
     sensor = mission_sensor_id(vi_map, 0, MissionSensor.IMU)
     file = tmp_path / f"{vi_map.vertices.timestamp_ns[1]}.ply"
