@@ -7,11 +7,13 @@ t_imu = t_camera + offset.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.calibrations.basalt import read_basalt
@@ -29,7 +31,14 @@ from maplab_py.interop.calibrations.kalibr import (
 )
 from maplab_py.interop.calibrations.okvis import is_okvis, is_svo, read_okvis, read_svo
 from maplab_py.interop.calibrations.orb_slam import is_orb_slam, read_orb_slam
-from maplab_py.interop.calibrations.parts import Parts, read_entry, read_json_entry, with_imu
+from maplab_py.interop.calibrations.parts import (
+    Parts,
+    is_json,
+    read_calibration_text,
+    read_entry,
+    read_json_entry,
+    with_imu,
+)
 from maplab_py.interop.calibrations.realsense import is_realsense, read_realsense
 from maplab_py.interop.calibrations.single_cameras import (
     is_camera_info,
@@ -41,7 +50,7 @@ from maplab_py.interop.calibrations.single_cameras import (
 from maplab_py.interop.calibrations.vins import is_vins, read_vins
 from maplab_py.interop.colmap.calibration import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
-from maplab_py.sensors import CameraRig, Extrinsics, Imu, SensorSet
+from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
 from maplab_py.sensors.sensor_set import Sensor
 from maplab_py.sensors.sensors_yaml import note_unread_keys, read_sensors
 from maplab_py.sensors.yaml_entry import Entry
@@ -53,6 +62,8 @@ KNOWN_FORMATS = (
 )
 _OPENVINS = "estimator_config.yaml"
 _SAME_POSE = 1e-9
+_ODD_ASPECT, _ODD_DISTANCE_M = 1.2, 5.0
+"""Ratio of focal lengths, and distance of a camera, that are noted."""
 _ODD_SCALE = 0.1
 """Scales of IMUs that are further from 1 than this are noted: those on the market are within 0.03."""
 
@@ -142,6 +153,7 @@ def _finished(path: Path, parts: Parts) -> CalibrationFile:
     T_B_C = parts.T_B_C.reshape(-1, 7)
     T_I_C = T_B_C if parts.imu is None else se3.compose(se3.inverse(parts.T_B_I), T_B_C)
     notes = [*parts.notes, *(_imu_notes(path, parts.imu) if parts.imu else [])]
+    notes += _camera_notes(path, parts.cameras, T_I_C)
     device = make_device(parts.cameras, T_I_C, parts.imu, notes)
     return _as_file(path, parts.format, device)
 
@@ -163,6 +175,27 @@ def _joined(cameras: Parts, imu: Parts, imu_file: Path) -> Parts:
     if cameras.why_not_on_imu:
         raise MapError(cameras.why_not_on_imu)
     return with_imu(cameras, imu)
+
+
+def _camera_notes(path: Path, cameras: Sequence[Camera], T_I_C: F64) -> list[str]:
+    """Return notes on cameras that no device has."""
+    notes = []
+    for row, (camera, T) in enumerate(zip(cameras, T_I_C, strict=True)):
+        fu, fv, cu, cv = camera.intrinsics[-4:]
+        if not (0.0 < cu < camera.width_px and 0.0 < cv < camera.height_px):
+            notes.append(
+                f"{path}: camera {row}: the centre {cu:.6g}, {cv:.6g} is outside the image"
+            )
+        if max(fu / fv, fv / fu) > _ODD_ASPECT:
+            notes.append(
+                f"{path}: camera {row}: focal lengths {fu:.6g} and {fv:.6g} differ: is the order fu fv cu cv?"
+            )
+        distance_m = float(np.linalg.norm(np.clip(T[4:], -1e9, 1e9)))
+        if distance_m > _ODD_DISTANCE_M:
+            notes.append(
+                f"{path}: camera {row} is {distance_m:.4g} m from the body: are the poses in metres?"
+            )
+    return notes
 
 
 def _imu_notes(path: Path, imu: Imu) -> list[str]:
@@ -193,6 +226,8 @@ def _of_maplab(path: Path, sensors: SensorSet, chosen: DeviceOptions) -> Calibra
         device = device_of(sensors, str(path), chosen)
     if device.imu_id:
         notes += _imu_notes(path, sensors.imu(device.imu_id))
+    if device.rig_id:
+        notes += _camera_notes(path, device.cameras, device.T_I_C)
     return _as_file(path, "maplab", dataclasses.replace(device, notes=tuple(notes)))
 
 
@@ -294,9 +329,13 @@ def _read(path: Path) -> Parts | SensorSet:
         return _read_folder(path)
     if is_dso_camera(path):
         return read_dso_camera(path)
-    if path.suffix.lower() == ".json":
+    _refuse_other_texts(path)
+    if is_json(path):
         return _read_json(path)
     entry = read_entry(path)
+    for key, what in _REFUSED_YAML.items():
+        if key in entry:
+            raise UserError(f"{path}: {what}")
     if "relative_config_imucam" in entry:
         return _read_openvins(entry, path.parent)
     if is_camera_chain(entry) and "cam0" in entry and "intrinsics" not in entry.child("cam0"):
@@ -309,6 +348,18 @@ def _read(path: Path) -> Parts | SensorSet:
     if _is_maplab(entry):
         return read_sensors(path)
     raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
+
+
+def _refuse_other_texts(path: Path) -> None:
+    """Check that a file is none of those that people take for calibrations.
+
+    Raises:
+        UserError: It is; names the program.
+    """
+    text = read_calibration_text(path)
+    for pattern, what in _REFUSED_TEXTS:
+        if pattern.search(text):
+            raise UserError(f"{path}: {what}")
 
 
 def _read_json(path: Path) -> Parts:
@@ -347,6 +398,26 @@ def _has_imu_noise(entry: Entry) -> bool:
     return "accelerometer_noise_density" in entry or "gyroscope_noise_density" in entry
 
 
+_REFUSED_TEXTS = (
+    (
+        re.compile(r"\A\s*(?:Calibration results|Camera-system parameters|Normalized Residuals)"),
+        "is kalibr's report: give the camera chain (yaml) that kalibr writes beside it",
+    ),
+    (re.compile(r"\A\s*(?:<\?xml|<opencv_storage)"), "is XML of OpenCV: save it as yaml"),
+    (re.compile(r"\A\s*(?:#.*\n\s*)*\[image\]"), "is an ini file of ROS: save it as yaml"),
+    (
+        re.compile(r"^(?:Camera0|Common)\s*\{?\s*$", re.MULTILINE),
+        "settings of ROVIO are not read: give the yaml of the camera, or kalibr's camera chain",
+    ),
+    (
+        re.compile(r"^\s*(?:Intrinsic of \"|Device info:)", re.MULTILINE),
+        "is the text of rs-enumerate-devices: give the JSON of RealSense's calibration",
+    ),
+)
+_REFUSED_YAML = {
+    "target_type": "is a calibration target of kalibr, no calibration: give the camera chain",
+    "Gyr": "is a report of imu_utils: give its noise under the keys of kalibr's IMU file",
+}
 _REFUSED_JSON = {
     "CalibrationInformation": "Windows Mixed Reality",
     "CameraCalibrations": "Project Aria",

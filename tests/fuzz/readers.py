@@ -13,6 +13,7 @@ import os
 import shutil
 import sqlite3
 import struct
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -44,6 +45,7 @@ from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.interop.wheel_odometry import read_wheel_odometry
 from maplab_py.sensors.sensors_yaml import read_sensors, write_sensors
+from maplab_py.server.options import MapServerOptions
 from maplab_py.server.requests import answers
 from maplab_py.storage.column_file import UnusableColumns, read_columns, write_columns
 from maplab_py.storage.native import load_map, save_map
@@ -78,7 +80,9 @@ def check(reader: Reader, folder: Path, data: bytes) -> None:
         Exception: The reader failed.
     """
     try:
-        reader.read(folder, data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # numpy's text is not for the user
+            reader.read(folder, data)
     except reader.refusals as error:
         text = str(error)
         assert "\n" not in text, f"several lines: {text!r}"
@@ -237,31 +241,31 @@ def _read_pcd(folder: Path, data: bytes) -> None:
 _MODEL = ("cameras", "images", "points3D", "rigs", "frames")
 
 
+def _make_model(folder: Path) -> None:
+    export_colmap(_map(), folder / "model", ColmapExportOptions(quality="all"))
+
+
 def _colmap_seeds(folder: Path) -> list[bytes]:
-    seeds = []
-    for row, form in enumerate(("binary", "text")):
-        export_colmap(_map(), folder / form, ColmapExportOptions(colmap_format=form))
-        suffix = ".bin" if form == "binary" else ".txt"
-        for kind, name in enumerate(_MODEL):
-            content = (folder / form / f"{name}{suffix}").read_bytes()
-            seeds.append(bytes([kind + len(_MODEL) * row]) + content)
-    return seeds
+    """Return the binary files; those in text are read by pycolmap."""
+    _make_model(folder)
+    files = [(folder / "model" / f"{name}.bin").read_bytes() for name in _MODEL]
+    return [bytes([kind]) + content for kind, content in enumerate(files)]
 
 
 def _read_colmap(folder: Path, data: bytes) -> None:
     """Replace one file of a valid model."""
-    source = _prepared(folder, "colmap", _colmap_seeds)
-    kind = data[0] % (2 * len(_MODEL)) if data else 0
-    form, suffix = ("binary", ".bin") if kind < len(_MODEL) else ("text", ".txt")
-    model = folder / "model"
-    shutil.rmtree(model, ignore_errors=True)
-    model.mkdir()
-    for name in _MODEL:
-        os.link(source / form / f"{name}{suffix}", model / f"{name}{suffix}")
-    path = model / f"{_MODEL[kind % len(_MODEL)]}{suffix}"
-    path.unlink()
-    path.write_bytes(data[1:])
-    read_model(model)
+    source = _prepared(folder, "colmap", _make_model) / "model"
+    name = _MODEL[data[0] % len(_MODEL)] if data else _MODEL[0]
+    read_model(_replaced(source, folder / "model", f"{name}.bin", data[1:]))
+
+
+def _replaced(source: Path, target: Path, name: str, content: bytes) -> Path:
+    """Return a copy of a folder in which one file has another content."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target, copy_function=os.link)
+    (target / name).unlink()
+    (target / name).write_bytes(content)
+    return target
 
 
 def _database_seeds(folder: Path) -> list[bytes]:
@@ -321,13 +325,8 @@ def _read_map(folder: Path, data: bytes) -> None:
     source = _prepared(folder, "map", _make_map)
     files = _map_files(source)
     chosen = files[data[0] % len(files)] if data else files[0]
-    target = folder / "map"
-    shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source / "map", target, copy_function=os.link)
-    path = target / chosen.relative_to(source / "map")
-    path.unlink()
-    path.write_bytes(data[1:])
-    load_map(target, max_size_megabytes=50)
+    name = str(chosen.relative_to(source / "map"))
+    load_map(_replaced(source / "map", folder / "map", name, data[1:]), max_size_megabytes=50)
 
 
 def _columns_seeds(folder: Path) -> list[bytes]:
@@ -422,12 +421,8 @@ def _folder_seeds(folder: Path) -> list[bytes]:
 
 def _read_folder(folder: Path, data: bytes) -> None:
     source = _prepared(folder, "recording", _make_recording)
-    target = folder / "room"
-    shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source / "room", target)
     name = _FOLDER_FILES[data[0] % len(_FOLDER_FILES)] if data else _FOLDER_FILES[0]
-    (target / "mav0" / name).write_bytes(data[1:])
-    _decode(open_recording(target))
+    _decode(open_recording(_replaced(source / "room" / "mav0", folder / "mav0", name, data[1:])))
 
 
 # -- requests of the map server -----------------------------------------------------------------
@@ -452,7 +447,7 @@ def _read_request(folder: Path, data: bytes) -> None:
         return
     server: Any = SimpleNamespace(
         published=_map(),
-        options=SimpleNamespace(dense_map_resource_type="PointCloudXYZ"),
+        options=MapServerOptions(),
         publisher=SimpleNamespace(folder=folder),
         call=lambda function: function(),
         delete_missions=len,

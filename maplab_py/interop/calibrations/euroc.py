@@ -46,7 +46,7 @@ def read_camera_file(entry: Entry) -> Parts:
     form = "Kimera" if "camera_id" in entry else "EuRoC"
     notes = note_line_delays(entry, [camera])
     notes += note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION, settings=form == "Kimera")
-    return Parts(form, [camera], T_B_C, notes=notes)
+    return Parts(form, [camera], T_B_C, is_on_body=True, notes=notes)
 
 
 def read_imu_file(entry: Entry) -> Parts:
@@ -64,7 +64,7 @@ def read_imu_file(entry: Entry) -> Parts:
     shift_ns = read_time_shift_ns(entry, "imu_time_shift")
     notes = note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION, settings=is_kimera)
     form = "Kimera" if is_kimera else "EuRoC"
-    return Parts(form, imu=imu, T_B_I=T_B_I, time_shift_ns=shift_ns, notes=notes)
+    return Parts(form, imu=imu, T_B_I=T_B_I, is_on_body=True, time_shift_ns=shift_ns, notes=notes)
 
 
 def read_kimera_folder(folder: Path) -> Parts:
@@ -83,7 +83,8 @@ def read_kimera_folder(folder: Path) -> Parts:
 def _joined(cameras: list[Parts]) -> Parts:
     every = [camera for part in cameras for camera in part.cameras]
     notes = [note for part in cameras for note in part.notes]
-    return Parts("EuRoC", every, np.concatenate([part.T_B_C for part in cameras]), notes=notes)
+    T_B_C = np.concatenate([part.T_B_C for part in cameras])
+    return Parts("EuRoC", every, T_B_C, is_on_body=True, notes=notes)
 
 
 def read_folder(folder: Path) -> Parts:

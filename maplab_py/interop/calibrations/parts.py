@@ -38,6 +38,7 @@ class Parts:
     T_B_C: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))
     imu: Imu | None = None
     T_B_I: F64 = dataclasses.field(default_factory=se3.identity)
+    is_on_body: bool = False  # B is no sensor, as in EuRoC's files; else it is the IMU or a camera
     time_shift_ns: int = 0  # of the file of an IMU: t_imu = t_camera + shift
     why_not_on_imu: str = ""  # where B is not fixed to an IMU: key and remedy
     notes: Sequence[str] = ()
@@ -55,6 +56,11 @@ def read_calibration_text(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise MapError(f"cannot read {path}: {reason}") from error
+
+
+def is_json(path: Path) -> bool:
+    """Return whether a file is JSON: it begins with a brace."""
+    return read_calibration_text(path).lstrip().startswith("{")
 
 
 def read_entry(path: Path) -> Entry:
@@ -129,4 +135,12 @@ def with_imu(cameras: Parts, imu: Parts) -> Parts:
         for camera in cameras.cameras
     ]
     notes = [*cameras.notes, *imu.notes]
-    return dataclasses.replace(cameras, cameras=shifted, imu=imu.imu, T_B_I=imu.T_B_I, notes=notes)
+    T_B_I = imu.T_B_I
+    if imu.is_on_body and not cameras.is_on_body:
+        T_B_I = se3.identity()  # the cameras are on the IMU itself
+    elif cameras.is_on_body and not imu.is_on_body:
+        notes.append(
+            f"{cameras.format}: cameras are on a body, and the file of the IMU ({imu.format}) does not say "
+            "where it is: it is taken as the body"
+        )
+    return dataclasses.replace(cameras, cameras=shifted, imu=imu.imu, T_B_I=T_B_I, notes=notes)

@@ -73,9 +73,7 @@ def read_camera_info(entry: Entry) -> Parts:
 
 def is_dso_camera(path: Path) -> bool:
     """Return whether a file begins like a camera of DSO."""
-    if path.suffix.lower() != ".txt" or not path.is_file():
-        return False
-    return bool(_DSO_FIRST.match(read_calibration_text(path)))
+    return path.is_file() and bool(_DSO_FIRST.match(read_calibration_text(path)))
 
 
 def read_dso_camera(path: Path) -> Parts:

@@ -71,7 +71,7 @@ class _Cursor:
 
     def pose(self) -> F64:
         values = self.doubles(7)[_FROM_FILE]
-        if abs(float(np.linalg.norm(values[:4])) - 1.0) > _UNIT_TOLERANCE:
+        if not abs(float(np.linalg.norm(np.clip(values[:4], -2.0, 2.0))) - 1.0) <= _UNIT_TOLERANCE:
             raise self.damaged("it has a quaternion that is not of unit length")
         return np.concatenate([so3.normalize(values[:4]), values[4:]])
 

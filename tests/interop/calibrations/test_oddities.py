@@ -287,3 +287,70 @@ def test_a_chain_with_a_gap_names_the_missing_camera(tmp_path: Path) -> None:
     relative = CAMERA.replace("T_cam_imu", "T_unknown") + SECOND
     with pytest.raises(MaplabError, match="cam0: key 'T_cam_imu' is missing"):
         import_calibration(written(tmp_path / "chain.yaml", relative))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "results.txt",
+            "Calibration results\n====\nCamera-system parameters:\n",
+            "kalibr's report",
+        ),
+        ("calib.xml", '<?xml version="1.0"?>\n<opencv_storage/>\n', "is XML of OpenCV"),
+        ("ost.txt", "# oST version 5.0\n\n\n[image]\n\nwidth\n640\n", "is an ini file of ROS"),
+        ("rovio.info", "Common\n{\n\tdoVECalibration true;\n}\n", "settings of ROVIO are not read"),
+        ("rs.txt", 'Device info:\n Name: D435i\n Intrinsic of "Depth" / 640x480\n', "rs-enumerate"),
+        (
+            "april.yaml",
+            "target_type: 'aprilgrid'\ntagCols: 6\n",
+            "is a calibration target of kalibr",
+        ),
+        ("imu.yaml", "%YAML:1.0\n---\ntype: IMU\nGyr:\n   unit: rad/s\n", "report of imu_utils"),
+        ("unknown.yaml", "rig: {cameras: 2}\n", "format is not known: files of kalibr"),
+        ("empty.yaml", "# nothing\n", "key-value pairs are expected"),
+    ],
+)
+def test_files_that_are_no_calibrations_are_refused_by_name(
+    name: str, text: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(MaplabError, match=message) as error:
+        import_calibration(written(tmp_path / name, text))
+    assert name in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_format_follows_from_the_content(tmp_path: Path) -> None:
+    assert import_calibration(written(tmp_path / "chain.json", CAMERA)).format == "kalibr"
+    stream = '{"width": 64, "height": 48, "fx": 60, "fy": 61, "ppx": 32, "ppy": 24}'
+    assert import_calibration(written(tmp_path / "stream.yaml", stream)).format == "RealSense"
+    dso = "Pinhole 60 61 32 24 0\n64 48\n"
+    assert import_calibration(written(tmp_path / "calib.cfg", dso)).format == "DM-VIO"
+
+
+def test_frames_of_files_of_two_programs_are_kept_apart(tmp_path: Path) -> None:
+    imu_text = "T_BS: {rows: 4, cols: 4, data: [1, 0, 0, 7, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}\n"
+    imu_text += IMU.replace("rostopic: /imu0\n", "").replace("update_rate", "rate_hz")
+    euroc_imu = written(tmp_path / "imu0.yaml", imu_text)
+    chain = written(tmp_path / "chain.yaml", CAMERA)
+    camera = written(tmp_path / "cam0.yaml", EUROC)
+    np.testing.assert_allclose(import_calibration(chain, euroc_imu).T_I_C[0, 4:], [0, 0, 0])
+    np.testing.assert_allclose(import_calibration(camera, euroc_imu).T_I_C[0, 4:], [-7, 0, 0])
+    mixed = import_calibration(camera, written(tmp_path / "imu.yaml", IMU))
+    assert "does not say where it is: it is taken as the body" in mixed.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "note"),
+    [
+        ("[60.0, 61.0, 32.0, 24.0]", "[60.0, 32.0, 61.0, 24.0]", "60 and 32 differ: is the order"),
+        ("[60.0, 61.0, 32.0, 24.0]", "[60.0, 61.0, 320.0, 240.0]", "centre 320, 240 is outside"),
+        ("[1.0, 0, 0, 0]", "[1.0, 0, 0, 65.0]", "is 65 m from the body: are the poses in metres"),
+    ],
+)
+def test_cameras_that_no_device_has_are_noted(
+    old: str, new: str, note: str, tmp_path: Path
+) -> None:
+    chain = written(tmp_path / "chain.yaml", CAMERA.replace(old, new))
+    result = import_calibration(chain, written(tmp_path / "imu.yaml", IMU))
+    assert note in " ".join(result.notes)
