@@ -154,7 +154,7 @@ def _measured(
     except EstimationError as refusal:
         row["refused"] = str(refusal)
     else:
-        row = _compared(result, report, data.truth)
+        row = _compare(result, report, data.truth)
         rows = [data.names.index(name) for name in row.pop("names")]
         error[rows], sigma[rows] = row.pop("error"), row.pop("sigma")
         sensors = result.sensors
@@ -179,7 +179,7 @@ def _measured(
     }
 
 
-def _compared(result: Calibration, report: SelfCalibrationReport, truth: ParameterBlocks) -> Row:
+def _compare(result: Calibration, report: SelfCalibrationReport, truth: ParameterBlocks) -> Row:
     """Return error, formal deviations and NEES of a calibration."""
     error = result.parameters.difference(result.blocks, truth)
     return {
@@ -201,6 +201,6 @@ def consistency(scenario: Scenario, seeds: range, out: Path) -> None:
             continue
         data = data_set(scenario, seed)
         result, report = calibrate(data.maps[0], OPTIONS)
-        row = _compared(result, report, true_problem(data).states.blocks)
+        row = _compare(result, report, true_problem(data).states.blocks)
         swaps = scenario.measurement.identity_swap_share
         append_line(out, {"set": seed, "swaps": swaps, **row})

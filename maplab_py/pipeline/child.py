@@ -55,7 +55,7 @@ def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:
         )
         try:
             _send(child, order.script)
-            return _watched(child, order.memory_gb * 1e9, is_cancelled)
+            return _watch(child, order.memory_gb * 1e9, is_cancelled)
         finally:
             kill(child)  # with the shell commands of its script
 
@@ -66,7 +66,7 @@ def _send(child: subprocess.Popen[bytes], script: str) -> None:
         child.stdin.write(script.encode("utf-8", "surrogateescape"))
 
 
-def _watched(
+def _watch(
     child: subprocess.Popen[bytes], limit_bytes: float, is_cancelled: Callable[[], bool]
 ) -> ChildEnd:
     peak = 0.0

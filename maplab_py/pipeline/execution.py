@@ -47,7 +47,7 @@ def execute(order: Order, is_cancelled: Callable[[], bool] = lambda: False) -> O
             work = _work_folder(order)
         end = run_child(_written_to(order, work), is_cancelled)
         peak_gb = end.peak_gb
-        ending, error = _judged(order, end)
+        ending, error = _judge(order, end)
         if ending is Ending.DONE and work is not None:
             _publish(order, work)
     except UserError as failure:
@@ -97,7 +97,7 @@ def _check_worker(order: Order) -> None:
             )
 
 
-def _judged(order: Order, end: ChildEnd) -> tuple[Ending, str]:
+def _judge(order: Order, end: ChildEnd) -> tuple[Ending, str]:
     if end.is_cancelled:
         return Ending.CANCELLED, "cancelled"
     if end.is_over_memory:

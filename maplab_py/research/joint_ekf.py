@@ -281,7 +281,7 @@ class JointFilter:
         self._square += float(square[rows].sum())
         self.observations += len(rows)
         self._count += 2 * len(rows) - 3 * int(good.sum())
-        self._correct(*_eliminated(H, by_point, error, residuals.track[rows]))
+        self._correct(*_eliminate(H, by_point, error, residuals.track[rows]))
 
     def _state_jacobian(
         self, vertex: I64, camera: I64, residuals: TrackResiduals, rows: I64
@@ -303,7 +303,7 @@ class JointFilter:
         self.T_G_I[self._window] = se3.retract(self.T_G_I[self._window], poses)
         self.v_G = self.v_G + now[6:9]
         self.gyro_bias, self.accel_bias = self.gyro_bias + now[9:12], self.accel_bias + now[12:15]
-        self.blocks = _moved(self.blocks, step[: self.size])
+        self.blocks = _move(self.blocks, step[: self.size])
 
     @property
     def change(self) -> F64:
@@ -361,7 +361,7 @@ def _column(block: str, row: int, column: int) -> int:
     return _FIRST_CAMERA + 6 * row + column if block == EXTRINSICS else _IMU_COLUMNS[block] + column
 
 
-def _moved(blocks: ParameterBlocks, step: F64) -> ParameterBlocks:
+def _move(blocks: ParameterBlocks, step: F64) -> ParameterBlocks:
     """Apply a step of the calibration states."""
     by_block = {
         GYRO: step[None, 0:6],
@@ -381,7 +381,7 @@ def _groups(values: I64, rows: I64) -> list[tuple[int, I64]]:
     return list(zip(unique.tolist(), np.split(rows, first[1:]), strict=True))
 
 
-def _eliminated(H: F64, by_point: F64, error: F64, track: I64) -> tuple[F64, F64]:
+def _eliminate(H: F64, by_point: F64, error: F64, track: I64) -> tuple[F64, F64]:
     """Return the information (d, d) of tracks about the states and its right side; points eliminated.
 
     The Schur complement of a track's point is the projection on the left null space of its

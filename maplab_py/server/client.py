@@ -26,15 +26,15 @@ def ask(spool: Spool, name: str, **parameters: str) -> dict[str, Any]:
         NotRunning: No server works on the spool.
         UserError: The server refuses the request; the message is its own.
     """
-    return _sent(spool, f"{name}?{urllib.parse.urlencode(parameters)}", None)
+    return _send(spool, f"{name}?{urllib.parse.urlencode(parameters)}", None)
 
 
 def order(spool: Spool, name: str, **parameters: str) -> dict[str, Any]:
     """Let the server do something, and return its answer; errors as `ask`."""
-    return _sent(spool, name, json.dumps(parameters).encode())
+    return _send(spool, name, json.dumps(parameters).encode())
 
 
-def _sent(spool: Spool, path: str, body: bytes | None) -> dict[str, Any]:
+def _send(spool: Spool, path: str, body: bytes | None) -> dict[str, Any]:
     spool.check_exists()
     stopped = f"no server works on --spool={spool.root}: start one with maplab serve"
     try:

@@ -180,11 +180,11 @@ class Merger:
             Cancelled: The map is as before.
         """
         clock = _Clock()
-        whole = self._appended(submap)
+        whole = self._append(submap)
         clock.lap("append")
         new = self._surroundings(whole, submap)
         pairs = self._open_alignments.copy()
-        edited, anchored, joint_is_due = self._anchored(
+        edited, anchored, joint_is_due = self._anchor(
             new.part.vi_map, progress, pairs, new.searched
         )
         clock.lap("anchor")
@@ -197,7 +197,7 @@ class Merger:
         clock.lap("anchor others")
         whole, local = self._optimized_around(whole, new.rows, progress)
         clock.lap("optimise")
-        self.vi_map, self._open_alignments = self._laid_out(whole), pairs
+        self.vi_map, self._open_alignments = self._lay_out(whole), pairs
         is_whole = len(new.stretches) == 1 and self._places.is_trained
         for stretch in new.stretches:
             self._remember(stretch, submap, new.frequencies if is_whole else None)
@@ -225,7 +225,7 @@ class Merger:
         if before is None:
             return 0.0
         vi_map, _ = evaluate_quality(before, LandmarkQualityOptions())
-        vi_map, _, _ = self._anchored(vi_map, progress)
+        vi_map, _, _ = self._anchor(vi_map, progress)
         if self._merging.enable_visual_loop_closure:
             vi_map = self._with_all_loops(vi_map, progress)
         options, self.note = self._optimization, ""
@@ -240,18 +240,18 @@ class Merger:
         moved_m = np.linalg.norm(vi_map.T_G_I[:, 4:] - before.T_G_I[:, 4:], axis=1)
         return float(moved_m[known].max(initial=0.0))
 
-    def _appended(self, submap: VIMap) -> VIMap:
+    def _append(self, submap: VIMap) -> VIMap:
         base = self.vi_map
         if base is None:
             is_known = np.zeros(len(submap.baseframes), dtype=np.bool_)
             if self._merging.set_first_robot_map_baseframe_to_known:
                 is_known[submap.missions.baseframe[0]] = True
             return submap.replace(
-                baseframes=submap.baseframes.replace(is_known=is_known | _placed(submap))
+                baseframes=submap.baseframes.replace(is_known=is_known | _place(submap))
             )
         if (base.mission_index.rows(submap.missions.id) >= 0).any():
             return with_resources_taken_in(append_submap(base, submap)[0], submap)
-        frames = submap.baseframes.replace(is_known=_placed(submap))
+        frames = submap.baseframes.replace(is_known=_place(submap))
         whole, _ = merge_maps(base, submap.replace(baseframes=frames))
         return with_resources_taken_in(whole, submap)
 
@@ -327,13 +327,13 @@ class Merger:
             progress=progress,
         )
 
-    def _laid_out(self, whole: VIMap) -> VIMap:
+    def _lay_out(self, whole: VIMap) -> VIMap:
         """Set missions that are not anchored apart from the others."""
         if not self._merging.spatially_distribute_missions:
             return whole
         return distribute_missions(whole, LayoutOptions())[0]
 
-    def _anchored(
+    def _anchor(
         self,
         vi_map: VIMap,
         progress: Progress,
@@ -388,7 +388,7 @@ class Merger:
         inside = np.isin(whole.vertices.mission, missions)
         inside[np.concatenate(rows)] = True
         part = excerpt(whole, inside)
-        edited, anchored, _ = self._anchored(part.vi_map, progress)
+        edited, anchored, _ = self._anchor(part.vi_map, progress)
         return (part.written_back(edited) if anchored else whole), anchored
 
     def _with_all_loops(self, vi_map: VIMap, progress: Progress) -> VIMap:
@@ -419,7 +419,7 @@ def _ids(names: Iterable[str]) -> IdArray:
     return np.stack(words) if words else np.zeros((0, 2), dtype=np.uint64)
 
 
-def _placed(vi_map: VIMap) -> Mask:
+def _place(vi_map: VIMap) -> Mask:
     """Return which base frames (B,) absolute poses determine."""
     result = np.zeros(len(vi_map.baseframes), dtype=np.bool_)
     mission = vi_map.vertices.mission[vi_map.absolute_poses.vertex]

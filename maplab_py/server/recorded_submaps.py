@@ -119,11 +119,11 @@ def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     with np.errstate(over="ignore"):
         words = np.tile(seed.astype(np.uint64), (len(numbers[0]), 1))
         for column in numbers:
-            words = _mixed(words + column.astype(np.uint64)[:, None])
+            words = _mix(words + column.astype(np.uint64)[:, None])
     return np.asarray(words | (words == 0).astype(np.uint64))
 
 
-def _mixed(words: IdArray) -> IdArray:
+def _mix(words: IdArray) -> IdArray:
     """Return words whose every bit depends on all bits (the finaliser of splitmix64)."""
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -52,7 +52,7 @@ def point(text: str, flag: str) -> F64:
     return values
 
 
-def _published(server: MapServer) -> VIMap:
+def _publish(server: MapServer) -> VIMap:
     if server.published is None:
         raise UserError("the server has no map yet")
     return server.published
@@ -61,14 +61,14 @@ def _published(server: MapServer) -> VIMap:
 def _lookup(server: MapServer, given: dict[str, str]) -> Any:
     p_S = point(given.get("p_S", "0 0 0"), "p_S")
     time_ns, sensor = int(given["timestamp_ns"]), given.get("sensor", "")
-    return map_lookup(_published(server), given["robot_name"], time_ns, sensor, p_S)
+    return map_lookup(_publish(server), given["robot_name"], time_ns, sensor, p_S)
 
 
 def _dense(server: MapServer, given: dict[str, str]) -> Any:
     center_G, radius_m = point(given["center_G"], "center_G"), float(given["radius_m"])
     kind = server.options.dense_map_resource_type
     folder = server.publisher.folder
-    points, clouds = dense_points_in_range(_published(server), folder, kind, center_G, radius_m)
+    points, clouds = dense_points_in_range(_publish(server), folder, kind, center_G, radius_m)
     return {"p_G": points, "resources": clouds}
 
 
@@ -78,12 +78,12 @@ def _stop(server: MapServer) -> Message:
 
 
 def _delete(server: MapServer, mission: str) -> DeletedMissions:
-    vi_map = _published(server)
+    vi_map = _publish(server)
     return server.delete_missions({to_hex(vi_map.missions.id[find_mission(vi_map, mission)])})
 
 
 def _delete_robot(server: MapServer, robot: str) -> DeletedMissions:
-    vi_map = _published(server)
+    vi_map = _publish(server)
     rows = [row for row, name in enumerate(vi_map.missions.name) if name == robot]
     if not rows:
         raise UserError(f"--robot_name={robot}: the map has no mission of it")

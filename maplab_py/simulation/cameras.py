@@ -27,19 +27,19 @@ def pixels_of(camera: Camera, p_C: F64) -> F64:
         scaled = np.sqrt(values[1] * np.sum(p_C[:, :2] ** 2, axis=1) + depth**2)
         depth = values[0] * scaled + (1.0 - values[0]) * depth
     values = values[-4:]
-    x = _distorted(camera, p_C[:, 0] / depth, p_C[:, 1] / depth)
+    x = _distort(camera, p_C[:, 0] / depth, p_C[:, 1] / depth)
     return np.stack([values[0] * x[0] + values[2], values[1] * x[1] + values[3]], axis=1)
 
 
 def field_of_view_radius(camera: Camera) -> float:
     """Return the normalised radius |x| / z inside which the image moves outwards with the point."""
     radius = np.linspace(1e-3, _LARGEST_RADIUS, 4000)
-    image = np.hypot(*_distorted(camera, radius, np.zeros_like(radius)))
+    image = np.hypot(*_distort(camera, radius, np.zeros_like(radius)))
     backwards = np.flatnonzero(np.diff(image) <= 0.0)
     return float(radius[backwards[0]]) if len(backwards) else _LARGEST_RADIUS
 
 
-def _distorted(camera: Camera, x: F64, y: F64) -> tuple[F64, F64]:
+def _distort(camera: Camera, x: F64, y: F64) -> tuple[F64, F64]:
     k = camera.distortion_parameters
     r2 = x * x + y * y
     if camera.distortion in (Distortion.RADTAN, Distortion.RADTAN5, Distortion.RATIONAL):

@@ -118,7 +118,7 @@ def _piece(
     duration = motion.duration_s
     # the last time is the end of the piece
     at = np.append(time, duration)
-    progress = at / duration if is_alone else _eased(at, duration)
+    progress = at / duration if is_alone else _ease(at, duration)
     turns = dict(entry.turns)
     if motion.kind in PATH_KINDS:
         position, yaw, turns[motion.kind] = _path_piece(motion, world, entry, progress, jitter)
@@ -210,7 +210,7 @@ def _bridge(entry: _Entry, position: F64, yaw: F64, time: F64) -> tuple[F64, F64
     return position + left[:, None] * back, yaw + left * (entry.yaw - yaw)
 
 
-def _eased(time: F64, duration: float) -> F64:
+def _ease(time: F64, duration: float) -> F64:
     """Return progress 0 .. 1 at constant speed with smooth ramps from and to rest."""
     ramp = min(_RAMP_S, 0.5 * duration)
     t = np.clip(time, 0.0, duration)

@@ -80,7 +80,7 @@ def make_textures(surfaces: Surfaces, options: ImageOptions, rng: np.random.Gene
     is_bare = np.zeros(len(surfaces.area), dtype=np.bool_)
     if options.bare_share > 0.0:
         is_bare = rng.uniform(size=len(is_bare)) < options.bare_share
-    return _joined(_paintings(surfaces, is_bare, texel_m, rng), is_bare, texel_m)
+    return _join(_paintings(surfaces, is_bare, texel_m, rng), is_bare, texel_m)
 
 
 def repainted(
@@ -97,7 +97,7 @@ def repainted(
         squares = rng.uniform(size=(-(-height // side), -(-width // side))) < share
         is_new = squares.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
         images.append(np.where(is_new, other, image))
-    return _joined(images, textures.is_bare, textures.texel_m)
+    return _join(images, textures.is_bare, textures.texel_m)
 
 
 def _paintings(
@@ -107,10 +107,10 @@ def _paintings(
     sizes_m = (np.linalg.norm(side, axis=1) for side in (surfaces.side_u, surfaces.side_v))
     for u_m, v_m, bare in zip(*sizes_m, is_bare, strict=True):
         density = _BARE_SHAPES_PER_M2 if bare else _SHAPES_PER_M2
-        yield _painted(float(u_m), float(v_m), texel_m, density, rng)
+        yield _paint(float(u_m), float(v_m), texel_m, density, rng)
 
 
-def _joined(images: Iterable[U8], is_bare: Mask, texel_m: float) -> Textures:
+def _join(images: Iterable[U8], is_bare: Mask, texel_m: float) -> Textures:
     """Return the finest images (v, u) of the surfaces with their pyramids as textures."""
     pixels, offset = [], 0
     starts = np.zeros((len(is_bare), LEVELS), dtype=np.int64)
@@ -124,7 +124,7 @@ def _joined(images: Iterable[U8], is_bare: Mask, texel_m: float) -> Textures:
     return Textures(np.concatenate(pixels), starts, widths, heights, texel_m, is_bare)
 
 
-def _painted(
+def _paint(
     u_m: float, v_m: float, texel_m: float, shapes_per_m2: float, rng: np.random.Generator
 ) -> U8:
     """Return a grey image of a surface (v, u)."""

@@ -67,8 +67,8 @@ def street_route(options: WorldOptions, first: tuple[int, int], last: tuple[int,
     for quarter, corner in enumerate(
         ((high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1]))
     ):
-        turned = _turned(arc, quarter - 1)
-        inwards = _turned(np.array([[-1.0, -1.0]]), quarter - 1) * _TURN_RADIUS_M
+        turned = _turn(arc, quarter - 1)
+        inwards = _turn(np.array([[-1.0, -1.0]]), quarter - 1) * _TURN_RADIUS_M
         corners.append(np.asarray(corner) + inwards + turned)
     route = np.concatenate([*corners, corners[0][:1]])
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1)))
@@ -76,7 +76,7 @@ def street_route(options: WorldOptions, first: tuple[int, int], last: tuple[int,
     return np.stack([np.interp(at, length, route[:, axis]) for axis in range(2)], axis=1)
 
 
-def _turned(xy: F64, quarters: int) -> F64:
+def _turn(xy: F64, quarters: int) -> F64:
     """Return points (N, 2) turned by a number of right angles."""
     for _ in range(quarters % 4):
         xy = np.stack([-xy[:, 1], xy[:, 0]], axis=1)

@@ -42,8 +42,8 @@ def trajectory_spline(
         UserError: A file is no trajectory, is too short, or has gaps of more than a second.
     """
     spacing_s = _RECORDED_KNOT_SPACING_S if options.recorded_imu else KNOT_SPACING_S
-    poses = _resampled(options, spacing_s)
-    placed = [_resampled(session, KNOT_SPACING_S) for session in together] or [poses]
+    poses = _resample(options, spacing_s)
+    placed = [_resample(session, KNOT_SPACING_S) for session in together] or [poses]
     first = together[0] if together else options
     poses[:, 4:] += _shift(placed, first, world)
     return through(poses, spacing_s)
@@ -88,7 +88,7 @@ def _beyond(before: F64, last: F64) -> F64:
     return np.concatenate([q, 2.0 * last[4:] - before[4:]])
 
 
-def _resampled(options: SessionOptions, spacing_s: float) -> F64:
+def _resample(options: SessionOptions, spacing_s: float) -> F64:
     """Return the poses (N, 7) of the file at multiples of a time from the start."""
     trajectory, duration_s = read_motion(options), options.duration_s
     times, first = np.unique(trajectory.times_ns, return_index=True)

@@ -70,7 +70,7 @@ def _standing(p_G: F64) -> I64:
 
 
 def _rooms(options: WorldOptions, rng: np.random.Generator) -> World:
-    rooms = [_furnished(room, options, rng) for room in range(options.rooms)]
+    rooms = [_furnish(room, options, rng) for room in range(options.rooms)]
     p_G = np.concatenate([room.p_G for room in rooms])
     return _world_of_rooms(options, rooms, np.arange(len(p_G)))
 
@@ -88,7 +88,7 @@ def _identical_rooms(options: WorldOptions, rng: np.random.Generator) -> World:
     rooms, looks, begin = [], [], len(common_p)
     for room in range(options.rooms):
         if room in options.corridor_rooms:
-            rooms.append(_furnished(room, options, rng))
+            rooms.append(_furnish(room, options, rng))
             looks.append(begin + np.arange(len(rooms[-1].p_G)))
             begin += len(rooms[-1].p_G)
             continue
@@ -113,7 +113,7 @@ class _Room:
     boxes: F64  # (B, 2, 3)
 
 
-def _furnished(room: int, options: WorldOptions, rng: np.random.Generator) -> _Room:
+def _furnish(room: int, options: WorldOptions, rng: np.random.Generator) -> _Room:
     """Return a room with furniture of its own, or an empty corridor."""
     size = np.asarray(options.room_size_m, dtype=np.float64)
     low = _corner_of_room(room, size)

@@ -116,7 +116,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
     extent = drawing.extent
     if subject.localized is not None:
-        extent = _widened(extent, subject.localized.p_G - drawing.origin_G)
+        extent = _widen(extent, subject.localized.p_G - drawing.origin_G)
     notes = [note for layer in layers if not layer.choices for note in layer.notes]
     notes += unreadable + problems
     if subject.other is not None:
@@ -132,10 +132,10 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
 def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:
     """Return the extent of the map together with the path of another state of it."""
     shift = comparison.shift_beside(drawing, other) if side_by_side else -drawing.origin_G
-    return _widened(drawing.extent, other.T_G_I[:, 4:] + shift)
+    return _widen(drawing.extent, other.T_G_I[:, 4:] + shift)
 
 
-def _widened(extent: Extent, p: F64) -> Extent:
+def _widen(extent: Extent, p: F64) -> Extent:
     """Return an extent that has points (N, 3), too."""
     p = p[np.isfinite(p).all(axis=1)]
     outline = np.concatenate([extent.outline, p[spread_rows(p, _OUTLINE_POINTS)]])

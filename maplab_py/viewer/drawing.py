@@ -256,11 +256,11 @@ def _z_order(p: F64) -> U64:
     low = p.min(axis=0)
     width = max(float((p - low).max()), 1e-12)
     cell = np.minimum((p - low) / width * (1 << _BITS), (1 << _BITS) - 1).astype(np.uint64)
-    x, y, z = (_spaced(cell[:, axis]) for axis in range(3))
+    x, y, z = (_space(cell[:, axis]) for axis in range(3))
     return np.asarray(x | y << np.uint64(1) | z << np.uint64(2))
 
 
-def _spaced(x: U64) -> U64:
+def _space(x: U64) -> U64:
     """Put two zero bits between the 16 bits of each number."""
     for shift, mask in (
         (16, 0x0000FF0000FF),

@@ -111,7 +111,7 @@ def plugin_layers(drawing: Drawing, taken: set[str]) -> tuple[list[Layer], list[
             problems.append(f"layer {definition.name}: the viewer has one of this name")
             continue
         try:
-            layers.append(_built(definition, drawing))
+            layers.append(_build(definition, drawing))
         except MaplabError as error:
             problems.append(f"layer {definition.name}: {error}")
         except Exception as error:
@@ -120,12 +120,12 @@ def plugin_layers(drawing: Drawing, taken: set[str]) -> tuple[list[Layer], list[
     return layers, problems
 
 
-def _built(definition: ViewerLayer, drawing: Drawing) -> Layer:
+def _build(definition: ViewerLayer, drawing: Drawing) -> Layer:
     """Return what a plugin wants drawn, moved to where its missions are drawn."""
     from maplab_py.viewer.scene import WHOLE_MAP, Layer
 
     shapes = definition.function(drawing.vi_map)
-    p_G, colour = _checked(shapes)
+    p_G, colour = _check(shapes)
     count = len(p_G)
     groups: list[tuple[str, I64]] = [(WHOLE_MAP, np.arange(count))]
     p = p_G - drawing.origin_G
@@ -141,7 +141,7 @@ def _built(definition: ViewerLayer, drawing: Drawing) -> Layer:
     return Layer(name, title, parts, count, is_visible=definition.is_visible)
 
 
-def _checked(shapes: LayerShapes) -> tuple[F64, U8]:
+def _check(shapes: LayerShapes) -> tuple[F64, U8]:
     """Return positions (N, 3) or (N, 2, 3) and colours (N, 3) of the right shapes."""
     wanted: tuple[int, ...]
     if isinstance(shapes, LayerPoints):

@@ -68,17 +68,17 @@ def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None
         distance = TriangleTree(reference.p_G, reference.faces).distances(mesh.p_G)
         largest = max(float(np.percentile(distance, _USUAL_PART)), 1e-9)
         low, high = "0 m", f"{largest:.3g} m"
-        return _ramped(mesh, distance / largest, colours.HEAT, "distance", low, high)
+        return _ramp(mesh, distance / largest, colours.HEAT, "distance", low, high)
     if colouring == "height":
         part, low_m, high_m = colours.normalised(mesh.p_G[:, 2])
         low, high = f"{low_m:.3g} m", f"{high_m:.3g} m"
-        return _ramped(mesh, part, colours.SEQUENTIAL, "height", low, high)
+        return _ramp(mesh, part, colours.SEQUENTIAL, "height", low, high)
     if colouring == "colour" and mesh.colours is None:
         raise UserError(f"--mesh_colouring=colour: the mesh {mesh.title} has no colours")
     return dataclasses.replace(mesh, colours=None) if colouring == "shaded" else mesh
 
 
-def _ramped(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> Cloud:
+def _ramp(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> Cloud:
     legend = LegendEntry(text, tuple(colours.hex_codes(stops)), low, high)
     return dataclasses.replace(mesh, colours=colours.ramp(part, stops), legend=(legend,))
 

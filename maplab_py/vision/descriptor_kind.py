@@ -56,10 +56,10 @@ class DescriptorKind(NamedTuple):
             values = np.ascontiguousarray(raw[rows])
             if self.depth == DescriptorDepth.FLOAT32:
                 values = values.view("<f4")
-            steps[rows] = self._rounded(values.astype(np.float64))
+            steps[rows] = self._round(values.astype(np.float64))
         return steps
 
-    def _rounded(self, vectors: F64) -> I8:
+    def _round(self, vectors: F64) -> I8:
         """Return vectors (N, dimensions) of any length as signed bytes of unit length."""
         largest = np.abs(vectors).max(axis=1, initial=0.0, keepdims=True)
         usable = np.isfinite(largest) & (largest > 0.0)  # a NaN makes the largest one NaN

@@ -142,7 +142,7 @@ def import_calibration(
         changes = _apply(context, calibration, chosen, imu_noise=apply_imu_noise)
     if sensors_file is not None:
         write_text(sensors_file, [write_sensors(calibration.sensors)], overwrite=overwrite)
-    return _described(calibration, sensors_file, changes)
+    return _describe(calibration, sensors_file, changes)
 
 
 def _apply(
@@ -160,7 +160,7 @@ def _apply(
     return compare(before.sensors, device, after.sensors, device).parameters
 
 
-def _described(
+def _describe(
     calibration: CalibrationFile, written: Path | None, changes: tuple[ComparedParameter, ...]
 ) -> CalibrationImport:
     sensors = calibration.sensors

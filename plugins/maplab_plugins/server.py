@@ -200,7 +200,7 @@ def delete_mission(
         spool: Folder of the spool.
         map_mission: Mission id or unambiguous beginning.
     """
-    return _deleted(spool, "delete_mission", mission=map_mission)
+    return _delete(spool, "delete_mission", mission=map_mission)
 
 
 @command(
@@ -222,7 +222,7 @@ def delete_all_robot_missions(
         spool: Folder of the spool.
         robot_name: The robot.
     """
-    return _deleted(spool, "delete_all_robot_missions", robot_name=robot_name)
+    return _delete(spool, "delete_all_robot_missions", robot_name=robot_name)
 
 
 @command(
@@ -389,7 +389,7 @@ def _shown(context: CommandContext) -> tuple[Callable[[VIMap], None], str]:
     return watch, viewer.url
 
 
-def _deleted(spool: Path, name: str, **parameters: str) -> DeletedMissions:
+def _delete(spool: Path, name: str, **parameters: str) -> DeletedMissions:
     from maplab_py.server.client import order
     from maplab_py.server.reports import DeletedMissions
     from maplab_py.server.spool import Spool

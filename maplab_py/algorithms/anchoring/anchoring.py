@@ -99,7 +99,7 @@ def anchor_missions(
         choice = AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
     detection = _between_missions(judged, loop_options, choice, projections, progress)
-    T_G_M, reached, pairs = _aligned(
+    T_G_M, reached, pairs = _align(
         yaw.from_pose(vi_map.T_G_M),
         known,
         _sightings(judged, detection),
@@ -109,7 +109,7 @@ def anchor_missions(
     )
     used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
     if used:
-        T_G_M = fit_missions(_joined(used), T_G_M, known | ~reached)
+        T_G_M = fit_missions(_join(used), T_G_M, known | ~reached)
     alignments = [_describe(pair, names) for pair in pairs]
     anchored = reached & wanted
     report = AnchoringReport(
@@ -216,7 +216,7 @@ def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
     )
 
 
-def _aligned(
+def _align(
     T_G_M: F64,
     known: NDArray[np.bool_],
     sightings: Sightings,
@@ -281,7 +281,7 @@ def _against_tree(
     return dataclasses.replace(pair, verdict="contradicts stronger alignments")
 
 
-def _joined(parts: list[Sightings]) -> Sightings:
+def _join(parts: list[Sightings]) -> Sightings:
     return Sightings(
         *(
             np.concatenate([getattr(part, field.name) for part in parts])

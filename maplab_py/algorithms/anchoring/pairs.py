@@ -64,7 +64,7 @@ def align_pairs(
         elif wanted is None or (a, b) in wanted:
             T_B_A, agree = agreeing(between, options)
             pair = Pair(a, b, T_B_A, between.take(agree), len(mine))
-            pairs.append(_judged(_fitted(pair), options))
+            pairs.append(_judge(_fit(pair), options))
     return pairs
 
 
@@ -106,7 +106,7 @@ def _rows_of_pairs(sightings: Sightings) -> dict[tuple[int, int], I64]:
     }
 
 
-def _fitted(pair: Pair) -> Pair:
+def _fit(pair: Pair) -> Pair:
     """Fit the alignment to all closures that agree."""
     good = pair.sightings
     local = dataclasses.replace(
@@ -117,7 +117,7 @@ def _fitted(pair: Pair) -> Pair:
     return dataclasses.replace(pair, T_B_A=T_B_A)
 
 
-def _judged(pair: Pair, options: AnchoringOptions) -> Pair:
+def _judge(pair: Pair, options: AnchoringOptions) -> Pair:
     agreed = len(pair.sightings.weight)
     if agreed < options.min_inlier_count:
         verdict = f"{agreed} closures agree, {options.min_inlier_count} are needed"

@@ -127,7 +127,7 @@ def judge_matches(
             vi_map,
             query[left],
             place[left],
-            _taken(solutions, left),
+            _take(solutions, left),
             _closure_options(options),
             is_known=vi_map.baseframes.is_known[vi_map.missions.baseframe],
         )
@@ -218,7 +218,7 @@ def _corrections(vi_map: VIMap, query: I64, place: I64, T_M_I: F64) -> F64:
     return se3.local(vi_map.T_G_I[query], se3.compose(T_G_M, T_M_I))
 
 
-def _taken(solutions: PoseSolutions, rows: I64) -> PoseSolutions:
+def _take(solutions: PoseSolutions, rows: I64) -> PoseSolutions:
     kept = {
         field.name: getattr(solutions, field.name)[rows]
         for field in dataclasses.fields(solutions)

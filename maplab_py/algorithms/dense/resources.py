@@ -54,12 +54,12 @@ class FrameResources:
         Raises:
             MapError: It is not in sensors.yaml.
         """
-        return self._mounted(frame)[0]
+        return self._mount(frame)[0]
 
     def T_G_C(self, frame: int) -> F64:
         """Return the pose (7,) of a frame's camera; see `camera`."""
         vertex = self.vi_map.frames.vertex[frame]
-        return se3.compose(self.vi_map.T_G_I[vertex], self._mounted(frame)[1])
+        return se3.compose(self.vi_map.T_G_I[vertex], self._mount(frame)[1])
 
     def depth(self, row: int) -> F32:
         """Return a depth map (H, W) [m] (row of a resource) of a frame.
@@ -79,7 +79,7 @@ class FrameResources:
         """Return the content of a resource; see `ResourceStore.load`."""
         return self._store.load(row)
 
-    def _mounted(self, frame: int) -> tuple[Camera, F64]:
+    def _mount(self, frame: int) -> tuple[Camera, F64]:
         index = int(self.vi_map.frames.camera_index[frame])
         cameras, T_I_C = self._mounting(self.mission(frame))
         if index >= len(cameras):

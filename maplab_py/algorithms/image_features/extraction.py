@@ -98,7 +98,7 @@ def extract_features(
         keypoints=int(counts.sum()),
         median_per_image=float(np.median(counts)) if len(counts) else 0.0,
         frames_that_had_some=skipped,
-        frames_without_image=int(np.count_nonzero(_chosen(vi_map, missions)))
+        frames_without_image=int(np.count_nonzero(_choose(vi_map, missions)))
         - len(frames)
         - skipped,
         keypoints_removed=removed,
@@ -124,7 +124,7 @@ def _extractor(options: ExtractionOptions) -> tuple[_Extract, DescriptorKind | N
     return lambda image: checked(call(image), plugin.feature_type, name), None, 1
 
 
-def _chosen(vi_map: VIMap, missions: I64 | None) -> Mask:
+def _choose(vi_map: VIMap, missions: I64 | None) -> Mask:
     """Return which frames (F,) belong to missions and are valid."""
     valid = vi_map.frames.is_valid & (vi_map.frames.id != 0).any(axis=1)
     if missions is None:
@@ -137,7 +137,7 @@ def _frames_with_images(vi_map: VIMap, missions: I64 | None) -> tuple[I64, I64]:
     chosen = resources_of(vi_map, IMAGES) & (vi_map.resources.owner_kind == ResourceOwner.FRAME)
     resources = np.flatnonzero(chosen)
     owner = vi_map.resources.owner[resources].astype(np.int64)
-    inside = _chosen(vi_map, missions)[owner]
+    inside = _choose(vi_map, missions)[owner]
     frames, first = np.unique(owner[inside], return_index=True)
     if not len(frames):
         raise UserError(

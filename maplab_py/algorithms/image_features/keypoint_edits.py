@@ -72,10 +72,10 @@ def with_features(
     owner = np.repeat(np.array(frames, dtype=np.int64), counts)
     new = Keypoints.filled(
         len(owner),
-        uv_px=_stacked([part.keypoints_px for part in features], np.zeros((0, 2))),
+        uv_px=_stack([part.keypoints_px for part in features], np.zeros((0, 2))),
         sigma_px=np.full(len(owner), sigma_px),
-        scale=_stacked([_diameters(part) for part in features], np.zeros(0)),
-        descriptor=_stacked(
+        scale=_stack([_diameters(part) for part in features], np.zeros(0)),
+        descriptor=_stack(
             [np.ascontiguousarray(part.descriptors).view(np.uint8) for part in features],
             np.zeros((0, kind.size), dtype=np.uint8),
         ),
@@ -115,7 +115,7 @@ def keypoints_of(vi_map: VIMap, frames: I64) -> tuple[I64, I64]:
     return first + np.arange(int(start[-1])), start
 
 
-def _stacked(parts: list[NDArray[Any]], empty: NDArray[Any]) -> NDArray[Any]:
+def _stack(parts: list[NDArray[Any]], empty: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate(parts) if parts else empty
 
 

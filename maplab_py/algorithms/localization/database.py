@@ -59,7 +59,7 @@ class LocalizationMap:
     @cached_property
     def observers_of(self) -> tuple[I64, I64]:
         """Offsets (L + 1) and observers, by landmark."""
-        return _grouped(self.descriptors.label, self.observer, len(self.p_G))
+        return _group(self.descriptors.label, self.observer, len(self.p_G))
 
     @cached_property
     def rows_of(self) -> tuple[I64, I64]:
@@ -89,7 +89,7 @@ class LocalizationMap:
     @cached_property
     def landmarks_of(self) -> tuple[I64, I64]:
         """Offsets (K + 1) and landmarks, by observer."""
-        return _grouped(self.observer, self.descriptors.label, len(self.p_G_observer))
+        return _group(self.observer, self.descriptors.label, len(self.p_G_observer))
 
     def place_of(self, observer: int, min_shared: int) -> NDArray[np.bool_]:
         """Return which observers (K,) share at least this many landmarks with an observer, or are it."""
@@ -200,7 +200,7 @@ def _kind(summary: SummaryMap) -> DescriptorKind | None:
     return DescriptorKind(*summary.descriptor_kind)
 
 
-def _grouped(key: I64, value: I64, groups: int) -> tuple[I64, I64]:
+def _group(key: I64, value: I64, groups: int) -> tuple[I64, I64]:
     """Return offsets (groups + 1) and distinct values, by key."""
     size = int(value.max(initial=0)) + 1
     pairs = distinct(key * size + value)

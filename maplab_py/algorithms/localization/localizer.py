@@ -119,7 +119,7 @@ class Localizer:
         solution = self._search(
             _Level.of(query), query.key * self._options.places, keypoint, landmark
         )
-        answer = self._judged(query, solution)
+        answer = self._judge(query, solution)
         return dataclasses.replace(answer, ransac_s=time.perf_counter() - begin)
 
     def localize(self, query: Query) -> Localization:
@@ -204,7 +204,7 @@ class Localizer:
                     break
                 solution = guided
             if best.outcome is Outcome.FEW_MATCHES or solution.landmarks > best.inliers:
-                best = self._judged(query, solution)
+                best = self._judge(query, solution)
             if best.outcome is Outcome.LOCALIZED and best.inliers >= enough:
                 break
         return best
@@ -229,7 +229,7 @@ class Localizer:
             level.query, solutions, len(np.unique(keypoint)), keypoint[agreeing], landmark[agreeing]
         )
 
-    def _judged(self, query: Query, solution: _PoseSolution) -> Localization:
+    def _judge(self, query: Query, solution: _PoseSolution) -> Localization:
         """Decide whether a pose is accepted."""
         o = self._options
         solutions, inliers = solution.solutions, int(solution.solutions.inlier_count[0])

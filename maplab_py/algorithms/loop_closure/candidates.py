@@ -74,7 +74,7 @@ def find_candidates(
     """Return the candidate places in every mission for each query vertex."""
     seen = _observers(vi_map)  # (L, V)
     near = _near(seen)
-    matched = _matched(vi_map, features, matches)
+    matched = _match(vi_map, features, matches)
     queries = np.flatnonzero(np.diff(matched.indptr))
     places: list[I64] = [np.zeros((0, 3), dtype=np.int64)]
     for begin in range(0, len(queries), _QUERIES_AT_ONCE):
@@ -100,7 +100,7 @@ def _near(seen: Any) -> Any:
     return near
 
 
-def _matched(vi_map: VIMap, features: MapFeatures, matches: Matches) -> Any:
+def _match(vi_map: VIMap, features: MapFeatures, matches: Matches) -> Any:
     """Return the matrix (V, L) of ones where a query vertex is matched with a landmark."""
     from scipy.sparse import csr_array
 

@@ -126,7 +126,7 @@ def _merge(
     absorbed, survivor = _into_best(vi_map, united.first, united.second)
     merged = merge_landmarks(vi_map, absorbed, survivor)
     ids = vi_map.landmarks.id[np.unique(survivor)]
-    return _triangulated(merged, merged.landmark_index.rows(ids)), MergeResult(
+    return _triangulate(merged, merged.landmark_index.rows(ids)), MergeResult(
         landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
         observations_moved=int(np.count_nonzero(np.isin(vi_map.keypoints.landmark, absorbed))),
         refused=refused,
@@ -137,7 +137,7 @@ def _merge(
     )
 
 
-def _triangulated(vi_map: VIMap, landmarks: I64) -> VIMap:
+def _triangulate(vi_map: VIMap, landmarks: I64) -> VIMap:
     """Move landmarks to the points nearest to all their rays where these are better determined."""
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks)]
     start = starts_of_counts(np.diff(vi_map.observation_start)[landmarks])

@@ -45,9 +45,7 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
     edges = IdIndex(ids).rows(vi_map.loop_closure_edges.id) >= 0
     result = remove_loop_closure_edges(vi_map, edges) if edges.any() else vi_map
     pairs = record.pairs.take(IdIndex(ids).rows(record.pairs.closure) < 0)
-    result, restored, moved, pairs = _restored(
-        result, record, _still_wanted(pairs, record.closures)
-    )
+    result, restored, moved, pairs = _restore(result, record, _still_wanted(pairs, record.closures))
     result = write_record(result, dataclasses.replace(record, closures=closures, pairs=pairs))
     notes = []
     if relaxed.any():
@@ -87,7 +85,7 @@ def _groups(landmarks: IdIndex, count: int, pairs: MergePairs) -> I64:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _restored(
+def _restore(
     vi_map: VIMap, record: LoopRecord, pairs: MergePairs
 ) -> tuple[VIMap, int, int, MergePairs]:
     """Split merged landmarks into the groups that the remaining pairs connect."""

@@ -145,7 +145,7 @@ class _Graph:
         limits: list[float] = []
         for share in _STARTS:
             T, iterations = self._anneal(share, self.options.switch_prior)
-            solution, limit = self._tested(T, iterations + spent)
+            solution, limit = self._test(T, iterations + spent)
             spent = 0
             solutions.append(solution)
             limits.append(limit)
@@ -180,7 +180,7 @@ class _Graph:
         weight = everything.astype(np.float64)
         return Solution(T, weight, iterations + more, first, last), iterations
 
-    def _tested(self, T: F64, iterations: int) -> tuple[Solution, float]:
+    def _test(self, T: F64, iterations: int) -> tuple[Solution, float]:
         """Find a set of closures that is the set of those which agree with its own optimum.
 
         Returns:
@@ -200,13 +200,13 @@ class _Graph:
         kept = u < 2.0 * penalty
         problem, limit = self.problem.without_loss(), prior
         for _ in range(_MAX_TESTS):
-            T, used, u, limit = self._measured(problem, T, kept)
+            T, used, u, limit = self._measure(problem, T, kept)
             iterations += used
             before, kept = kept, with_tail(u, limit)
             core = u <= limit
             # true closures with larger errors, or false ones that distort all?
             if np.any(kept & ~core):
-                T, used, u, limit = self._measured(problem, T, core)
+                T, used, u, limit = self._measure(problem, T, core)
                 iterations += used
                 kept = with_tail(u, limit)
             if np.array_equal(before, kept):
@@ -216,7 +216,7 @@ class _Graph:
         first, last = problem.cost(self.T_G_I), problem.cost(T)
         return Solution(T, kept.astype(np.float64), iterations + used, first, last), limit
 
-    def _measured(
+    def _measure(
         self, problem: PoseGraphProblem, T: F64, kept: Mask
     ) -> tuple[F64, int, F64, float]:
         """Optimise with some closures; return poses, iterations, independent errors, their limit."""

@@ -66,23 +66,23 @@ def make_localization_map(
         ("retriangulate_landmarks", lambda m: retriangulate(m, LandmarkQualityOptions())),
         ("keyframe_heuristic", lambda m: keyframe(m, options.keyframing)),
         ("evaluate_landmark_quality", lambda m: evaluate_quality(m, quality)),
-        ("optimize_visual_inertial", lambda m: _optimized(m, _FIRST_ITERATIONS, progress)),
+        ("optimize_visual_inertial", lambda m: _optimize(m, _FIRST_ITERATIONS, progress)),
     ]
     if several:
         steps.append(
             ("anchor_all_missions", lambda m: _anchored(m, options.loop_closure, progress))
         )
     steps += [
-        ("relax", lambda m: _relaxed(m, options.loop_closure, progress)),
+        ("relax", lambda m: _relax(m, options.loop_closure, progress)),
         (
             "loopclosure_all_missions",
             lambda m: close_loops(m, options.loop_closure, progress=progress),
         ),
-        ("optimize_visual_inertial", lambda m: _optimized(m, _LAST_ITERATIONS, progress)),
+        ("optimize_visual_inertial", lambda m: _optimize(m, _LAST_ITERATIONS, progress)),
         ("evaluate_landmark_quality", lambda m: evaluate_quality(m, quality)),
     ]
     if options.landmarks_to_keep:
-        steps.append(("landmark_sparsify", lambda m: _sparsified(m, options, progress)))
+        steps.append(("landmark_sparsify", lambda m: _sparsify(m, options, progress)))
     lines = []
     for number, (name, step) in enumerate(steps):
         progress.step(number, len(steps), name)
@@ -96,7 +96,7 @@ def make_localization_map(
     return vi_map, report
 
 
-def _optimized(vi_map: VIMap, iterations: int, progress: Progress) -> tuple[VIMap, Report]:
+def _optimize(vi_map: VIMap, iterations: int, progress: Progress) -> tuple[VIMap, Report]:
     options = VIOptimizationOptions(num_iterations=iterations)
     return optimize(vi_map, options, progress=progress)
 
@@ -113,16 +113,14 @@ def _anchored(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> t
     return result, report
 
 
-def _relaxed(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
+def _relax(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
     edges, search_report = find_loop_closures(vi_map, loops, progress=progress)
     if len(edges) == 0:
         return vi_map, search_report
     return relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
 
 
-def _sparsified(
-    vi_map: VIMap, options: WorkflowOptions, progress: Progress
-) -> tuple[VIMap, Report]:
+def _sparsify(vi_map: VIMap, options: WorkflowOptions, progress: Progress) -> tuple[VIMap, Report]:
     keep, how = options.landmarks_to_keep, options.sparsification
     result, report, _ = sparsify(vi_map, keep, how, progress=progress)
     return result, report

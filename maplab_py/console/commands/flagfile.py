@@ -52,7 +52,7 @@ def read_flagfile(path: Path, depth: int = 0) -> list[FileWords]:
             continue
         if not looks_like_flag(words[0]):
             raise FlagError(f"{origin}: '{words[0]}' is not a flag (write --name=value)")
-        included = _included(words)
+        included = _include(words)
         if included is None:
             lines.append(FileWords(tuple(words), origin))
         else:
@@ -70,7 +70,7 @@ def _read_included(path: Path, depth: int, origin: str) -> list[FileWords]:
         raise
 
 
-def _included(words: list[str]) -> str | None:
+def _include(words: list[str]) -> str | None:
     name, _, value = words[0].lstrip("-").partition("=")
     if name != "flagfile":
         return None

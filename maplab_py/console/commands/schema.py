@@ -87,7 +87,7 @@ def report_types(function: Callable[..., Any]) -> tuple[type[Report], ...]:
         TypeError: There is no annotation, or it is no concrete report class.
     """
     annotation = inspect.signature(function).return_annotation
-    hint = _evaluated(annotation, sys.modules[function.__module__])
+    hint = _evaluate(annotation, sys.modules[function.__module__])
     kinds = typing.get_args(hint) if _is_union(hint) else (hint,)
     reports = tuple(Message if kind in (str, type(None), None) else kind for kind in kinds)
     for kind in reports:
@@ -161,11 +161,11 @@ def _field_hints(kind: type) -> dict[str, Any]:
     for base in reversed(kind.__mro__):
         module = sys.modules[base.__module__]
         for name, annotation in vars(base).get("__annotations__", {}).items():
-            hints[name] = _evaluated(annotation, module)
+            hints[name] = _evaluate(annotation, module)
     return hints
 
 
-def _evaluated(annotation: Any, module: types.ModuleType) -> Any:
+def _evaluate(annotation: Any, module: types.ModuleType) -> Any:
     """Evaluate an annotation, also where its names are imported for type checkers only."""
     if not isinstance(annotation, str):
         return annotation

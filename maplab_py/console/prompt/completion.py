@@ -62,7 +62,7 @@ def _commands(current: Word, session: Session) -> list[Candidate]:
         candidates.append((name, Candidate(name, current.start, name, note)))
     for name, line in session.aliases.items():
         candidates.append((name, Candidate(name, current.start, name, f"alias: {line}")))
-    return _ranked(current.text, candidates, session.uses)
+    return _rank(current.text, candidates, session.uses)
 
 
 def _shell_paths(text: str) -> list[Candidate]:
@@ -124,7 +124,7 @@ def _flags(flags: dict[str, Flag], current: Word, used: set[str]) -> list[Candid
         note = f"{flag.type.name}{unit} = {flag.default_text or '(empty)'}  {flag.help}".rstrip()
         text = f"--{name}" if flag.type.is_bool else f"--{name}="
         candidates.append((name, Candidate(text, current.start, text, note)))
-    return _ranked(typed, candidates)
+    return _rank(typed, candidates)
 
 
 def _values(
@@ -148,10 +148,10 @@ def _values(
         (v.text, Candidate(before + head + escaped(v.text), current.start, v.text, v.note))
         for v in values[:_MOST_VALUES]
     ]
-    return _ranked(typed, candidates)
+    return _rank(typed, candidates)
 
 
-def _ranked(
+def _rank(
     typed: str, candidates: list[tuple[str, Candidate]], uses: Counter[str] | None = None
 ) -> list[Candidate]:
     """Return the candidates that fit, best first; of equal ones the most used, then the shortest.

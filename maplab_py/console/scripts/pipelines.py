@@ -24,11 +24,11 @@ _MAPS_FOLDER = "maps_folder"
 _DEFAULTS = PipelineOptions()
 
 
-def _declared(context: object, *, options: PipelineOptions = _DEFAULTS) -> None:
+def _declare(context: object, *, options: PipelineOptions = _DEFAULTS) -> None:
     """Run commands on each of several map folders, or the stages of a pipeline."""
 
 
-_BATCH = describe(_declared, "batch", ())
+_BATCH = describe(_declare, "batch", ())
 
 
 def split_flags(

@@ -159,7 +159,7 @@ class Runner:
                 call = self.session.parse(["help", call.command.name])
             if command.in_background:
                 return self._start_job(call, command)
-            with self._piped(command.shell), self._written(command), self.session.lock:
+            with self._pipe(command.shell), self._write(command), self.session.lock:
                 report = run_in_foreground(
                     call.command.name,
                     lambda: self.session.execute(call),
@@ -234,7 +234,7 @@ class Runner:
         return {**os.environ, **self.session.variables}
 
     @contextmanager
-    def _written(self, command: TypedCommand) -> Iterator[None]:
+    def _write(self, command: TypedCommand) -> Iterator[None]:
         """Write the report of a command to the file behind `>` or `>>`, if it succeeds."""
         if not command.output:
             yield
@@ -253,7 +253,7 @@ class Runner:
         write_file(path, [before + report.getvalue().encode()])
 
     @contextmanager
-    def _piped(self, line: str) -> Iterator[None]:
+    def _pipe(self, line: str) -> Iterator[None]:
         """Send the report of a command to the standard input of a shell command."""
         if not line:
             yield

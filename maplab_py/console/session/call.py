@@ -172,13 +172,13 @@ def _flagfile_texts(text: str, command: Command, registry: Registry) -> dict[str
             given, plain = parse_words(line.words, known, command.name)
             if plain:
                 raise FlagError(f"'{plain[0]}' is not a flag (write --name=value)")
-            texts.update(_checked(given, command))
+            texts.update(_check(given, command))
         except UserError as error:
             raise FlagError(f"{line.origin}: {error}") from None
     return texts
 
 
-def _checked(given: Sequence[Given], command: Command) -> dict[str, str]:
+def _check(given: Sequence[Given], command: Command) -> dict[str, str]:
     texts = {g.name: g.text for g in given if g.name in command.flags}
     for name, text in texts.items():
         command.flags[name].convert(text)

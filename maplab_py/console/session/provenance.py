@@ -96,11 +96,11 @@ def _text(call: Call) -> str:
     given: Mapping[str, Any] = {
         name: value for name, value in call.values.items() if value != flags[name].default
     }
-    words: Iterable[str] = (f"--{name}={_quoted(value)}" for name, value in sorted(given.items()))
-    return " ".join([call.command.name, *words, *map(_quoted, call.words)])
+    words: Iterable[str] = (f"--{name}={_quote(value)}" for name, value in sorted(given.items()))
+    return " ".join([call.command.name, *words, *map(_quote, call.words)])
 
 
-def _quoted(value: Any) -> str:
+def _quote(value: Any) -> str:
     """Return a value as a word; paths are absolute, so that the script runs in any folder."""
     text = format_value(value.absolute() if isinstance(value, Path) else value)
     return escaped(text).replace("$", "\\$") if text else "''"

@@ -228,7 +228,7 @@ class Session:
                     draft, progress, terminal, command.name, is_trial=call.is_trial
                 )
                 with staging(enabled=not command.acts_outside) as staged:
-                    report = _called(call, context, arguments)
+                    report = _call(call, context, arguments)
                     if context.has_drafts and not current_token().has_effects:
                         progress.check()
                     if staged.files:
@@ -280,7 +280,7 @@ class Session:
         return inside
 
 
-def _called(call: Call, context: CommandContext, arguments: dict[str, Any]) -> Any:
+def _call(call: Call, context: CommandContext, arguments: dict[str, Any]) -> Any:
     """Call the function; a trial lists the files instead of writing them."""
     words = _by_position(call, arguments)
     with memory_limited(call.max_memory_gb):

@@ -86,32 +86,32 @@ class Watchers:
         """Close and remove a watcher."""
         watcher = self._watchers.pop(name, None)
         if watcher is not None:
-            self._guarded(name, watcher.close)
+            self._guard(name, watcher.close)
         self._told.discard(name)
 
     def after_command(self, maps: MapManager) -> None:
         """Notify all watchers."""
         for name, watcher in list(self._watchers.items()):
-            if self._guarded(name, partial(watcher.after_command, maps)):
+            if self._guard(name, partial(watcher.after_command, maps)):
                 self._told.discard(name)
 
     def during_command(self, make_map: Callable[[], VIMap]) -> None:
         """Notify all watchers of an intermediate result."""
         for name, watcher in list(self._watchers.items()):
-            self._guarded(name, partial(watcher.during_command, make_map))
+            self._guard(name, partial(watcher.during_command, make_map))
 
     def after_line(self, line: str, *, succeeded: bool) -> None:
         """Notify the watchers that observe typed lines."""
         for name, watcher in list(self._watchers.items()):
             if isinstance(watcher, LineWatcher):
-                self._guarded(name, partial(watcher.after_line, line, succeeded=succeeded))
+                self._guard(name, partial(watcher.after_line, line, succeeded=succeeded))
 
     def close(self) -> None:
         """Close all."""
         for name in list(self._watchers):
             self.remove(name)
 
-    def _guarded(self, name: str, action: Callable[[], None]) -> bool:
+    def _guard(self, name: str, action: Callable[[], None]) -> bool:
         try:
             action()
         except Exception:

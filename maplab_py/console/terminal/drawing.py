@@ -70,7 +70,7 @@ class _Drawing:
             return [
                 folded_line
                 for line, indent in zip(lines, indents, strict=True)
-                for folded_line in self._folded(line, hanging=indent)
+                for folded_line in self._fold(line, hanging=indent)
             ]
         title = [self._in(_TITLE, block.title)] if block.title else []
         if isinstance(block, Pairs):
@@ -83,7 +83,7 @@ class _Drawing:
         name_width = max((text_width(name) for name, _ in pairs.rows), default=0)
         lines = []
         for name, value in pairs.rows:
-            first, *others = self._folded(value, name_width + GAP)
+            first, *others = self._fold(value, name_width + GAP)
             shown = self._in(_NAME, name) + " " * (name_width - text_width(name) + GAP)
             lines += [(shown + first).rstrip()]
             lines += [" " * (name_width + GAP) + line for line in others]
@@ -97,9 +97,9 @@ class _Drawing:
             note = ", ".join(
                 cell if head == table.heads[1] else f"{head} {cell}" for head, cell in named if cell
             )
-            first, *others = self._folded(f"{term}  {note}".rstrip(), hanging=4)
+            first, *others = self._fold(f"{term}  {note}".rstrip(), hanging=4)
             lines += [self._in(_NAME, term) + first.removeprefix(term), *others]
-            lines += [" " * 4 + line for line in self._folded(text, 4)] if text else []
+            lines += [" " * 4 + line for line in self._fold(text, 4)] if text else []
         return lines
 
     def _table(self, table: Table) -> list[str]:
@@ -113,10 +113,10 @@ class _Drawing:
             lines += _row(row, shown.widths, shown.table)
         if shown.omitted:
             hint = f"no room for: {', '.join(shown.omitted)} (all columns: | less -S, or --json)"
-            lines += [self._in(_FAINT, line) for line in self._folded(hint)]
+            lines += [self._in(_FAINT, line) for line in self._fold(hint)]
         return lines
 
-    def _folded(self, text: str, indent: int = 0, hanging: int = 0) -> list[str]:
+    def _fold(self, text: str, indent: int = 0, hanging: int = 0) -> list[str]:
         if self._width is None:
             return [text]
         return folded(text, max(20, self._width - indent), hanging).split("\n")
@@ -178,7 +178,7 @@ def fitted(table: Table, width: int) -> FittedTable:
     if _total(_widths(table, by_words=True)) <= width:
         return FittedTable(table, narrowed_widths(table, width), [])
     if len(table.rows) <= _MAX_ROWS_TRANSPOSED and len(table.heads) > 1:
-        turned = _transposed(table)
+        turned = _transpose(table)
         if _total(_widths(turned, by_words=True)) <= width:
             return FittedTable(turned, narrowed_widths(turned, width), [])
     count = len(table.heads)
@@ -228,7 +228,7 @@ def _total(widths: list[int]) -> int:
     return sum(widths) + GAP * (len(widths) - 1)
 
 
-def _transposed(table: Table) -> Table:
+def _transpose(table: Table) -> Table:
     """Return a table whose rows are the columns; the first column gives the heads."""
     heads = [table.heads[0], *(row[0] for row in table.rows)]
     rows = [

@@ -35,7 +35,7 @@ def with_names(blocks: list[Block], names: Mapping[str, str]) -> list[Block]:
     """Return blocks in which the ids of missions are replaced by the names."""
     if not names:
         return blocks
-    return [_named(block, names) for block in blocks]
+    return [_name(block, names) for block in blocks]
 
 
 def text_with_names(text: str, names: Mapping[str, str]) -> str:
@@ -43,7 +43,7 @@ def text_with_names(text: str, names: Mapping[str, str]) -> str:
     return _ID.sub(lambda match: names.get(match[0], match[0]), text) if names else text
 
 
-def _named(block: Block, names: Mapping[str, str]) -> Block:
+def _name(block: Block, names: Mapping[str, str]) -> Block:
     def named(text: str) -> str:
         return text_with_names(text, names)
 

@@ -174,7 +174,7 @@ def add_part(
     if not len(part):
         return []
     if isinstance(part, Points):
-        order = _shuffled(len(part))
+        order = _shuffle(len(part))
         return [
             scene.add_point_cloud(
                 name, part.p[order], part.colours[order], point_size=part.size_m * point_scale,
@@ -218,7 +218,7 @@ def _add_labels(
 
 
 @functools.lru_cache(maxsize=16)
-def _shuffled(count: int) -> I64:
+def _shuffle(count: int) -> I64:
     """Return an order of points whose beginnings are spread over all of them; `page.js` uses that."""
     return np.random.default_rng(0).permutation(count)
 
@@ -238,7 +238,7 @@ def _moved_in_place(server: viser.ViserServer, key: _NodeKey, node: _Node, part:
     if not node.handles or len(before) != len(part):
         return False
     if isinstance(before, Points) and isinstance(part, Points) and before.size_m == part.size_m:
-        order = _shuffled(len(part))
+        order = _shuffle(len(part))
         if not np.array_equal(before.p, part.p):
             node.handles[0].points = part.p[order]
             labelled = [row for row, label in enumerate(before.labels) if label]

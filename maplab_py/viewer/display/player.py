@@ -105,9 +105,9 @@ class Player:
         drawing, timeline = self._drawing, self.timeline
         mission = drawing.vi_map.vertices.mission
         start = np.flatnonzero((mission[1:] == mission[:-1]) & self._plays[mission[1:]])
-        paths = _grouped(timeline.vertex_step[start + 1], start)
+        paths = _group(timeline.vertex_step[start + 1], start)
         rows = timeline.landmarks[self._plays[drawing.landmark_mission[timeline.landmarks]]]
-        clouds = _grouped(timeline.landmark_step[rows], rows)
+        clouds = _group(timeline.landmark_step[rows], rows)
         every, _ = landmark_colours(drawing)
         chunks: dict[int, list[Any]] = {}
         p = drawing.p_vertices
@@ -197,7 +197,7 @@ class Player:
         self._recent = add_part(self._server, "/play/recent", part)
 
 
-def _grouped(step: I64, rows: I64) -> dict[int, I64]:
+def _group(step: I64, rows: I64) -> dict[int, I64]:
     """Return the rows of each step."""
     order = np.argsort(step, kind="stable")
     cuts = np.flatnonzero(np.diff(step[order])) + 1

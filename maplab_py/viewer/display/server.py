@@ -58,7 +58,7 @@ def start_server(port: int) -> viser.ViserServer:
     _hush_libraries()
     with (
         _patching,
-        _patched(websockets.asyncio.server, "serve", _restricted_serve()),
+        _patch(websockets.asyncio.server, "serve", _restricted_serve()),
     ):
         try:
             server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False, label="maplab")
@@ -139,7 +139,7 @@ def _hush_libraries() -> None:
 
 
 @contextmanager
-def _patched(owner: Any, name: str, value: Any) -> Iterator[None]:
+def _patch(owner: Any, name: str, value: Any) -> Iterator[None]:
     before = getattr(owner, name)
     setattr(owner, name, value)
     try:

@@ -83,7 +83,7 @@ class Viewer:
         self._is_stopped = False
         self._next_live = 0.0
         self.set_dark(is_dark)
-        self._server.scene.on_click()(by_user(self._lock, self._clicked, self._panel.say))
+        self._server.scene.on_click()(by_user(self._lock, self._click, self._panel.say))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
         atexit.register(self.stop)
@@ -223,7 +223,7 @@ class Viewer:
         scene = self._shown()
         self.wait()
         layers = self.visible_layers
-        with self._lock, self._nodes.with_hidden(self._drawn(scene), layers, self.visible_missions):
+        with self._lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
             return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
 
     def _shown(self) -> Scene:
@@ -408,7 +408,7 @@ class Viewer:
                 with client.atomic():
                     approach(client.camera, picked.p, 0.25 * self.drawing.extent.radius_m)
 
-    def _clicked(self, event: Any) -> None:
+    def _click(self, event: Any) -> None:
         if self.scene is None:
             return
         picked = pick(
@@ -470,8 +470,8 @@ class Viewer:
         if self.scene is None:
             return
         layers, missions = self.visible_layers, self.visible_missions
-        self._nodes.show(self._drawn(self.scene), layers, missions)
+        self._nodes.show(self._draw(self.scene), layers, missions)
         self._panel.show(self.scene, layers, missions)
 
-    def _drawn(self, scene: Scene) -> Scene:
+    def _draw(self, scene: Scene) -> Scene:
         return scene if self.player is None else without_played(scene)

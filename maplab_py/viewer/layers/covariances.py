@@ -31,7 +31,7 @@ def loop_closure_covariances(drawing: Drawing) -> Layer:
     vi_map, edges = drawing.vi_map, drawing.vi_map.loop_closure_edges
     is_usable = _is_finite(edges.covariance) & (edges.from_vertex >= 0)
     usable = np.flatnonzero(is_usable & (edges.to_vertex >= 0))
-    rows, title = _thinned(usable, "Loop closure covariances")
+    rows, title = _thin(usable, "Loop closure covariances")
     start = edges.from_vertex[rows]
     T_G_A = vi_map.T_G_I[start]
     centre = se3.transform(T_G_A, edges.T_A_B[rows, 4:])
@@ -49,7 +49,7 @@ def absolute_pose_covariances(drawing: Drawing) -> Layer:
     """An ellipsoid at each absolute pose measurement."""
     table = drawing.vi_map.absolute_poses
     usable = np.flatnonzero(_is_finite(table.covariance))
-    rows, title = _thinned(usable, "Absolute pose covariances")
+    rows, title = _thin(usable, "Absolute pose covariances")
     mission = drawing.vi_map.vertices.mission[table.vertex[rows]]
     parts: dict[str, Part] = {}
     for mission_id, places in drawing.by_mission(mission):
@@ -98,7 +98,7 @@ def _is_finite(covariance: F64) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_
     return np.asarray(np.isfinite(covariance[:, :3, :3]).all(axis=(1, 2)))
 
 
-def _thinned(rows: I64, title: str) -> tuple[I64, str]:
+def _thin(rows: I64, title: str) -> tuple[I64, str]:
     """Return as many of the rows as a page can draw, and the title of their layer."""
     step = max(-(-len(rows) // _MAX_ELLIPSOIDS), 1)
     return rows[::step], f"{title} (one of {step})" if step > 1 else title

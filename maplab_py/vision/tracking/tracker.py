@@ -364,7 +364,7 @@ def match(
     rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
     uv_second, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow)
     ray_second, exists = second.rays(uv_second)
-    off, distance, is_ahead = _triangulated(tracks.ray[rows], ray_second @ R_A_B.T, p_A_B)
+    off, distance, is_ahead = _triangulate(tracks.ray[rows], ray_second @ R_A_B.T, p_A_B)
     gate = options.gate_px / second.focal_px
     is_match &= exists & second.is_usable(uv_second) & (np.abs(off) <= gate)
     # where the rays are nearly parallel, noise decides on which side they meet
@@ -395,7 +395,7 @@ def _expected_distances(tracks: LiveTracks, default_m: float) -> F64:
     return expected
 
 
-def _triangulated(a: F64, b: F64, p: F64) -> tuple[F64, F64, Mask]:
+def _triangulate(a: F64, b: F64, p: F64) -> tuple[F64, F64, Mask]:
     """Intersect rays a (K, 3) from the origin with rays b (K, 3) from p (3,).
 
     Returns:

@@ -59,7 +59,7 @@ def _chord(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled(forceinline=True)
-def _turned(turn, a):  # type: ignore[no-untyped-def]
+def _turn(turn, a):  # type: ignore[no-untyped-def]
     """Turn a by a small rotation vector, to first order."""
     c = _cross(turn, a)
     return (a[0] + c[0], a[1] + c[1], a[2] + c[2])
@@ -140,7 +140,7 @@ def _refine(a, b, is_used, limits, turn, direction):  # type: ignore[no-untyped-
         for k in range(len(a)):
             if not is_used[k]:
                 continue
-            a_k = _turned(turn, a[k])
+            a_k = _turn(turn, a[k])
             normal = _cross(direction, a_k)
             length = np.sqrt(_dot(normal, normal))
             if length < 1e-6:
@@ -197,7 +197,7 @@ def search_two_point(a, b, limits, seed, result):  # type: ignore[no-untyped-def
         return
     _refine(a, b, result.is_inlier, limits, result.turn, result.direction)
     for k in range(count):
-        a_k = _turned(result.turn, a[k])
+        a_k = _turn(result.turn, a[k])
         is_moved = _is_moved(result.direction, a_k, b[k], limits.gate)
         result.is_inlier[k] = is_moved or _chord(a_k, b[k]) <= limits.gate
 

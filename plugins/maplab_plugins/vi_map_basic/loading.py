@@ -170,7 +170,7 @@ def load(
         vi_map = with_new_ids(vi_map)
     is_saved = not (assign_new_ids or reading.repair)
     context.maps.add(key, vi_map, folder=map_folder, is_saved=is_saved, disk_copy=before)
-    return LoadedMaps((_loaded(key, vi_map, map_folder),), (report,))
+    return LoadedMaps((_load(key, vi_map, map_folder),), (report,))
 
 
 @command("load_all", example="load_all --maps_folder=maps", needs_map=False)
@@ -204,7 +204,7 @@ def load_all(
     for key, copy, folder, (vi_map, _) in zip(keys, before, folders, loaded, strict=True):
         value = with_new_ids(vi_map) if assign_new_ids else vi_map
         context.maps.add(key, value, folder=folder, is_saved=is_saved, disk_copy=copy)
-        lines.append(_loaded(key, value, folder))
+        lines.append(_load(key, value, folder))
     return LoadedMaps(tuple(lines), ())
 
 
@@ -428,6 +428,6 @@ def _start_time_ns(vi_map: VIMap) -> int:
     return int(vi_map.vertices.timestamp_ns.min()) if len(vi_map.vertices) else 0
 
 
-def _loaded(key: str, vi_map: VIMap, folder: Path) -> LoadedMap:
+def _load(key: str, vi_map: VIMap, folder: Path) -> LoadedMap:
     counts = len(vi_map.missions), len(vi_map.vertices), len(vi_map.landmarks)
     return LoadedMap(key, *counts, folder)

@@ -69,7 +69,7 @@ def why(
         return explanation.explain_pair(
             vi_map, first, second, loop_options, anchoring.min_inlier_count, context.progress
         )
-    kind, row = _resolved(vi_map, subject)
+    kind, row = _resolve(vi_map, subject)
     if kind == "mission":
         return explanation.explain_mission(vi_map, row)
     if kind == "closure":
@@ -77,7 +77,7 @@ def why(
     return explain_landmark(vi_map, row, quality)
 
 
-def _resolved(vi_map: VIMap, subject: str) -> tuple[str, int]:
+def _resolve(vi_map: VIMap, subject: str) -> tuple[str, int]:
     """Return what a text names, and its row: a mission's name first, then the beginning of an id.
 
     Raises:

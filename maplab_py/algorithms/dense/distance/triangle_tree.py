@@ -38,7 +38,7 @@ class TriangleTree:
         size = -(-len(faces) // leaves)  # rounded up
         # repeated triangles fill the last leaves
         rows = np.concatenate([np.arange(len(faces)), np.zeros(leaves * size - len(faces), int)])
-        rows = _halved(corners.mean(axis=1), rows, leaves)
+        rows = _halve(corners.mean(axis=1), rows, leaves)
         self._triangles = corners[rows].reshape(-1, 9)
         self._boxes = _boxes(corners[rows].reshape(leaves, -1, 3))
 
@@ -69,7 +69,7 @@ def _with_slivers_as_segments(corners: F64) -> F64:
     return corners
 
 
-def _halved(centres: F64, rows: I64, leaves: int) -> I64:
+def _halve(centres: F64, rows: I64, leaves: int) -> I64:
     """Order triangles (rows) so that equal parts of them are the leaves of a tree."""
     groups = rows[None]
     while len(groups) < leaves:

@@ -122,7 +122,7 @@ class UndistortedViews:
             is_good = vi_map.landmarks.quality == LandmarkQuality.GOOD
             chosen[chosen] &= is_good[landmark[chosen]]
         rows = np.flatnonzero(chosen)
-        uv, inside = self._undistorted(view[rows], vi_map.keypoints.uv_px[rows])
+        uv, inside = self._undistort(view[rows], vi_map.keypoints.uv_px[rows])
         rows, uv = rows[inside], uv[inside]
         count = np.bincount(landmark[rows], minlength=len(vi_map.landmarks))
         often = count[landmark[rows]] >= 2
@@ -130,7 +130,7 @@ class UndistortedViews:
         kept, number = np.unique(landmark[rows], return_inverse=True)
         return PointTracks(vi_map.p_G[kept], number.reshape(-1), view[rows], uv)
 
-    def _undistorted(self, view: I64, uv_px: F64) -> tuple[F64, Any]:
+    def _undistort(self, view: I64, uv_px: F64) -> tuple[F64, Any]:
         """Return keypoints (N, 2) in the undistorted images, and which are inside."""
         result = np.zeros((len(view), 2))
         inside = np.zeros(len(view), dtype=np.bool_)

@@ -67,7 +67,7 @@ def write_colmap_workspace(
     tracks, scene = _scene(views, names, only_good=only_good)
     colours = np.full((len(scene.p_G), 3), _GREY, dtype=np.uint8)
     for view, image in _images(views, progress):
-        write_bytes(folder / "images" / names[view], [_encoded(image, ".png")], overwrite=overwrite)
+        write_bytes(folder / "images" / names[view], [_encode(image, ".png")], overwrite=overwrite)
         _paint(colours, image, tracks, view)
     model = encode_model(dataclasses.replace(scene, colours=colours))
     for name, content in model.items():
@@ -106,7 +106,7 @@ def write_pmvs_folder(
     tracks, scene = _scene(views, names, only_good=only_good)
     colours = np.full((len(scene.p_G), 3), _GREY, dtype=np.uint8)
     for view, image in _images(views, progress):
-        content = _encoded(_three_channels(image), suffix)
+        content = _encode(_three_channels(image), suffix)
         write_bytes(folder / "visualize" / names[view], [content], overwrite=overwrite)
         matrix = folder / "txt" / f"{file_number(view)}.txt"
         write_text(matrix, [projection_text(scene, view)], overwrite=overwrite)
@@ -171,7 +171,7 @@ def _three_channels(image: Any) -> Any:
     return np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
 
 
-def _encoded(image: Any, suffix: str) -> bytes:
+def _encode(image: Any, suffix: str) -> bytes:
     import cv2
 
     return bytes(cv2.imencode(suffix, image)[1])

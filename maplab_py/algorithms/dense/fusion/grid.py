@@ -161,7 +161,7 @@ class TsdfGrid:
             quads = np.empty((number, 4), dtype=np.int32)
         if len(quads):
             join_vertices(around, self.distance, cells, quads)
-        return _triangulated(points, quads)
+        return _triangulate(points, quads)
 
     def sorted(self) -> TsdfGrid:
         """Return the grid with observed blocks only, in the order of their coordinates."""
@@ -199,7 +199,7 @@ class TsdfGrid:
         fill_table(self.coordinates, self._table)
 
 
-def _triangulated(p: F64, quads: I32) -> Mesh:
+def _triangulate(p: F64, quads: I32) -> Mesh:
     """Split quadrilaterals along the shorter diagonal; leave out vertices without a face."""
     diagonals = [np.linalg.norm(p[quads[:, k]] - p[quads[:, k + 2]], axis=1) for k in (0, 1)]
     turned = diagonals[1] < diagonals[0]

@@ -196,7 +196,7 @@ def _reconstruct(
             [pinhole_pose(pair, writer.resources.T_G_C(f)) for f in sequence.left_frames.tolist()]
         )
         offsets = sequence.neighbour_offsets(settings.stereo.multi_view_interval_s)
-        checked = _confirmed(depths, poses, offsets, pair, settings.stereo)
+        checked = _confirm(depths, poses, offsets, pair, settings.stereo)
     else:
         checked = ((depth, depth) for depth in depths)
     for index, (raw, confirmed) in enumerate(checked):
@@ -222,7 +222,7 @@ def _raw_depths(
         yield matcher.depth(left, right)
 
 
-def _confirmed(
+def _confirm(
     depths: Iterator[F32],
     T_G_P: F64,
     offsets: list[int],
@@ -364,14 +364,14 @@ class DepthMatcher:
         ]
         disparity = self._matcher.compute(*padded)[:, self._padding :].astype(np.float32)
         disparity /= np.float32(_SUBPIXELS)
-        disparity = self._smoothed(disparity)
+        disparity = self._smooth(disparity)
         columns = np.arange(disparity.shape[1], dtype=np.float32)
         known = (disparity > _MIN_DISPARITY_PX) & (columns >= disparity) & pair.valid
         focal_baseline = np.float32(pair.pinhole.focal_px * pair.baseline_m)
         depth = focal_baseline / np.maximum(disparity, np.float32(_MIN_DISPARITY_PX))
         return np.where(known, depth, np.float32(0.0))
 
-    def _smoothed(self, disparity: F32) -> F32:
+    def _smooth(self, disparity: F32) -> F32:
         """Filter the disparities (H, W) on surfaces; those that are not known stay below zero."""
         import cv2
 

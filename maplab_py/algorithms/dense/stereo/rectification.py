@@ -72,8 +72,8 @@ def stereo_pairs(
             if reason:
                 reasons.append(f"cameras {a} and {b}: {reason}")
             else:
-                left, right = _ordered(rig, a, b)
-                pairs.append(_rectified(rig, left, right, scale))
+                left, right = _order(rig, a, b)
+                pairs.append(_rectify(rig, left, right, scale))
     return pairs, reasons
 
 
@@ -95,14 +95,14 @@ def _unsuitable(rig: CameraRig, a: int, b: int, min_baseline_m: float, max_angle
     return ""
 
 
-def _ordered(rig: CameraRig, a: int, b: int) -> tuple[int, int]:
+def _order(rig: CameraRig, a: int, b: int) -> tuple[int, int]:
     """Return the left and the right camera; of two above each other the upper is the left one."""
     p_a_b = se3.relative(rig.T_B_C[a], rig.T_B_C[b])[4:]
     main = int(np.argmax(np.abs(p_a_b[:2])))
     return (a, b) if p_a_b[main] > 0.0 else (b, a)
 
 
-def _rectified(rig: CameraRig, left: int, right: int, scale: float) -> StereoPair:
+def _rectify(rig: CameraRig, left: int, right: int, scale: float) -> StereoPair:
     T_left, T_right = (se3.to_matrix(rig.T_B_C[camera]) for camera in (left, right))
     baseline = T_right[:3, 3] - T_left[:3, 3]
     baseline_m = float(np.linalg.norm(baseline))
