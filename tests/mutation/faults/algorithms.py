@@ -25,8 +25,8 @@ ALGORITHMS = (
     Fault(
         "cycles_not_checked",
         "maplab_py/algorithms/anchoring/anchoring.py",
-        "    pairs = consistent(pairs, options, names)\n",
-        "",
+        "known, consistent(pairs, options, names), options)",
+        "known, pairs, options)",
         _ANCHORING,
     ),
     Fault(

@@ -94,8 +94,8 @@ CONSOLE = (
     Fault(
         "dry_run_changes_the_maps",
         "maplab_py/console/session/session.py",
-        "base if call.is_trial else draft.maps.state",
-        "draft.maps.state",
+        "            return report, base\n",
+        "            return report, draft.maps.state\n",
         _MAPS,
     ),
     Fault(

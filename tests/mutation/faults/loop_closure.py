@@ -18,8 +18,8 @@ LOOP_CLOSURE = (
     Fault(
         "no_tilt_gate",
         "maplab_py/algorithms/loop_closure/gates.py",
-        "    judgement.refuse(tilted, Verdict.TILTED)\n",
-        "",
+        "c.tilt_deg, o.max_gravity_deviation_deg, ",
+        "c.tilt_deg, np.inf, ",
         _GATES,
     ),
     Fault(
@@ -39,15 +39,15 @@ LOOP_CLOSURE = (
     Fault(
         "drift_limits_closures_between_missions",
         "maplab_py/algorithms/loop_closure/gates.py",
-        "    is_far_same_mission = same & (judgement.correction_m > drift)\n",
-        "    is_far_same_mission = judgement.correction_m > drift\n",
+        '"--lc_max_drift_ratio", "m", applies=c.same,',
+        '"--lc_max_drift_ratio", "m",',
         _ANCHORING,
     ),
     Fault(
         "look_alikes_not_resolved_by_odometry",
         "maplab_py/algorithms/loop_closure/gates.py",
-        "    judgement.refuse(ambiguous & ~resolved, Verdict.AMBIGUOUS)\n",
-        "    judgement.refuse(ambiguous, Verdict.AMBIGUOUS)\n",
+        "ambiguous & c.related & ~c.is_usual",
+        "ambiguous & c.related",
         _ALIKE,
     ),
     Fault(
@@ -67,15 +67,15 @@ LOOP_CLOSURE = (
     Fault(
         "matches_of_one_query_vote_twice",
         "maplab_py/algorithms/loop_closure/merging.py",
-        "    voters = np.unique(pair.astype(np.int64) * span + query)\n",
-        "    voters = np.sort(pair.astype(np.int64) * span + query)\n",
+        "    voters = distinct(pair * span + votes.query[open_])\n",
+        "    voters = np.sort(pair * span + votes.query[open_])\n",
         _EDGES,
     ),
     Fault(
         "drift_of_one_mission_only",
         "maplab_py/algorithms/loop_closure/mission_alignment.py",
-        "    between = np.abs(c.way_A_m - c.way_A_m[h]) + np.abs(c.way_B_m - c.way_B_m[h])\n",
-        "    between = np.abs(c.way_A_m - c.way_A_m[h])\n",
+        " + np.abs(c.way_B_m[rows] - c.way_B_m[h])\n",
+        "\n",
         _PAIRS,
     ),
     Fault(
