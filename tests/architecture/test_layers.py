@@ -108,8 +108,7 @@ MAY_WRITE = (
     "maplab_py/console/terminal/output.py",  # a transcript is appended to
     "maplab_py/interop/colmap/child.py",  # databases and models in a temporary folder
     "maplab_py/interop/colmap/child_process.py",  # likewise
-    "maplab_py/pipeline/child.py",  # the output of a running task
-    "maplab_py/pipeline/execution.py",  # its log is appended to
+    "maplab_py/pipeline/execution.py",  # output and log of a running task
     "maplab_py/server/status.py",  # likewise
     "maplab_py/server/worker.py",  # likewise
 )
