@@ -28,6 +28,10 @@ def pose_nodes(vertices: NDArray[np.integer]) -> I64:
     return np.stack([base + POSITION, base + ORIENTATION], axis=1)
 
 
+_FAR = 10.0
+"""Landmarks beyond so many times the extent of the vertices count as being there."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class States:
     """States of V vertices and L landmarks, everything in G, and parameters of other kinds.
@@ -82,6 +86,31 @@ class States:
         )
 
     def size(self) -> float:
-        """Return the norm of all values, for the relative size of a step."""
-        parts = (self.T_G_I, self.v_G, self.gyro_bias, self.accel_bias, self.p_G)
+        """Return the norm of all values, for the relative size of a step.
+
+        Positions are relative to the centre of the vertices.
+        """
+        centre, p_G = self._centre, self.p_G
+        pose = self.T_G_I - np.concatenate([np.zeros(4), centre])
+        landmarks = self._landmark_weight * (p_G - centre)
+        parts = (pose, self.v_G, self.gyro_bias, self.accel_bias, landmarks)
         return float(np.sqrt(sum(np.sum(part * part) for part in parts) + self.blocks.size2()))
+
+    def step_size(self, step: F64, moved: States) -> float:
+        """Return the norm of a step (nodes, 3) together with that of the landmarks, as `size` counts them."""
+        landmarks = self._landmark_weight * (moved.p_G - self.p_G)
+        return float(np.sqrt(np.sum(step**2) + np.sum(landmarks**2)))
+
+    @property
+    def _centre(self) -> F64:
+        return np.asarray(self.T_G_I[:, 4:].mean(axis=0)) if len(self.T_G_I) else np.zeros(3)
+
+    @property
+    def _landmark_weight(self) -> F64:
+        """Weights (L, 1): landmarks far beyond the vertices count in units of their distance.
+
+        Some are nearly at infinity, and their values would otherwise hide those of all other states.
+        """
+        reach = max(float(np.abs(self.T_G_I[:, 4:] - self._centre).max(initial=0.0)), 1.0)
+        distance = np.linalg.norm(self.p_G - self._centre, axis=1, keepdims=True)
+        return np.asarray(np.minimum(_FAR * reach / np.maximum(distance, reach), 1.0))

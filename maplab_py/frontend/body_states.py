@@ -39,5 +39,10 @@ class BodyStates:
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
+    def row(self, index: int) -> BodyStates:
+        """Return the state of one time."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return type(self)(**{name: getattr(self, name)[index : index + 1] for name in names})
+
     def __len__(self) -> int:
         return len(self.times_ns)

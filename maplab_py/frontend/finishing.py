@@ -61,7 +61,8 @@ def finish(
     """
     output = mapping.options.output
     problems = [mapping.problem] if mapping.problem else []
-    notes = [*mapping.statistics.notes, *_stream_notes(mapping), *_localization_notes(mapping)]
+    notes = [*mapping.statistics.notes, *_calibration_notes(mapping), *_stream_notes(mapping)]
+    notes += _localization_notes(mapping)
     vi_map: VIMap | None = None
     disk_copy: DiskCopy | None = None
     saved_folder: Path | None = None
@@ -185,6 +186,35 @@ def _stream_notes(mapping: Mapping) -> list[str]:
             "range of the sensor"
         )
     return notes
+
+
+def _calibration_notes(mapping: Mapping) -> list[str]:
+    """Return what of the calibration was doubted, and since when the scale is known."""
+    odometry = mapping.odometry
+    notes, delays = list(odometry.notes), odometry.delays
+    if delays is not None and delays.applied_s:
+        notes.append(
+            f"the images were taken {1e3 * delays.delay_s:+.1f} +- {1e3 * delays.sigma_s:.1f} ms after "
+            "their stamps, and are used so: put "
+            f"--imu_to_camera_time_offset_ns={_offset_ns(mapping, delays.delay_s)}"
+            " to have it from the beginning (--vio_estimate=none keeps the stamps)"
+        )
+    if odometry.scale_sigma > 0.0:
+        first_ns = mapping.statistics.first_ns
+        since_ns = odometry.trusted_ns
+        notes.append(
+            f"the scale is not known to better than {100 * odometry.scale_sigma:.0f} %: change speed and "
+            "direction more"
+            if since_ns is None
+            else f"started before the scale was known: it can be trusted from "
+            f"{(since_ns - first_ns) * 1e-9:.1f} s on"
+        )
+    return notes
+
+
+def _offset_ns(mapping: Mapping, delay_s: float) -> int:
+    """Return the time offset of the cameras with a delay."""
+    return mapping.odometry.device.cameras[0].time_offset_ns + round(delay_s * 1e9)
 
 
 def _localization_notes(mapping: Mapping) -> list[str]:

@@ -26,8 +26,12 @@ class ImuInterval:
         return float(self.times_ns[-1] - self.times_ns[0]) * 1e-9
 
 
+_KEPT_NS = 300_000_000
+"""Used samples are kept for so long: frames that turn out to be earlier than their stamps need them."""
+
+
 class ImuBuffer:
-    """Samples that no interval has used yet."""
+    """Samples that no interval has used yet, and the latest that one has."""
 
     def __init__(self) -> None:
         """Start without samples."""
@@ -70,14 +74,17 @@ class ImuBuffer:
         self._accel_gyro = np.concatenate([self._accel_gyro, batch.accel_gyro])
         self._is_saturated = np.concatenate([self._is_saturated, batch.is_saturated])
 
+    @property
+    def samples(self) -> tuple[I64, F64]:
+        """Return times (S,) and samples (S, 6)."""
+        return self._times_ns, self._accel_gyro
+
     def covers(self, time_ns: int) -> bool:
         """Tell whether there is a sample at this time or later."""
         return self.last_ns is not None and time_ns <= self.last_ns
 
     def cut(self, from_ns: int, to_ns: int) -> ImuInterval:
-        """Return the samples from one time to a later one, and forget those before the end.
-
-        The samples that enclose the end stay, for the next interval.
+        """Return the samples from one time to a later one, and forget those long before the end.
 
         Raises:
             ValueError: The samples do not reach from the one time to the other.
@@ -101,8 +108,9 @@ class ImuBuffer:
         return interval
 
     def forget_before(self, time_ns: int) -> None:
-        """Forget samples that are not needed to interpolate at this time or later."""
-        kept = max(0, int(np.searchsorted(self._times_ns, time_ns, side="right")) - 1)
+        """Forget samples that are not needed to interpolate shortly before this time or later."""
+        kept = int(np.searchsorted(self._times_ns, time_ns - _KEPT_NS, side="right")) - 1
+        kept = max(0, kept)
         self._times_ns = self._times_ns[kept:]
         self._accel_gyro = self._accel_gyro[kept:]
         self._is_saturated = self._is_saturated[kept:]

@@ -10,6 +10,7 @@ from maplab_py.algorithms.landmarks.reports import TrackReport
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError
+from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
@@ -53,6 +54,7 @@ class MapBuilder:
         if self._options.save_image_as_resources:
             self._images = NewResources(staging_parent, seed=seed)
         self._missions: list[RecordedMission] = []
+        self._waiting: dict[int, tuple[tuple[TrackedFrame | None, ...], list[int]]] = {}
 
     @property
     def missions(self) -> int:
@@ -64,8 +66,13 @@ class MapBuilder:
         """Number of vertices of all missions."""
         return sum(len(mission) for mission in self._missions)
 
-    def start_mission(self) -> None:
-        """Begin a mission: the next vertex is its root."""
+    def start_mission(self, device: RecordedSensors | None = None) -> None:
+        """Begin a mission: the next vertex is its root.
+
+        Args:
+            device: The sensors with other figures of noise; None = as before.
+        """
+        self._device = device or self._device
         self._missions.append(RecordedMission())
 
     def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
@@ -77,9 +84,45 @@ class MapBuilder:
 
     def is_due(self, time_ns: int) -> bool:
         """Tell whether a frame of this time becomes a vertex."""
-        interval_ns = _EARLY * 1e9 / self._options.nframe_sync_max_output_frequency_hz
         last_ns = self._missions[-1].last_ns
-        return last_ns is None or time_ns - last_ns >= interval_ns
+        return last_ns is None or time_ns - last_ns >= self._interval_ns
+
+    @property
+    def _interval_ns(self) -> float:
+        return _EARLY * 1e9 / self._options.nframe_sync_max_output_frequency_hz
+
+    def is_due_before_start(self, stamp_ns: int) -> bool:
+        """Tell whether a frame without a state may become a vertex when its state is found."""
+        last_ns = next(reversed(self._waiting), None)
+        return last_ns is None or stamp_ns - last_ns >= self._interval_ns
+
+    def add_before_start(
+        self,
+        stamp_ns: int,
+        frames: Sequence[TrackedFrame | None],
+        images: Sequence[U8 | None] = (),
+    ) -> None:
+        """Keep a frame for which there is no state yet; see `add_vertex`."""
+        self._waiting[stamp_ns] = tuple(frames), self._image_rows(frames, images)
+
+    def forget_before_start(self) -> None:
+        """Forget the frames for which there is no state."""
+        self._waiting.clear()
+
+    def fill(self, found: Backfill) -> None:
+        """Make vertices of the frames before the first vertex of the mission, and refine the others."""
+        mission, earlier = self._missions[-1], RecordedMission()
+        first_ns = int(mission.states[0].times_ns[0]) if len(mission) else 0
+        for row, frame in enumerate(found.frames):
+            if frame.time_ns <= first_ns and row:
+                earlier.add_imu(frame.imu_times_ns, frame.accel_gyro)
+            kept = self._waiting.get(int(found.stamps_ns[row]))
+            if frame.time_ns < first_ns and kept is not None:
+                earlier.add_vertex(found.states.row(row), *kept)
+        if len(earlier) and earlier.has_samples_until(first_ns):
+            mission.prepend(earlier, earlier.samples())
+        mission.refine(found.states)
+        self._waiting.clear()
 
     def add_vertex(
         self,
@@ -97,13 +140,18 @@ class MapBuilder:
         Raises:
             UserError: An image cannot be written.
         """
-        rows = [-1] * len(frames)
-        if self._images is not None:
-            rows = [
-                -1 if image is None or frame is None else self._images.add_image(image)
-                for frame, image in zip(frames, images or [None] * len(frames), strict=True)
-            ]
-        self._missions[-1].add_vertex(state, tuple(frames), rows)
+        self._missions[-1].add_vertex(state, tuple(frames), self._image_rows(frames, images))
+
+    def _image_rows(
+        self, frames: Sequence[TrackedFrame | None], images: Sequence[U8 | None]
+    ) -> list[int]:
+        """Keep images as resources; return their rows, -1 where there is none."""
+        if self._images is None:
+            return [-1] * len(frames)
+        return [
+            -1 if image is None or frame is None else self._images.add_image(image)
+            for frame, image in zip(frames, images or [None] * len(frames), strict=True)
+        ]
 
     def refine(self, states: BodyStates) -> None:
         """Replace the states of vertices of the present mission that have one of these times."""

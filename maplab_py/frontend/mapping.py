@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from maplab_py.array_types import F64, U8
+from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, MaplabError
 from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
 from maplab_py.frontend.localization.opening import opened_localization
@@ -22,7 +22,13 @@ from maplab_py.frontend.run_options import RunOptions
 from maplab_py.frontend.run_statistics import RunStatistics
 from maplab_py.frontend.starting import MakeStarter
 from maplab_py.frontend.vertex_keypoints import described_frames
-from maplab_py.interop.recordings.protocol import Event, FrameSet, ImuBatch, Recording
+from maplab_py.interop.recordings.protocol import (
+    Event,
+    FrameSet,
+    ImuBatch,
+    Recording,
+    TrackedFrame,
+)
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
@@ -142,6 +148,9 @@ class Mapping:
                 raise Cancelled("cancelled")
             raise EstimationError(self._nothing())
         if self.builder is not None:
+            found = self.odometry.finish_backfill()
+            if found is not None:
+                self.builder.fill(found)
             self.builder.refine(self.odometry.window_states())
 
     def trajectory(self) -> Trajectory:
@@ -204,21 +213,28 @@ class Mapping:
         if update.healthy_until_ns:
             builder.drop_after(update.healthy_until_ns)
         if update.state is None:
+            self._keep_before_start(update, builder)
             return
         if update.mission != self._mission:
-            builder.start_mission()
+            builder.start_mission(self.odometry.device)
             self._mission = update.mission
         elif update.interval is not None:
             builder.add_imu(update.interval.times_ns, update.interval.accel_gyro)
         if update.released is not None:
             builder.refine(update.released)
         if builder.is_due(update.time_ns):
-            images: tuple[U8, ...] = update.images
-            if update.tracks is not None:
-                builder.add_vertex(update.state, update.tracks.frames)
-            else:
-                frames = described_frames(update.tracked.cameras, images, update.time_ns)
-                builder.add_vertex(update.state, frames, images)
+            builder.add_vertex(update.state, _frames(update), update.images)
+        if update.backfill is not None:
+            builder.fill(update.backfill)
+
+    def _keep_before_start(self, update: OdometryUpdate, builder: MapBuilder) -> None:
+        """Keep a frame whose state may be found later."""
+        if not self.options.odometry.backfill:
+            return
+        if update.interval is None:
+            builder.forget_before_start()
+        if builder.is_due_before_start(update.stamp_ns):
+            builder.add_before_start(update.stamp_ns, _frames(update), update.images)
 
     def _tell_health(self, update: OdometryUpdate, progress: Progress) -> None:
         """Print how sure the estimate is."""
@@ -261,3 +277,10 @@ class Mapping:
             return f"{name}: there are no frames: choose another part or other cameras"
         reason = self.statistics.waiting_for or "the recording is too short"
         return f"{name}: the odometry has not started: {reason}"
+
+
+def _frames(update: OdometryUpdate) -> Sequence[TrackedFrame | None]:
+    """Return the keypoints of a frame with descriptors."""
+    if update.tracks is not None:
+        return update.tracks.frames
+    return described_frames(update.tracked.cameras, update.images, update.time_ns)

@@ -10,15 +10,19 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError, MapError, UserError
-from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.linear.threads import single_thread
+from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.estimation.window.update import WindowUpdate
+from maplab_py.frontend.backfill import Backfill, BackwardReading, WaitingFrames
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.gyroscope import turn
 from maplab_py.frontend.health import HealthMonitor
+from maplab_py.frontend.image_delay import DelayMonitor
 from maplab_py.frontend.imu_buffer import ImuBuffer, ImuInterval
+from maplab_py.frontend.initialization.imu_noise import plausible_noise
 from maplab_py.frontend.initialization.initializer import Initializer
 from maplab_py.frontend.motion import MotionDetector
 from maplab_py.frontend.odometry_options import OdometryOptions
@@ -37,6 +41,16 @@ from maplab_py.vision.tracking.tracks import TrackedImages
 
 _MAX_WAITING = 200
 """Frames that may wait for IMU samples."""
+_BACKWARD_FRAMES = 2
+"""Frames that are read backwards with each new frame."""
+_DELAY_STEP_NS = 2_000_000
+"""Largest change of the delay of images from one frame to the next while the window has states."""
+_TRUSTED_SCALE_SIGMA = 0.05
+_POSITION_SIGMA_M = 1e-4
+_NOISE_TIME_NS = 900_000_000
+"""Time after which the samples are compared with the calibrated noise."""
+_SCALE_CHECK_S, _LONGEST_DOUBT_S = 0.5, 30.0
+"""Time between two looks at the scale, and after which frames are read backwards in any case."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -102,6 +116,17 @@ class Odometry:
         self._replayed: TrackedImages | None = None  # tracks of the last frame of a replay
         self._detector = MotionDetector(self.options.rest)
         self._smoother: FixedLagSmoother | None = None
+        self._delays: DelayMonitor | None = None
+        if make_starter is None and self.options.estimates_time_offset:
+            self._delays = DelayMonitor(device)
+        self.notes: list[str] = []  # what is wrong with the calibration
+        self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
+        self._delay_ns = 0  # that frames have in addition to the calibrated offset
+        self._before = WaitingFrames()
+        self._backward: BackwardReading | None = None
+        self._scale_check_ns: int | None = None  # time of the next; None = the scale is trusted
+        self.trusted_ns: int | None = None  # since when the scale of this mission is known
+        self.scale_sigma = 0.0  # as a share of the scale, when it was looked at last
         self._starter: Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
         self._start_again()
@@ -143,6 +168,26 @@ class Odometry:
         """The estimator of the window; None while the odometry initialises."""
         return self._smoother
 
+    @property
+    def device(self) -> RecordedSensors:
+        """The sensors, with figures of noise that are used."""
+        return self._device
+
+    @property
+    def delays(self) -> DelayMonitor | None:
+        """Delay of the images that shows in the recording; None where it is not looked for."""
+        return self._delays
+
+    def finish_backfill(self) -> Backfill | None:
+        """Read the frames before the start to their end; None when there are none left."""
+        if self._scale_check_ns is not None and self._smoother is not None:
+            self._read_backwards_from(self._smoother)
+        if self._backward is None:
+            return None
+        self._backward.advance(len(self._before.frames))
+        result, self._backward = self._backward.result(), None
+        return result
+
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places (L, 3) in M of the landmarks in the window."""
         if self._smoother is None:
@@ -183,29 +228,57 @@ class Odometry:
 
     def _process_waiting(self) -> list[OdometryUpdate]:
         updates = []
-        while self._waiting and self._buffer.covers(self._waiting[0].time_ns):
+        while self._waiting and self._buffer.covers(
+            self._waiting[0].time_ns + self._longest_delay_ns
+        ):
             frame_set = self._waiting.popleft()
             first_ns = self._buffer.first_ns
-            if first_ns is not None and frame_set.time_ns < first_ns:
+            if first_ns is not None and frame_set.time_ns + self._delay_ns < first_ns:
                 self.counts.frames_before_imu += 1
                 continue
             updates.append(self._process(frame_set))
         return updates
 
+    @property
+    def _wanted_delay_ns(self) -> int:
+        return 0 if self._delays is None else round(self._delays.applied_s * 1e9)
+
+    @property
+    def _longest_delay_ns(self) -> int:
+        return max(self._delay_ns, self._wanted_delay_ns)
+
+    def _apply_delay(self) -> None:
+        """Change the delay of frames: at once before the start, in small steps after it."""
+        change_ns = self._wanted_delay_ns - self._delay_ns
+        if not change_ns:
+            return
+        if self._smoother is not None:
+            self._delay_ns += int(np.clip(change_ns, -_DELAY_STEP_NS, _DELAY_STEP_NS))
+            return
+        self._delay_ns += change_ns
+        self._detector.reset()
+        self._before.delay(change_ns, self._buffer.samples)
+        if isinstance(self._starter, Initializer):
+            self._starter.replace_frames(self._before.frames)
+        if self._last_ns is not None:
+            self._last_ns += change_ns
+
     def _process(self, frame_set: FrameSet | TrackedFrameSet) -> OdometryUpdate:
         note = ""
         interval = None
+        self._apply_delay()
+        time_ns = frame_set.time_ns + self._delay_ns
         if self._last_ns is None:
-            self._buffer.forget_before(frame_set.time_ns)
+            self._buffer.forget_before(time_ns)
         else:
-            interval = self._buffer.cut(self._last_ns, frame_set.time_ns)
+            interval = self._buffer.cut(self._last_ns, time_ns)
             if interval.largest_step_ns > self.options.max_imu_gap_s * 1e9:
                 note = self._in_gap(interval)
                 interval = None
             else:
                 self._gap_end_ns = -1
         self.counts.frames += 1
-        self._last_ns = frame_set.time_ns
+        self._last_ns = time_ns
         tracked, images = self._tracked(frame_set, interval)
         motion = Motion.MOVING
         if interval is not None:
@@ -216,7 +289,8 @@ class Odometry:
                 speed_mps=self._speed_mps,
             )
         update = OdometryUpdate(
-            time_ns=frame_set.time_ns,
+            time_ns=time_ns,
+            stamp_ns=frame_set.time_ns,
             status=OdometryStatus.INITIALISING,
             mission=self.counts.starts - 1,
             tracked=tracked,
@@ -229,9 +303,38 @@ class Odometry:
         )
         if self._gap_end_ns >= 0:
             return update
-        if self._smoother is None:
-            return self._initialised(update)
-        return self._smoothed(update, self._smoother)
+        frame = _window_frame(update)
+        has_new_delay = self._measure_delay(update, frame)
+        if self._smoother is not None:
+            return self._smoothed(update, frame, self._smoother)
+        self._before.push(update.stamp_ns, frame, self._buffer.samples)
+        self._check_noise()
+        if has_new_delay:
+            return dataclasses.replace(update, note="the images have other times than their stamps")
+        return self._initialised(update, frame)
+
+    def _check_noise(self) -> None:
+        """Once there are enough samples, doubt figures of noise that they contradict."""
+        frames = self._before.frames
+        if not self._noise_is_open or frames[-1].time_ns - frames[0].time_ns < _NOISE_TIME_NS:
+            return
+        self._noise_is_open = False
+        self._imu, notes = plausible_noise(self._imu, *self._before.samples())
+        if notes:
+            self.notes += notes
+            self._device = self._device.with_imu(self._imu)
+            self._starter = self._make_starter(self._device)
+            if isinstance(self._starter, Initializer):
+                self._starter.replace_frames(frames[:-1])
+
+    def _measure_delay(self, update: OdometryUpdate, frame: WindowFrame) -> bool:
+        """Look for a delay of the images; return whether another is to be applied."""
+        if self._delays is None or update.tracks is not None:
+            return False
+        begin = time.perf_counter()
+        has_new_delay = self._delays.push(frame)
+        update.stage_ms["delay"] = 1e3 * (time.perf_counter() - begin)
+        return has_new_delay
 
     def _in_gap(self, interval: ImuInterval) -> str:
         """Start again at a frame inside or after a gap of the IMU; return a note at the first of them."""
@@ -269,10 +372,10 @@ class Odometry:
         R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
         return float(np.linalg.norm(so3.log(so3.from_matrix(R_I0_I1))))
 
-    def _initialised(self, update: OdometryUpdate) -> OdometryUpdate:
+    def _initialised(self, update: OdometryUpdate, frame: WindowFrame) -> OdometryUpdate:
         """Offer the frame to the initialisation; start the smoother when it succeeds."""
         begin = time.perf_counter()
-        start = self._starter.push(_window_frame(update))
+        start = self._starter.push(frame)
         update.stage_ms["initialise"] = 1e3 * (time.perf_counter() - begin)
         if start is None:
             return dataclasses.replace(update, note=update.note or self._starter.reason)
@@ -301,24 +404,85 @@ class Odometry:
         newest = BodyStates.single(
             first.time_ns, state.T_M_I, state.v_M, state.gyro_bias, state.accel_bias
         )
+        later = []
         for frame in start.later:
             # without biases and speed, turning and resting could not be told apart
             newest = _state(smoother.add(dataclasses.replace(frame, motion=Motion.MOVING)))
+            later.append(newest)
         self._smoother = smoother
         self._health = HealthMonitor(self.options.health)
+        self._scale_check_ns = None
+        self.trusted_ns = newest.times_ns[0]
+        if start.scale_sigma > _TRUSTED_SCALE_SIGMA:
+            self._scale_check_ns, self.trusted_ns = int(newest.times_ns[0]), None
+        elif self.options.backfill and len(self._before.frames) > 1 + len(later):
+            self._backward = BackwardReading(
+                self._plain_smoother(), self._before, state, later, is_resting=start.is_resting
+            )
         return newest
 
+    def _check_scale(self, update: OdometryUpdate, frame: WindowFrame) -> None:
+        """Look whether the scale is known now, and read all frames so far backwards once it is."""
+        if self._scale_check_ns is None:
+            return
+        if self.options.backfill:
+            self._before.push(update.stamp_ns, frame, self._buffer.samples)
+        smoother = self._smoother
+        if smoother is None or update.time_ns < self._scale_check_ns:
+            return
+        self._scale_check_ns = update.time_ns + round(_SCALE_CHECK_S * 1e9)
+        self.scale_sigma = smoother.scale_sigma()
+        if self.scale_sigma <= _TRUSTED_SCALE_SIGMA:
+            self.trusted_ns = update.time_ns
+            self._read_backwards_from(smoother)
+
+    def _read_backwards_from(self, smoother: FixedLagSmoother) -> None:
+        """Begin to read backwards from the newest state."""
+        self._scale_check_ns = None
+        states = smoother.states
+        if not self.options.backfill or len(self._before.frames) < 2:
+            return
+        sigma = np.sqrt(np.maximum(np.diagonal(smoother.newest_covariance), 0.0))
+        if not np.isfinite(sigma).all():
+            return
+        sigma[:3] = _POSITION_SIGMA_M
+        v_M, gyro_bias, accel_bias = states.motion[-1].reshape(3, 3)
+        state = StartState(states.T_M_I[-1], v_M, gyro_bias, accel_bias, sigma)
+        self._backward = BackwardReading(
+            self._plain_smoother(), self._before, state, [], is_resting=False
+        )
+
+    def _advance_backfill(self, update: OdometryUpdate) -> OdometryUpdate:
+        """Read some frames backwards; return the update with their states at the end."""
+        backward = self._backward
+        if backward is None:
+            return update
+        begin = time.perf_counter()
+        with single_thread():
+            backward.advance(_BACKWARD_FRAMES)
+        update.stage_ms["backfill"] = 1e3 * (time.perf_counter() - begin)
+        if not backward.is_finished:
+            return update
+        self._backward = None
+        return dataclasses.replace(update, backfill=backward.result())
+
+    def _plain_smoother(self) -> FixedLagSmoother:
+        device = self._device
+        return FixedLagSmoother(device.cameras, device.T_I_C, self._imu, self.options.window)
+
     def _new_smoother(self) -> FixedLagSmoother:
-        device, window = self._device, self.options.window
         if self._map_rule is None:
-            return FixedLagSmoother(device.cameras, device.T_I_C, self._imu, window)
+            return self._plain_smoother()
+        device, window = self._device, self.options.window
         return LocalizedSmoother(device.cameras, device.T_I_C, self._imu, window, self._map_rule)
 
-    def _smoothed(self, update: OdometryUpdate, smoother: FixedLagSmoother) -> OdometryUpdate:
+    def _smoothed(
+        self, update: OdometryUpdate, frame: WindowFrame, smoother: FixedLagSmoother
+    ) -> OdometryUpdate:
         """Add the frame to the window; start again if the estimate diverges."""
         begin = time.perf_counter()
         try:
-            result = smoother.add(_window_frame(update))
+            result = smoother.add(frame)
             state = _state(result)
             tracked = sum(int((c.num_frames > 1).sum()) for c in update.tracked.cameras)
             problem = self._health.problem(state, result.covariance, tracked)
@@ -333,8 +497,9 @@ class Odometry:
             )
         self._gyro_bias = result.gyro_bias
         self._speed_mps = float(np.linalg.norm(result.v_M))
+        self._check_scale(update, frame)
         return dataclasses.replace(
-            update,
+            self._advance_backfill(update),
             status=OdometryStatus.TRACKING,
             state=state,
             released=_released(result),
@@ -351,6 +516,10 @@ class Odometry:
         self._tracker.reset()
         self._replayed = None
         self._detector.reset()
+        self._before, self._backward = WaitingFrames(), None
+        self._scale_check_ns = None
+        if self._delays is not None:
+            self._delays.reset()
         return f"started again: {reason}" if reason else ""
 
 

@@ -108,6 +108,29 @@ class OdometryOptions:
         unit="s",
     )
 
+    estimate: str = option(
+        "time_offset",
+        choices=("time_offset", "none"),
+        help="Calibration that is estimated beside the motion: time_offset = of the images on the clock of "
+        "the IMU",
+    )
+    imu_noise: str = option(
+        "auto",
+        choices=("auto", "file"),
+        help="Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that "
+        "it cannot be",
+    )
+    backfill: bool = option(
+        True,
+        help="Read the frames before the start backwards from it, so that the map begins with the first "
+        "image",
+    )
+
+    @property
+    def estimates_time_offset(self) -> bool:
+        """Whether the times of images are corrected."""
+        return self.estimate == "time_offset"
+
     def check(self) -> None:
         """Check the values.
 

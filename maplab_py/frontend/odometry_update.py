@@ -7,6 +7,7 @@ from enum import Enum
 
 from maplab_py.array_types import F64, U8
 from maplab_py.estimation.window.frame import Motion
+from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.interop.recordings.protocol import TrackedFrameSet
@@ -49,6 +50,8 @@ class OdometryUpdate:
     healthy_until_ns: int = 0  # states after this time are doubtful; 0 = none is
     images: tuple[U8, ...] = ()  # grey, by camera; empty for tracks of a replay
     tracks: TrackedFrameSet | None = None  # of a replay
+    stamp_ns: int = 0  # of the images, without a delay that was estimated
+    backfill: Backfill | None = None  # states of frames that had none at their time
 
     @property
     def total_ms(self) -> float:

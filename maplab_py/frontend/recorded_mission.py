@@ -67,7 +67,7 @@ class RecordedMission:
             ValueError: The samples do not reach from the last vertex to this one.
         """
         if self.states:
-            times_ns, accel_gyro = _joined(self._samples)
+            times_ns, accel_gyro = joined_samples(self._samples)
             ends = (self.last_ns, int(state.times_ns[0]))
             if len(times_ns) < 2 or (int(times_ns[0]), int(times_ns[-1])) != ends:
                 raise ValueError(f"IMU samples do not reach from {ends[0]} to {ends[1]} ns")
@@ -77,6 +77,23 @@ class RecordedMission:
         self.states.append(state)
         self.frames.append(frames)
         self.image_rows.append(image_rows)
+
+    def samples(self) -> tuple[I64, F64]:
+        """Return the samples since the last vertex."""
+        return joined_samples(self._samples)
+
+    def has_samples_until(self, time_ns: int) -> bool:
+        """Tell whether the samples since the last vertex reach to a time."""
+        return bool(self._samples) and int(self._samples[-1][0][-1]) == time_ns
+
+    def prepend(self, earlier: RecordedMission, edge: tuple[I64, F64]) -> None:
+        """Put the vertices of another mission before the first, with the samples that lead to it."""
+        self.states = [*earlier.states, *self.states]
+        self.frames = [*earlier.frames, *self.frames]
+        self.image_rows = [*earlier.image_rows, *self.image_rows]
+        self.edges = [*earlier.edges, edge, *self.edges]
+        times_ns = (int(state.times_ns[0]) for state in self.states)
+        self._row_of_time = {time_ns: row for row, time_ns in enumerate(times_ns)}
 
     def drop_after(self, time_ns: int) -> None:
         """Remove vertices after a time, with the samples that lead to them."""
@@ -115,7 +132,7 @@ class RecordedMission:
                 )
 
 
-def _joined(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
+def joined_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
     """Join pieces whose first sample repeats the last of the piece before."""
     first = [slice(None), *([slice(1, None)] * (len(parts) - 1))]
     if not parts:

@@ -20,6 +20,8 @@ _GROUPS = {
     "detect": "tracking",
     "tracks": "tracking",
     "initialise": "initialise",
+    "delay": "initialise",
+    "backfill": "initialise",
     "window": "window",
     "localise": "localise",
     "map": "map",

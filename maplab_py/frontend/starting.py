@@ -17,6 +17,8 @@ class Start:
     frame: WindowFrame
     state: StartState
     later: tuple[WindowFrame, ...] = ()  # in the order of time
+    is_resting: bool = False  # the device rests since a while
+    scale_sigma: float = 0.0  # standard deviation of the scale of the motion, as a share of it
 
 
 class Starter(Protocol):

@@ -36,6 +36,9 @@ def test_intervals_join_without_gap() -> None:
         assert part.duration_s == pytest.approx((b - a) * 1e-9)
     np.testing.assert_array_equal(parts[0].accel_gyro[-1], parts[1].accel_gyro[0])
     assert len(parts[1].times_ns) == 11  # 50, 55, ..., 100 ms: nothing is interpolated
+    assert buffer.first_ns == 0  # frames may turn out to be earlier than their stamps
+    buffer.push(batch(np.arange(41, 101) * STEP_NS))
+    buffer.cut(frames[-1], 453_000_000)
     assert buffer.first_ns == 150_000_000
 
 

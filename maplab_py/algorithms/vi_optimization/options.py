@@ -198,7 +198,9 @@ class RobustnessOptions:
 class SolverFlags:
     """Linear solver, trust region and convergence criteria."""
 
-    num_iterations: int = option(30, help="Largest number of iterations.")
+    num_iterations: int = option(
+        100, help="Largest number of iterations; it stops earlier once it has converged."
+    )
     max_time_seconds: float = option(1e6, help="Stop after this time.", unit="s")
     linear_solver_type: str = option(
         "auto",

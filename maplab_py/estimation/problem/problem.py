@@ -218,8 +218,7 @@ class Problem:
         for term in self.factors:
             costs[term.name] = costs.get(term.name, 0.0) + factor_terms.cost(term, moved)
         promised += linear.promised_by_factors(step)
-        norm = float(np.sqrt(np.sum(step**2) + np.sum((moved.p_G - states.p_G) ** 2)))
-        return Step(moved, costs, promised, norm)
+        return Step(moved, costs, promised, states.step_size(step, moved))
 
     def is_stationary(self, linear: Linearization, tolerance: float) -> bool:
         """Tell whether no entry of the gradient is above a tolerance; landmarks must not move."""
@@ -228,7 +227,7 @@ class Problem:
         return bool(np.abs(self.projected_gradient(linear)).max(initial=0.0) <= tolerance)
 
     def norm(self, states: States) -> float:
-        """Return the norm of all values."""
+        """Return the norm of all values, as that of a step counts them."""
         return states.size()
 
     def factorise(self, linear: Linearization, damping: float) -> None:

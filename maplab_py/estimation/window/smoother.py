@@ -34,7 +34,7 @@ from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.standstill import Standstill
-from maplab_py.estimation.window.states import WindowStates
+from maplab_py.estimation.window.states import WindowStates, scale_sigma
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
 from maplab_py.estimation.window.update import ReleasedStates, WindowUpdate
@@ -43,6 +43,12 @@ from maplab_py.sensors import Camera, Imu
 
 _MIN_KNOWN_DEPTHS = 10
 """Landmarks of which the median depth is taken."""
+_PARALLAX_TIME_NS = 350_000_000
+_MIN_PARALLAX_TRACKS = 10
+_LEAST_PARALLAX_DEG = 0.25
+"""Median parallax over that time that only motion explains; EuRoC's cameras: 2 px."""
+_NEAR_M = 2.0
+"""Distance of points whose parallax by the cameras' way around the IMU is a turn's, too."""
 _ENOUGH_LANDMARKS = 150
 """Landmarks of the window beside which none is expected: noise of tracks at rest looks like a turn."""
 
@@ -71,7 +77,7 @@ class FixedLagSmoother:
         self._triangulator = Triangulator(self._kernels, self._cameras, options)
         self.tracks = Tracks()
         self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
-        self._velocity_covariance: F64 = np.full((3, 3), np.inf)  # of the newest frame
+        self.newest_covariance: F64 = np.full((15, 15), np.inf)  # order [p, theta, v, b_g, b_a]
         self._time_ns: I64 = np.zeros(0, dtype=np.int64)
         self._is_keyframe: Mask = np.zeros(0, dtype=np.bool_)
         self._is_resting: Mask = np.zeros(0, dtype=np.bool_)  # or surely turns on the spot
@@ -107,7 +113,7 @@ class FixedLagSmoother:
         self._stage_ms, self._released = {}, []
         with single_thread():
             with self._stage("predict"):
-                self._predict(frame)
+                frame = self._predict(frame)
             with self._stage("landmarks"):
                 self._see(frame)
                 self._gate_new()
@@ -122,7 +128,7 @@ class FixedLagSmoother:
                 self._take_map_states()
             with self._stage("covariance"):
                 covariance = self._covariance(problem)
-                self._velocity_covariance = covariance[6:9, 6:9]
+                self.newest_covariance = covariance
             with self._stage("outliers"):
                 error_px = self._remove_outliers(problem, order)
             with self._stage("slide"):
@@ -161,6 +167,15 @@ class FixedLagSmoother:
         """Which frames (F,) are, or will become, keyframes."""
         return self._is_keyframe
 
+    def scale_sigma(self) -> float:
+        """Return the standard deviation of the scale of the window, as a share; infinite = unknown."""
+        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
+        try:
+            linear = problem.undamped_near(self._states)
+            return scale_sigma(self._states.T_M_I[:, 4:], problem.covariance_of_frames(linear))
+        except NotPositiveDefinite:
+            return float("inf")
+
     def problem(self) -> tuple[WindowProblem, WindowStates]:
         """Return the least-squares problem of the window as it is now, and its states."""
         problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
@@ -168,8 +183,11 @@ class FixedLagSmoother:
 
     # -- a new frame ------------------------------------------------------------------------------
 
-    def _predict(self, frame: WindowFrame) -> None:
-        """Append the frame where the IMU says it is; at rest it replaces the latest one."""
+    def _predict(self, frame: WindowFrame) -> WindowFrame:
+        """Append the frame where the IMU says it is; at rest it replaces the latest one.
+
+        Return it, moving if it seemed to turn only and shows parallax over a longer time.
+        """
         is_resting = frame.motion is Motion.RESTING
         times_ns, accel_gyro = frame.imu_times_ns, frame.accel_gyro
         if is_resting and self._may_replace(frame):
@@ -184,7 +202,37 @@ class FixedLagSmoother:
         T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)
         self._states = self._states.with_frame(T_M_I, new_motion)
         self._prior = self._prior.with_frame(T_M_I, new_motion)
+        if frame.motion is Motion.TURNING and self._shows_parallax(frame):
+            frame = dataclasses.replace(frame, motion=Motion.MOVING)
         self._append_frame(frame, is_keyframe=False)
+        return frame
+
+    def _shows_parallax(self, frame: WindowFrame) -> bool:
+        """Tell whether a new frame, already predicted, shows parallax to one of half a second before.
+
+        From one image to the next, slow motion cannot be told from turning only.
+        """
+        old = np.flatnonzero(self._time_ns <= frame.time_ns - _PARALLAX_TIME_NS)
+        if not len(old):
+            return False
+        tracks, row = self.tracks, int(old[-1])
+        seen = tracks.observations.take(tracks.observations.frame == row)
+        rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
+        # one number for a track in a camera, which has one observation in a frame
+        cameras = int(max(frame.camera.max(initial=0), seen.camera.max(initial=0))) + 1
+        before = tracks.id[seen.row] * cameras + seen.camera
+        now = frame.track_id.astype(np.int64) * cameras + frame.camera
+        now[~valid] = -1
+        _, i, j = np.intersect1d(before, now, return_indices=True)
+        if len(i) < _MIN_PARALLAX_TRACKS:
+            return False
+        poses, newest = self._poses(), np.full(len(j), -1)
+        first = poses.rays(seen.frame[i], seen.camera[i], seen.ray_C[i])
+        angle = np.linalg.norm(first - poses.rays(newest, frame.camera[j], rays[j]), axis=1)
+        # a turn moves cameras that are not at the IMU
+        lever = poses.p_M_C[[row, -1]] - self._states.T_M_I[[row, -1], None, 4:]
+        by_turn = float(np.linalg.norm(lever[1] - lever[0], axis=1).max()) / _NEAR_M
+        return bool(np.median(angle) >= np.radians(_LEAST_PARALLAX_DEG) + by_turn)
 
     def _may_replace(self, frame: WindowFrame) -> bool:
         """Tell whether the latest frame rests, too, and the joined interval is not too long."""
@@ -206,7 +254,7 @@ class FixedLagSmoother:
         """Tell whether the newest frame turns, with a velocity that is well known to be zero."""
         options, v_M = self.options, self._states.motion[-1, :3]
         rate = np.mean(frame.accel_gyro[:, 3:], axis=0) - self._states.gyro_bias[-1]
-        covariance = self._velocity_covariance
+        covariance = self.newest_covariance[6:9, 6:9]
         if not np.isfinite(covariance).all():
             return False
         variance = np.linalg.eigvalsh(covariance)

@@ -85,3 +85,21 @@ class WindowStates:
         """Return the norm of all values, for the relative size of a step."""
         parts = (self.T_M_I, self.motion, self.h, self.T_G_M, self.p_G)
         return float(np.sqrt(sum(np.vdot(part, part) for part in parts)))
+
+
+def scale_sigma(p_M: F64, covariance: F64) -> float:
+    """Return the standard deviation of the scale of positions (F, 3), as a share of it.
+
+    It is that of a similarity alignment with the true positions: of s = sum q_i . p_i / sum q_i . q_i with
+    offsets q_i from the mean, to first order (S. Umeyama, PAMI 1991, equation 42). A single distance would
+    count the noise of two positions instead of all.
+
+    Args:
+        p_M: Positions.
+        covariance: Of all states (15 F, 15 F), which begin with the positions.
+    """
+    offset = p_M - p_M.mean(axis=0)
+    weight = np.zeros((len(p_M), FRAME_SIZE))
+    weight[:, :3] = offset / max(float(np.vdot(offset, offset)), 1e-12)
+    by_state = weight.ravel()
+    return float(np.sqrt(max(float(by_state @ covariance @ by_state), 0.0)))

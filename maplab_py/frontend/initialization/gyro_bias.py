@@ -26,6 +26,7 @@ from maplab_py.frontend.initialization.gyro_bias_kernels import (
 )
 from maplab_py.frontend.initialization.rays import SegmentRays
 from maplab_py.geometry import so3
+from maplab_py.vimap.table import starts_of_counts
 
 _STEPS_APART = (1, 2, 4)
 """Pairs of frames are so many frames apart."""
@@ -33,6 +34,11 @@ _MIN_TRACKS = 12
 _ITERATIONS = 10
 _CONVERGED_RADPS = 1e-6
 _PRIOR_RADPS = 0.2
+_PRIOR_DELAY_S = 0.05
+_DELAY_ITERATIONS = 15
+_CONVERGED_S = 2e-5
+_SIGMA_FACTOR = 3.0
+"""Standard deviations are so many times those of independent rays: pairs share frames and tracks."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,6 +104,15 @@ def ray_pairs(rays: SegmentRays) -> RayPairs:
     )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class TurnFit:
+    """Unknowns with which turns and images agree best."""
+
+    gyro_bias: F64  # (3,) [rad/s]
+    delay_s: float  # images were taken so much after their times
+    delay_sigma_s: float
+
+
 def estimate_gyro_bias(inertial: InertialData, pairs: RayPairs) -> F64:
     """Return the bias (3,) [rad/s] with which turns and images agree best; zero without pairs.
 
@@ -109,31 +124,96 @@ def estimate_gyro_bias(inertial: InertialData, pairs: RayPairs) -> F64:
     weight = np.ones(len(pairs.pair))
     for _ in range(_ITERATIONS):
         turns = integrate_turns(inertial, bias)
-        step, weight = gauss_newton_step(pairs, turns, weight, bias)
+        step, weight, _ = gauss_newton_step(pairs, turns, weight, bias)
         bias = bias + step
         if np.abs(step).max() < _CONVERGED_RADPS:
             break
     return bias
 
 
-def gauss_newton_step(pairs: RayPairs, turns: Turns, weight: F64, bias: F64) -> tuple[F64, F64]:
-    """Return the step of the bias and new weights (M,)."""
+def fit_turns(inertial: InertialData, pairs: RayPairs) -> TurnFit:
+    """Estimate the bias of the gyroscope together with the delay of the images.
+
+    A delay turns both frames of a pair by their angular velocities, so that the motion must change its
+    angular velocity for it to be told from the bias; otherwise its standard deviation stays large.
+    """
+    unknowns, sigma = np.zeros(4), _PRIOR_DELAY_S
+    if not len(pairs.first_frame):
+        return TurnFit(unknowns[:3], 0.0, sigma)
+    weight = np.ones(len(pairs.pair))
+    for _ in range(_DELAY_ITERATIONS):
+        moved = delayed(inertial, unknowns[3])
+        turns = integrate_turns(moved, unknowns[:3])
+        rate = angular_velocity(moved, unknowns[:3])
+        step, weight, covariance = gauss_newton_step(pairs, turns, weight, unknowns, rate)
+        unknowns = unknowns + step
+        sigma = float(np.sqrt(covariance[3, 3]))
+        if abs(step[3]) < _CONVERGED_S:
+            break
+    return TurnFit(unknowns[:3], float(unknowns[3]), _SIGMA_FACTOR * sigma)
+
+
+def delayed(inertial: InertialData, delay_s: float) -> InertialData:
+    """Return the samples of consecutive edges between frames that are all later by a delay.
+
+    Before the first and after the last sample, the nearest of them counts.
+    """
+    times_ns, ends = inertial.timestamp_ns, inertial.sample_start[1:] - 1
+    is_kept = np.diff(times_ns, prepend=times_ns[0] - 1) > 0  # edges repeat the sample between them
+    known_ns, known = times_ns[is_kept], inertial.accel_gyro[is_kept]
+    frames_ns = np.concatenate([times_ns[:1], times_ns[ends]]) + round(delay_s * 1e9)
+    inside = (known_ns > frames_ns[0]) & (known_ns < frames_ns[-1])
+    every_ns = np.union1d(known_ns[inside], frames_ns)
+    values = np.stack([np.interp(every_ns, known_ns, column) for column in known.T], axis=1)
+    at = np.searchsorted(every_ns, frames_ns)
+    start = starts_of_counts(np.diff(at) + 1)
+    rows = np.arange(start[-1]) - np.repeat(np.arange(len(at) - 1), np.diff(start))
+    return dataclasses.replace(
+        inertial, sample_start=start, timestamp_ns=every_ns[rows], accel_gyro=values[rows]
+    )
+
+
+def angular_velocity(inertial: InertialData, gyro_bias: F64) -> F64:
+    """Return the angular velocity (F, 3) [rad/s] at the frames, with which edges begin and end."""
+    rows = np.append(inertial.sample_start[:-1], inertial.sample_start[-1] - 1)
+    T_g_inverse = inertial.corrections[0][0]
+    return np.asarray((inertial.accel_gyro[rows, 3:] - gyro_bias) @ T_g_inverse.T)
+
+
+def gauss_newton_step(
+    pairs: RayPairs, turns: Turns, weight: F64, unknowns: F64, rate: F64 | None = None
+) -> tuple[F64, F64, F64]:
+    """Return the step of the unknowns, new weights (M,), and the unknowns' covariance.
+
+    Args:
+        pairs: Rays.
+        turns: At the present unknowns.
+        weight: Robust weights (M,).
+        unknowns: Bias (3,), or bias and delay (4,).
+        rate: Angular velocities (F, 3) of the frames, if the delay is an unknown.
+    """
     i, j, count = pairs.first_frame, pairs.second_frame, len(pairs.first_frame)
     R_i_j = so3.to_matrix(so3.multiply(so3.inverse(turns.q_A_I[i]), turns.q_A_I[j]))
+    R_j_i = np.swapaxes(R_i_j, 1, 2)
     # right perturbation of R_i_j by the bias
-    slope = turns.jacobian[j] - np.swapaxes(R_i_j, 1, 2) @ turns.jacobian[i]
+    slope = turns.jacobian[j] - R_j_i @ turns.jacobian[i]
+    sigma = np.full(3, _PRIOR_RADPS)
+    if rate is not None:
+        by_delay = rate[j][:, :, None] - R_j_i @ rate[i][:, :, None]
+        slope = np.ascontiguousarray(np.concatenate([slope, by_delay], axis=2))
+        sigma = np.append(sigma, _PRIOR_DELAY_S)
     rays = PairedRays(pairs.first, pairs.second, pairs.sigma, pairs.start)
     normal, scatter = np.empty_like(pairs.first), np.zeros((count, 3, 3))
     add_scatter(rays, R_i_j, weight, normal, scatter)
     direction = np.linalg.eigh(scatter)[1]  # ascending: the first is that of translation
-    weight, sums = np.empty_like(weight), BiasSums.zeros(count)
+    weight, sums = np.empty_like(weight), BiasSums.zeros(count, len(sigma))
     add_equations(rays, R_i_j, slope, direction, normal, weight, sums)
     eliminated = sums.H_bt @ np.linalg.inv(sums.H_tt + 1e-9 * np.eye(2))
     H = sums.H_bb - np.einsum("pij,pkj->ik", eliminated, sums.H_bt)
     g = sums.g_b - np.einsum("pij,pj->i", eliminated, sums.g_t)
-    H += np.eye(3) / _PRIOR_RADPS**2
-    g += bias / _PRIOR_RADPS**2
-    return -np.linalg.solve(H, g), weight
+    H += np.diag(1.0 / sigma**2)
+    g += unknowns / sigma**2
+    return -np.linalg.solve(H, g), weight, np.linalg.inv(H)
 
 
 def compile_kernels() -> None:

@@ -24,22 +24,22 @@ class PairedRays(NamedTuple):
 
 
 class BiasSums(NamedTuple):
-    """Normal equations of the bias b, and of every pair's direction t in its tangent plane."""
+    """Normal equations of K unknowns b, and of every pair's direction t in its tangent plane."""
 
-    H_bb: F64  # (3, 3)
-    g_b: F64  # (3,)
+    H_bb: F64  # (K, K)
+    g_b: F64  # (K,)
     H_tt: F64  # (P, 2, 2)
-    H_bt: F64  # (P, 3, 2)
+    H_bt: F64  # (P, K, 2)
     g_t: F64  # (P, 2)
 
     @classmethod
-    def zeros(cls, pairs: int) -> BiasSums:
+    def zeros(cls, pairs: int, unknowns: int) -> BiasSums:
         """Return the equations of nothing."""
         return cls(
-            np.zeros((3, 3)),
-            np.zeros(3),
+            np.zeros((unknowns, unknowns)),
+            np.zeros(unknowns),
             np.zeros((pairs, 2, 2)),
-            np.zeros((pairs, 3, 2)),
+            np.zeros((pairs, unknowns, 2)),
             np.zeros((pairs, 2)),
         )
 
@@ -111,14 +111,15 @@ def add_equations(
     Args:
         rays: The rays.
         R_i_j: Turn (P, 3, 3) from the second to the first frame of each pair.
-        slope: Right perturbation (P, 3, 3) of that turn by the bias.
+        slope: Right perturbation (P, 3, K) of that turn by the unknowns: the bias, and what else there is.
         direction: Direction of translation and its tangent plane, as columns (P, 3, 3).
         normal: From `add_scatter`.
         weight: Result: Cauchy weights.
         sums: Zeros, to which the sums are added.
     """
     plane, back, by_turn = np.empty(3), np.empty(3), np.empty(3)
-    J_b, J_t = np.empty(3), np.empty(2)
+    count = slope.shape[2]
+    J_b, J_t = np.empty(count), np.empty(2)
     for pair in range(len(R_i_j)):
         R, J, basis = R_i_j[pair], slope[pair], direction[pair]
         for m in range(rays.start[pair], rays.start[pair + 1]):
@@ -133,15 +134,15 @@ def add_equations(
             for i in range(3):
                 back[i] = R[0, i] * plane[0] + R[1, i] * plane[1] + R[2, i] * plane[2]
             so3.cross(rays.second[m], back, by_turn)
-            for i in range(3):
+            for i in range(count):
                 J_b[i] = by_turn[0] * J[0, i] + by_turn[1] * J[1, i] + by_turn[2] * J[2, i]
                 J_b[i] *= scale
             for i in range(2):
                 J_t[i] = n[0] * basis[0, i + 1] + n[1] * basis[1, i + 1] + n[2] * basis[2, i + 1]
                 J_t[i] *= scale
-            for i in range(3):
+            for i in range(count):
                 sums.g_b[i] += w * J_b[i] * r
-                for j in range(3):
+                for j in range(count):
                     sums.H_bb[i, j] += w * J_b[i] * J_b[j]
                 for j in range(2):
                     sums.H_bt[pair, i, j] += w * J_b[i] * J_t[j]

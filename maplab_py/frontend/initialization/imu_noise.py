@@ -6,15 +6,71 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.sensors import Imu
 
 _LEAST_REDUNDANCY = 5.0
+_LEAST_SCATTERED = 50
+_SIGMA_OF_MEDIAN = 1.4826
 _LARGEST_FACTOR = 2.0
 _COLUMNS = FRAME_SIZE + 9
+_EXAGGERATION, _MARGIN = 10.0, 5.0
+"""Accelerometer: largest density, and that used instead, as multiples of the scatter of its samples."""
+_LEAST_ACCEL_DENSITY = 0.02
+_DOUBTFUL_GYRO_DENSITY, _MOST_GYRO_DENSITY = 7e-5, 7e-4
+"""Hardly a gyroscope has less; samples that scatter by more than the other show vibrations."""
+
+
+def plausible_noise(imu: Imu, times_ns: I64, accel_gyro: F64) -> tuple[Imu, tuple[str, ...]]:
+    """Return an IMU with densities that its samples allow, and what was changed.
+
+    Independent noise of a density makes second differences of samples scatter; motion hardly does. The noise
+    cannot be much larger than they show.
+
+    Args:
+        imu: With the densities of the calibration.
+        times_ns: Times (S,) of samples.
+        accel_gyro: The samples (S, 6).
+    """
+    accel, gyro = scatter_density(times_ns, accel_gyro)
+    notes = []
+    if imu.acc_noise_density > max(_EXAGGERATION * accel, _LEAST_ACCEL_DENSITY):
+        density = max(_MARGIN * accel, _LEAST_ACCEL_DENSITY)
+        notes.append(
+            f"the accelerometer's noise is {imu.acc_noise_density:.2g} m/s^2/sqrt(Hz) by the calibration, "
+            f"but its samples scatter by {accel:.2g}: {density:.2g} is used (--vio_imu_noise=file keeps it)"
+        )
+        imu = dataclasses.replace(imu, acc_noise_density=density)
+    density = min(gyro, _MOST_GYRO_DENSITY)
+    if imu.gyro_noise_density < min(_DOUBTFUL_GYRO_DENSITY, density):
+        notes.append(
+            f"the gyroscope's noise is {imu.gyro_noise_density:.2g} rad/s/sqrt(Hz) by the calibration, "
+            f"but its samples scatter by {gyro:.2g}: {density:.2g} is used (--vio_imu_noise=file keeps it)"
+        )
+        imu = dataclasses.replace(imu, gyro_noise_density=density)
+    return imu, tuple(notes)
+
+
+def scatter_density(times_ns: I64, accel_gyro: F64) -> tuple[float, float]:
+    """Return the densities of independent noise that samples at about equal intervals scatter by.
+
+    The second difference of independent samples has six times their variance. The largest of the three axes
+    counts, and medians over time, so that shocks do not.
+    """
+    step_ns = np.diff(times_ns)
+    usual_ns = float(np.median(step_ns))
+    is_usual = np.abs(step_ns - usual_ns) < 0.5 * usual_ns
+    second = (accel_gyro[2:] - 2.0 * accel_gyro[1:-1] + accel_gyro[:-2])[
+        is_usual[1:] & is_usual[:-1]
+    ]
+    if len(second) < _LEAST_SCATTERED:
+        return float("inf"), 0.0
+    sigma = _SIGMA_OF_MEDIAN * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+    density = sigma * np.sqrt(usual_ns * 1e-9)
+    return float(density[:3].max()), float(density[3:].max())
 
 
 def with_least_noise(imu: Imu, gyro_density: float, accel_density: float) -> Imu:

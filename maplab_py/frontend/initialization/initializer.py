@@ -89,12 +89,21 @@ class Initializer:
             if motionlessness(frames, accel_gyro).is_rest(options):
                 self.reason = ""
                 sigma = accel_bias_sigma(self._imu, options)
-                return Start(frame, start_at_rest(self._imu, times_ns, accel_gyro, sigma))
+                state = start_at_rest(self._imu, times_ns, accel_gyro, sigma)
+                return Start(frame, state, is_resting=True)
         if self._pending is None:
             self._pending = self._begin(frame)
         else:
             self._pending.later.append(frame)
         return None if self._pending is None else self._advance(self._pending)
+
+    def replace_frames(self, frames: list[WindowFrame]) -> None:
+        """Exchange all frames so far by the same with other times."""
+        self._history = History(self._options.longest_s + 1e-3)
+        for frame in frames:
+            self._history.push(frame)
+        self._first_ns = frames[0].time_ns if frames else None
+        self._next_ns, self._pending = -1, None
 
     def _begin(self, frame: WindowFrame) -> _Pending | None:
         """Begin an attempt in motion if it is time to."""
@@ -126,6 +135,7 @@ class Initializer:
 
     def _advance(self, pending: _Pending) -> Start | None:
         """Do a frame's share of an attempt; return a start if it ends with one."""
+        options = self._options
         newest = pending.later[-1] if pending.later else pending.frame
         since_ns = newest.imu_times_ns[-1] - newest.imu_times_ns[0]
         units = min(_UNITS_PER_S * since_ns * 1e-9, _MOST_UNITS)
@@ -135,11 +145,19 @@ class Initializer:
             return None
         self._pending = None
         wait_s = min(self._wait_s(attempt, pending), pending.early_s)
+        if pending.waited_s < options.provisional_s:
+            wait_s = min(wait_s, max(options.provisional_s - pending.waited_s, options.retry_s))
         self._next_ns = pending.frame.time_ns + round((wait_s - 5e-3) * 1e9)
         self.attempt, self.reason = attempt, attempt.reason
-        if attempt.state is None:
+        later = tuple(pending.later)
+        if attempt.state is not None:
+            return Start(pending.frame, attempt.state, later)
+        waits_s = options.provisional_s
+        if attempt.scale_sigma < options.provisional_scale_sigma:
+            waits_s = options.promising_s
+        if attempt.provisional is None or pending.waited_s < waits_s - 5e-3:
             return None
-        return Start(pending.frame, attempt.state, tuple(pending.later))
+        return Start(pending.frame, attempt.provisional, later, scale_sigma=attempt.scale_sigma)
 
     def _wait_s(self, attempt: Attempt, pending: _Pending) -> float:
         """Return the time until the next attempt: those that reach the refinement take long."""

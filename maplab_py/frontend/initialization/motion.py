@@ -35,7 +35,10 @@ _MIN_PAIRS = 3
 _MIN_SHARE_IN_FRONT = 0.7
 _POSITION_SIGMA_M = 1e-4
 _BIAS_WALK_S = 3600.0
+_MOST_ACCEL_BIAS_MPS2 = 0.8
 _MAX_BIAS_SIGMAS = 4.0
+_PROVISIONAL_TILT_RAD, _LEAST_KNOWN_SCALE = 0.1, 0.5
+"""Largest standard deviations of tilt and scale from which the estimator can follow."""
 _GYRO_BIAS_UNITS, _MOTION_UNITS = 22.0, 22.0
 """Units of work of the closed forms, rays included."""
 
@@ -55,6 +58,8 @@ class Attempt:
     state: StartState | None
     reason: str  # empty when there is a state
     refined: Refined | None = None  # what the state was taken from
+    provisional: StartState | None = None  # a state of which much is only expected
+    scale_sigma: float = 0.0  # with that state
 
 
 class MotionStart:
@@ -118,9 +123,20 @@ class MotionStart:
         states = _states(turns, gyro_bias, motion)
         refined = yield from self._refinement.refine(segment, states, wanted_scale_sigma=wanted)
         reason = self._objection(refined, rays, limits)
-        if refined is None or reason:
+        if refined is not None and not reason:
+            return Attempt(_start_state(refined), "", refined)
+        if refined is None or not self._is_plausible(refined):
             return Attempt(None, reason, refined)
-        return Attempt(_start_state(refined), "", refined)
+        return Attempt(None, reason, refined, _start_state(refined), refined.scale_sigma)
+
+    def _is_plausible(self, refined: Refined) -> bool:
+        """Tell whether the estimator may go on from a state, however uncertain its scale."""
+        return (
+            refined.num_landmarks >= self._options.min_landmarks
+            and not self._contradiction(refined)
+            and refined.tilt_sigma_rad <= _PROVISIONAL_TILT_RAD
+            and refined.scale_sigma <= _LEAST_KNOWN_SCALE
+        )
 
     def _objection(self, refined: Refined | None, rays: SegmentRays, limits: Limits) -> str:
         """Return what is still unknown, empty when the estimator may start."""
@@ -135,18 +151,8 @@ class MotionStart:
                 f"{refined.num_landmarks} points have parallax, {options.min_landmarks} are needed: "
                 "move the camera sideways, or point it at things that are nearer"
             )
-        if refined.median_error_px > options.max_error_px:
-            return (
-                f"images and IMU disagree by {refined.median_error_px:.1f} px, "
-                f"{options.max_error_px:g} are allowed: check the time offset and the pose of the "
-                "camera on the IMU, and that the scene does not move"
-            )
-        bias = float(np.linalg.norm(refined.states.accel_bias[-1]))
-        if bias > _MAX_BIAS_SIGMAS * self._accel_bias_sigma:
-            return (
-                f"the accelerometer's bias would be {bias:.1f} m/s^2: change speed and direction, "
-                "and turn; if this stays, calibrate the IMU"
-            )
+        if contradiction := self._contradiction(refined):
+            return contradiction
         tilt_deg = float(np.degrees(refined.tilt_sigma_rad))
         if tilt_deg > limits.tilt_deg:
             return (
@@ -162,6 +168,23 @@ class MotionStart:
             )
         return ""
 
+    def _contradiction(self, refined: Refined) -> str:
+        """Return what images and samples say against each other; empty when they agree."""
+        options = self._options
+        if refined.median_error_px > options.max_error_px:
+            return (
+                f"images and IMU disagree by {refined.median_error_px:.1f} px, "
+                f"{options.max_error_px:g} are allowed: check the time offset and the pose of the "
+                "camera on the IMU, and that the scene does not move"
+            )
+        bias = float(np.linalg.norm(refined.states.accel_bias[-1]))
+        if bias > _MAX_BIAS_SIGMAS * self._accel_bias_sigma:
+            return (
+                f"the accelerometer's bias would be {bias:.1f} m/s^2: change speed and direction, "
+                "and turn; if this stays, calibrate the IMU"
+            )
+        return ""
+
 
 def accel_bias_sigma(imu: Imu, options: InitializationOptions) -> float:
     """Return the standard deviation [m/s^2] of a component of the accelerometer's bias at the start.
@@ -169,7 +192,7 @@ def accel_bias_sigma(imu: Imu, options: InitializationOptions) -> float:
     Sensors whose bias walks far are those that begin far off (Tango: 0.8 m/s^2).
     """
     walked = imu.acc_bias_random_walk_noise_density * float(np.sqrt(_BIAS_WALK_S))
-    return max(options.accel_bias_sigma_mps2, walked)
+    return max(options.accel_bias_sigma_mps2, min(walked, _MOST_ACCEL_BIAS_MPS2))
 
 
 def shares_points(rays: SegmentRays) -> bool:

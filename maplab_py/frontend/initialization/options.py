@@ -71,6 +71,20 @@ class InitializationOptions:
         unit="s",
         help="Time after which the limits of scale and gravity grow with the time that has passed",
     )
+    provisional_s: float = option(
+        2.2,
+        unit="s",
+        help="Time after which the estimator starts with what is known, and follows scale, velocity and "
+        "biases once they show",
+    )
+    provisional_scale_sigma: float = option(
+        0.06,
+        help="Standard deviation of the scale, as a share of it, below which it waits up to "
+        "--vio_initialization_promising_s instead",
+    )
+    promising_s: float = option(
+        4.0, unit="s", help="Longest time to wait for a scale that is nearly known"
+    )
     max_error_px: float = option(
         1.5, unit="px", help="Largest median reprojection error after the refinement"
     )

@@ -22,7 +22,7 @@ from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.standstill import Standstill
-from maplab_py.estimation.window.states import WindowStates
+from maplab_py.estimation.window.states import WindowStates, scale_sigma
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
 from maplab_py.frontend.initialization.imu_noise import noise_factor, with_least_noise
@@ -257,7 +257,7 @@ class Refinement:
             covariance=covariance,
             travelled_m=length,
             travelled_sigma_m=float(np.sqrt(max(float(ahead @ covariance_far @ ahead), 0.0))),
-            scale_sigma=_scale_sigma(states.T_M_I[:, 4:], of_frames),
+            scale_sigma=scale_sigma(states.T_M_I[:, 4:], of_frames),
             median_error_px=float(np.median(error_px)),
             num_landmarks=len(solved.states.h),
             num_rejected=solved.rejected,
@@ -306,24 +306,6 @@ class Refinement:
             tracks, candidates, states.T_M_I, only_stereo=False
         )
         return tracks, min(len(candidates), options.max_landmarks)
-
-
-def _scale_sigma(p_M: F64, covariance: F64) -> float:
-    """Return the standard deviation of the scale of positions (F, 3), as a share of it.
-
-    It is that of a similarity alignment with the true positions: of s = sum q_i . p_i / sum q_i . q_i with
-    offsets q_i from the mean, to first order (S. Umeyama, PAMI 1991, equation 42). A single distance would
-    count the noise of two positions instead of all.
-
-    Args:
-        p_M: Positions.
-        covariance: Of all states (15 F, 15 F), which begin with the positions.
-    """
-    offset = p_M - p_M.mean(axis=0)
-    weight = np.zeros((len(p_M), FRAME_SIZE))
-    weight[:, :3] = offset / max(float(np.vdot(offset, offset)), 1e-12)
-    by_state = weight.ravel()
-    return float(np.sqrt(max(float(by_state @ covariance @ by_state), 0.0)))
 
 
 def mission_frame(g_A: F64) -> F64:

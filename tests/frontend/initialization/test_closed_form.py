@@ -7,7 +7,9 @@ import pytest
 
 from maplab_py.array_types import F64
 from maplab_py.frontend.initialization.gyro_bias import (
+    delayed,
     estimate_gyro_bias,
+    fit_turns,
     gauss_newton_step,
     integrate_turns,
     ray_pairs,
@@ -70,7 +72,7 @@ def test_a_step_is_that_of_the_whole_least_squares_problem() -> None:
     turns = integrate_turns(segment.inertial, np.zeros(3))
     count, of = len(pairs.first_frame), pairs.pair
     weight = np.ones(len(of))
-    step, weight = gauss_newton_step(pairs, turns, weight, np.zeros(3))
+    step, weight, _ = gauss_newton_step(pairs, turns, weight, np.zeros(3))
 
     def normals(bias: F64) -> F64:
         q_A_I = so3.multiply(turns.q_A_I, so3.exp(turns.jacobian @ bias))
@@ -120,6 +122,33 @@ def test_without_common_tracks_the_bias_is_zero() -> None:
     pairs = ray_pairs(rays)
     assert len(pairs.first_frame) == 0
     assert estimate_gyro_bias(segment.inertial, pairs).tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("delay_s", [-0.045, -0.006, 0.0, 0.03])
+def test_the_delay_of_the_images(delay_s: float) -> None:
+    """Samples are moved the other way, so that images seem to be late."""
+    segment, rays = segment_of(fly(lively(2, 2.0), seed=2, points=1500), 0.1)
+    fit = fit_turns(delayed(segment.inertial, -delay_s), ray_pairs(rays))
+    assert fit.delay_sigma_s < 2e-3
+    assert abs(fit.delay_s - delay_s) < min(3.0 * fit.delay_sigma_s + 1e-4, 2e-3)
+
+
+def test_without_common_tracks_nothing_shows_a_delay() -> None:
+    segment, rays = segment_of(fly(lively(1, 1.0), points=20))
+    fit = fit_turns(segment.inertial, ray_pairs(rays))
+    assert (fit.delay_s, fit.gyro_bias.tolist()) == (0.0, [0.0, 0.0, 0.0])
+    assert fit.delay_sigma_s >= 0.05
+
+
+def test_delayed_samples_are_those_of_later_frames() -> None:
+    segment, _ = segment_of(fly(lively(1, 1.0), points=20))
+    moved = delayed(segment.inertial, 0.012)
+    assert len(moved) == len(segment.inertial)
+    begin = segment.inertial.timestamp_ns[segment.inertial.sample_start[:-1]]
+    np.testing.assert_array_equal(moved.timestamp_ns[moved.sample_start[:-1]], begin + 12_000_000)
+    unmoved = delayed(segment.inertial, 0.0)
+    np.testing.assert_array_equal(unmoved.timestamp_ns, segment.inertial.timestamp_ns)
+    np.testing.assert_allclose(unmoved.accel_gyro, segment.inertial.accel_gyro, atol=1e-12)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

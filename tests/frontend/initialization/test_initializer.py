@@ -192,7 +192,9 @@ def test_constant_velocity_of_a_single_camera_has_no_scale() -> None:
 
 def test_refused_attempts_become_rarer() -> None:
     flight = fly(lively(0, 9.0), seed=0, points=600)
-    never = InitializationOptions(max_scale_sigma=1e-9, max_tilt_sigma_deg=1e-9)
+    never = InitializationOptions(
+        max_scale_sigma=1e-9, max_tilt_sigma_deg=1e-9, provisional_s=1e3, promising_s=1e3
+    )
     initializer = Initializer(flight.device, never)
     attempts_s, last = [], None
     for frame in flight.frames:
