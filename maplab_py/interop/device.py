@@ -49,6 +49,11 @@ class RecordedSensors:
         """Poses (C, 7) of the cameras on the IMU, on the rig's body when there is no IMU."""
         return self.sensors.T_I_C(self.imu_id, self.rig_id) if self.imu_id else self.rig.T_B_C
 
+    def with_imu(self, imu: Imu) -> RecordedSensors:
+        """Return the same sensors with other figures of the IMU."""
+        known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, imu.id: imu})
+        return dataclasses.replace(self, sensors=known)
+
 
 @dataclasses.dataclass(frozen=True)
 class DeviceOptions:

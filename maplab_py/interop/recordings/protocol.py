@@ -17,11 +17,6 @@ from maplab_py.interop.device import RecordedSensors as RecordedSensors
 from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_8_bits, as_grey
 from maplab_py.sensors import Imu
 
-    def with_imu(self, imu: Imu) -> RecordedSensors:
-        """Return the same sensors with other figures of the IMU."""
-        known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, imu.id: imu})
-        return dataclasses.replace(self, sensors=known)
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImuBatch:
