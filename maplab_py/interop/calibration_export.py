@@ -117,6 +117,8 @@ def _chain(cameras: tuple[Camera, ...], T_imu_C: F64) -> dict[str, Any]:
             "rostopic": camera.topic or f"/cam{row}/image_raw",
             "timeshift_cam_imu": _time_shift_s(camera),
         }
+        if camera.line_delay_ns:
+            chain[f"cam{row}"]["line_delay"] = camera.line_delay_ns * 1e-9
     return chain
 
 

@@ -68,7 +68,7 @@ class _ShownParameter:
 def _as_shown(row: ReadParameter | _ShownParameter) -> _ShownParameter:
     if isinstance(row, _ShownParameter):  # a shown report is laid out, too
         return row
-    return _ShownParameter(row.parameter, f"{row.value:.6g}", row.unit)
+    return _ShownParameter(row.parameter, f"{row.value + 0.0:.6g}", row.unit)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,6 +20,7 @@ from maplab_py.sensors.yaml_entry import Entry
 _STREAM = ("fx", "fy", "ppx", "ppy")
 _DISTORTIONS = {
     "none": "none",
+    "undistorted": "none",
     "brown_conrady": "radtan",
     "modified_brown_conrady": "inverse",
     "inverse_brown_conrady": "inverse",

@@ -622,6 +622,10 @@ def test_realsense(tmp_path: Path) -> None:
     assert imu.intrinsics is not None
     assert imu.intrinsics.T_g[0, 0] == pytest.approx(1 / 1.01)
     assert imu.gyro_noise_density == pytest.approx(2e-3)
+    rectified = json.loads(realsense())
+    rectified["cameras"][0]["distortion"] = {"type": "undistorted"}
+    d435i = import_calibration(written(tmp_path, {"d435i.json": json.dumps(rectified)}))
+    assert cameras(d435i)[0].distortion is Distortion.NONE
     alone = import_calibration(written(tmp_path, {"imu.json": realsense(cameras=[])}))
     assert (alone.rig_id, bool(alone.imu_id)) == ("", True)
 

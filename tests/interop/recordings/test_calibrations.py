@@ -103,6 +103,7 @@ def _device(*, intrinsics: bool) -> RecordedSensors:
             480,
             topic=f"/cam{row}",
             time_offset_ns=1_500_000,
+            line_delay_ns=-15_000,
         )
         for row in range(2)
     ]
@@ -130,6 +131,7 @@ def test_what_we_export_reads_back(tmp_path: Path, form: str, intrinsics: bool) 
     for ours, theirs in zip(again.cameras, device.cameras, strict=True):
         assert ours.intrinsics.tolist() == theirs.intrinsics.tolist()
         assert (ours.time_offset_ns, ours.topic) == (1_500_000, theirs.topic)
+        assert ours.line_delay_ns == -15_000
     assert again.imu is not None
     assert device.imu is not None
     assert again.imu.acc_noise_density == 2e-3
