@@ -40,7 +40,10 @@ def python_of(name: str) -> Path:
     """Return the Python of an environment; skip the test where there is none."""
     if name == "noetic":
         program = Path("/usr/bin/python3")
-        known = program.exists() and shutil.which("rosmaster") is not None
+        probe = [str(program), "-c", "import numpy, rospy, sensor_msgs.msg, nav_msgs.msg"]
+        known = shutil.which("rosmaster") is not None and not (
+            subprocess.run(probe, check=False, capture_output=True).returncode
+        )
     else:
         program = folder() / name / "bin" / "python"
         known = (folder() / name / "complete").exists()
@@ -82,7 +85,8 @@ def install(name: str) -> str:
 
 def main() -> None:
     """Make all environments that can be made; never fail."""
-    if shutil.which("rosmaster") is None and shutil.which("apt-get") and os.geteuid() == 0:
+    needs = shutil.which("rosmaster") is None
+    if needs and shutil.which("apt-get") and os.geteuid() == 0:
         shell = f"apt-get install -qq -y --no-install-recommends {_DEBIAN}"
         subprocess.run(["sh", "-c", shell], capture_output=True, check=False, timeout=_LONGEST_S)
     for name in _REQUIREMENTS:

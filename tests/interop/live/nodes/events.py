@@ -31,3 +31,12 @@ def paced(events: list[tuple[int, int, Any]], rate: float) -> Iterator[tuple[int
         if wait_s > 0.0:
             time.sleep(wait_s)
         yield stamp_ns, sensor, content
+
+
+def wait_while_growing(received: list[Any], pause_s: float = 5.0, longest_s: float = 150.0) -> None:
+    """Wait until nothing has been received for a while."""
+    deadline_s = time.monotonic() + longest_s
+    count = -1
+    while len(received) != count and time.monotonic() < deadline_s:
+        count = len(received)
+        time.sleep(pause_s)

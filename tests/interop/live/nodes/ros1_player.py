@@ -58,7 +58,7 @@ def main() -> None:
         sent_s[stamp_ns] = time.monotonic()
         publishers[sensor].publish(message)
         sent[sensor] += 1
-    time.sleep(3.0)
+    events.wait_while_growing(odometry)
     report = {
         "sent": {str(sensor): count for sensor, count in sent.items()},
         "odometry": len(odometry),
