@@ -92,6 +92,41 @@ def export_bag(
 
 
 @command(
+    "export_mcap",
+    example="export_mcap v1_01_mcap",
+    writes_files=True,
+    see_also=("export_bag", "visualize", "export_view"),
+)
+def export_mcap(
+    context: CommandContext,
+    recording: Path,
+    *,
+    mcap_images: bool = True,
+    overwrite: bool = False,
+) -> BagReport:
+    """Write the map for Foxglove and other viewers: paths, poses, landmarks, loop closures, images.
+
+    The messages are those of ROS 2, in the frame map; landmarks, closures and paths are there from the
+    beginning.
+
+    Args:
+        recording: Folder to write; the .mcap in it has the same name.
+        mcap_images: Write the images of the map's resources, too.
+        overwrite: Replace a recording that exists.
+    """
+    from maplab_py.interop.bags.map_scene import export_mcap as write
+
+    return write(
+        context.vi_map,
+        context.map_folder or Path(),
+        recording,
+        images=mcap_images,
+        overwrite=overwrite,
+        progress=context.progress,
+    )
+
+
+@command(
     "bag_info",
     example="bag_info walk.bag",
     see_also=("recording_info", "export_bag", "pose_to_bag"),

@@ -47,12 +47,12 @@ from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_labels, mission_sensor_id
 from maplab_py.vimap.resource_queries import resources_of
 
-_IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
+IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Stream:
+class MessageStream:
     """Messages of a topic in the order of time."""
 
     topic: str
@@ -92,14 +92,14 @@ def export_bag(
     contents = options.contents
     kind = format_of_path(path, options.format)
     check_bag_writable(path, kind, overwrite=overwrite)
-    export = _Export(vi_map, map_folder, mission, kind, options)
-    parts: dict[str, Callable[[], list[_Stream]]] = {
+    export = MissionStreams(vi_map, map_folder, mission, kind, options)
+    parts: dict[str, Callable[[], list[MessageStream]]] = {
         "poses": export.poses,
         "path": export.path,
         "odometry": export.odometry,
         "tf": export.tf,
         "imu": export.imu,
-        "images": lambda: export.images(_IMAGES, "image_raw"),
+        "images": lambda: export.images(IMAGES, "image_raw"),
         "depth": lambda: export.images(_DEPTH, "depth"),
         "clouds": export.clouds,
     }
@@ -126,7 +126,7 @@ def export_bag(
     )
 
 
-class _Export:
+class MissionStreams:
     """The parts of a mission as streams of messages."""
 
     def __init__(
@@ -149,7 +149,7 @@ class _Export:
         self._imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
         self.notes: list[str] = []
 
-    def poses(self) -> list[_Stream]:
+    def poses(self) -> list[MessageStream]:
         """Poses T_G_I."""
         rows = pose_messages(
             self._times_ns,
@@ -159,7 +159,7 @@ class _Export:
         )
         return [self._fixed("/pose", "geometry_msgs/msg/PoseStamped", self._times_ns, rows)]
 
-    def path(self) -> list[_Stream]:
+    def path(self) -> list[MessageStream]:
         """All poses T_G_I in a message, at the last time."""
         if not len(self._times_ns):
             return []
@@ -167,7 +167,7 @@ class _Export:
         row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
         return [self._fixed("/path", PATH, self._times_ns[-1:], [row])]
 
-    def odometry(self) -> list[_Stream]:
+    def odometry(self) -> list[MessageStream]:
         """Poses T_M_I with velocities."""
         table = self._map.vertices
         rows = odometry_messages(
@@ -179,7 +179,7 @@ class _Export:
         )
         return [self._fixed("/odometry", "nav_msgs/msg/Odometry", self._times_ns, rows)]
 
-    def tf(self) -> list[_Stream]:
+    def tf(self) -> list[MessageStream]:
         """The tree G, M, I and cameras at the time of each vertex."""
         names, count = self._options, len(self._times_ns)
         tree: list[tuple[F64, tuple[str, str]]] = [
@@ -195,7 +195,7 @@ class _Export:
         rows = tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
         return [self._fixed(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
 
-    def imu(self) -> list[_Stream]:
+    def imu(self) -> list[MessageStream]:
         """IMU samples, each once."""
         if not self._imu_id:
             return []
@@ -208,9 +208,9 @@ class _Export:
         topic = _absolute(self._map.sensors.imu(self._imu_id).topic or "imu0")
         return [self._fixed(topic, "sensor_msgs/msg/Imu", times_ns, messages)]
 
-    def images(self, kinds: tuple[int, ...], name: str) -> list[_Stream]:
+    def images(self, kinds: tuple[int, ...], name: str) -> list[MessageStream]:
         """Images of frames, of some types of resources, and the calibration of their cameras."""
-        vi_map, streams = self._map, list[_Stream]()
+        vi_map, streams = self._map, list[MessageStream]()
         chosen = resources_of(vi_map, kinds, np.array([self._mission]))
         chosen &= vi_map.resources.owner_kind == ResourceOwner.FRAME
         resources = np.flatnonzero(chosen)
@@ -220,23 +220,23 @@ class _Export:
             times_ns = vi_map.frames.timestamp_ns[frames[of_camera]]
             order = np.argsort(times_ns, kind="stable")
             rows, times_ns = resources[of_camera[order]], times_ns[order]
-            is_raw = kinds == _IMAGES
+            is_raw = kinds == IMAGES
             topic = _absolute((is_raw and camera.topic) or f"cam{index}/{name}")
             stamps = times_ns - camera.time_offset_ns
             images = self._resource_messages(rows, times_ns, stamps, Channel(topic, IMAGE), index)
-            streams.append(_Stream(topic, len(rows), images))
+            streams.append(MessageStream(topic, len(rows), images))
             if is_raw and has_camera_info(camera):
                 info = f"/cam{index}/camera_info"
                 channel = Channel(info, CAMERA_INFO)
                 infos = self._camera_infos(times_ns, stamps, channel, index)
-                streams.append(_Stream(info, len(rows), infos))
+                streams.append(MessageStream(info, len(rows), infos))
             elif is_raw and len(rows):
                 self.notes.append(f"camera {index} has a model that CameraInfo does not have")
         return streams
 
-    def clouds(self) -> list[_Stream]:
+    def clouds(self) -> list[MessageStream]:
         """Clouds of sensors."""
-        vi_map, table, streams = self._map, self._map.resources, list[_Stream]()
+        vi_map, table, streams = self._map, self._map.resources, list[MessageStream]()
         chosen = resources_of(vi_map, _CLOUDS, np.array([self._mission]))
         chosen &= table.owner_kind == ResourceOwner.SENSOR
         rows = np.flatnonzero(chosen)
@@ -246,7 +246,7 @@ class _Export:
             sensor = vi_map.sensors.sensors.get(to_hex(sensor_id))
             topic = _absolute(getattr(sensor, "topic", "") or f"points{number}")
             messages = self._clouds_of(mine, Channel(topic, CLOUD), f"lidar{number}")
-            streams.append(_Stream(topic, len(mine), messages))
+            streams.append(MessageStream(topic, len(mine), messages))
         return streams
 
     def _clouds_of(self, rows: I64, channel: Channel, frame: str) -> Iterator[BagMessage]:
@@ -273,8 +273,8 @@ class _Export:
             data = self._maker.camera_info(stamp_ns, f"cam{camera}", model)
             yield BagMessage(time_ns, channel, data)
 
-    def _fixed(self, topic: str, kind: str, times_ns: I64, rows: list[bytes]) -> _Stream:
-        return _Stream(topic, len(rows), messages_of_topic(times_ns, topic, kind, rows))
+    def _fixed(self, topic: str, kind: str, times_ns: I64, rows: list[bytes]) -> MessageStream:
+        return MessageStream(topic, len(rows), messages_of_topic(times_ns, topic, kind, rows))
 
 
 def _repeated(T_A_B: F64, count: int) -> F64:

@@ -16,6 +16,8 @@ from maplab_py.sensors import Camera, Distortion, Projection
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 PATH = "nav_msgs/msg/Path"
+LINES = "visualization_msgs/msg/Marker"
+_LINE_LIST, _LINE_WIDTH_M = 5, 0.02
 _S_TO_NS = 1_000_000_000
 _ENCODINGS = {("uint8", 2): "mono8", ("uint8", 3): "bgr8", ("uint16", 2): "16UC1"}
 _DISTORTIONS = {
@@ -74,6 +76,43 @@ class MessageMaker:
             for time_ns, T in zip(times_ns.tolist(), T_A_B.tolist(), strict=True)
         ]
         return self._bytes(PATH, self._header(int(times_ns[-1]), frame), poses)
+
+    def lines(
+        self,
+        stamp_ns: int,
+        frame: str,
+        name: str,
+        ends: F64,
+        colour: tuple[float, float, float, float],
+    ) -> bytes:
+        """Return a Marker of ROS 2: lines between points (L, 2, 3), coloured (red, green, blue, alpha)."""
+        types = self._store.types
+        point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
+        quaternion, pose = types["geometry_msgs/msg/Quaternion"], types["geometry_msgs/msg/Pose"]
+        time, colour_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/ColorRGBA"]
+        none, nothing = np.zeros(0, dtype=np.uint8), types["std_msgs/msg/Header"](time(0, 0), "")
+        return self._bytes(
+            LINES,
+            self._header(stamp_ns, frame),
+            name,
+            0,
+            _LINE_LIST,
+            0,
+            pose(point(0.0, 0.0, 0.0), quaternion(0.0, 0.0, 0.0, 1.0)),
+            vector(_LINE_WIDTH_M, 0.0, 0.0),
+            colour_type(*colour),
+            types["builtin_interfaces/msg/Duration"](0, 0),
+            False,
+            [point(*p) for p in ends.reshape(-1, 3).tolist()],
+            [],
+            "",
+            types[COMPRESSED](nothing, "", none),
+            [],
+            "",
+            "",
+            types["visualization_msgs/msg/MeshFile"]("", none),
+            False,
+        )
 
     def camera_info(self, stamp_ns: int, frame: str, camera: Camera) -> bytes:
         """Return the CameraInfo of a pinhole camera; see `has_camera_info`."""
