@@ -14,8 +14,7 @@ comes from the folder `_kernels` of the package, which a wheel brings, else from
 where it is written when something is compiled.
 
 A module with kernels, or the module that calls them, has a function `compile_kernels`. It calls the
-kernels once with small arguments of the types that commands use. The `warmup` modules of `vision`,
-`estimation` and `storage` list these functions for `maplab warmup`.
+kernels once with small arguments of the types that commands use. `maplab_py.warmup` calls all of them.
 
 Threads sleep while they wait for others at the end of a parallel loop. By default, GNU OpenMP lets
 them spin for milliseconds; on a busy machine every loop then costs a time slice of the scheduler
@@ -27,6 +26,7 @@ from __future__ import annotations
 
 import enum
 import hashlib
+import json
 import os
 import pickle
 import platform
@@ -40,6 +40,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import numpy as np
 
+from maplab_py import kernel_cache
 from maplab_py.atomic import write_file
 from maplab_py.kernel_cache import PACKAGED, cache_folder
 
@@ -93,6 +94,8 @@ __all__ = [
 
 CODE_FOLDER = "code"
 """Folder of machine code, in the user's cache and in the package."""
+BUILT_WITH = "built_with.json"
+"""File of the package that tells what its machine code was compiled with."""
 
 
 def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -161,6 +164,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
                 continue
             result_type = numba.core.compiler.CompileResult
             return result_type._rebuild(target_context, *pickle.loads(data))
+        if self._function.__module__.startswith("maplab_py"):
+            _say_why_not_packaged()
         return None
 
     def _save_overload(self, sig: Any, data: Any) -> None:
@@ -197,6 +202,30 @@ def versions() -> dict[str, str]:
         "numba": numba.__version__,
         "numpy": ".".join(np.__version__.split(".")[:2]),
     }
+
+
+def built_with() -> dict[str, str]:
+    """Return the versions and the processor that machine code is compiled with now."""
+    return {**versions(), "processor": os.environ.get("NUMBA_CPU_NAME", "this one")}
+
+
+@cache
+def _say_why_not_packaged() -> None:
+    """Tell once why the wheel's machine code is not used, if the reason is known."""
+    try:
+        built = json.loads((PACKAGED / BUILT_WITH).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return
+    different = [
+        f"{name} {built.get(name)}, not {value}"
+        for name, value in built_with().items()
+        if value not in built.get(name, "").split(", ")
+    ]
+    if different:
+        kernel_cache.tell_user(
+            f"the installed kernels were compiled with {'; '.join(different)}: compiling them again, "
+            "once, when they are needed (maplab warmup compiles all)"
+        )
 
 
 @cache

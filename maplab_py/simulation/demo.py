@@ -18,14 +18,6 @@ from maplab_py.vimap import VIMap
 
 SCENARIO = "three_sessions"
 MAP_KEY = "demo"
-KERNELS = {
-    "anchor_all_missions": ("absolute pose by gravity", "descriptor search"),
-    "relax": ("relaxation",),
-}
-"""Kernels that another process compiles ahead, in this order, and the command that waits for them.
-
-All other kernels are compiled on first use, which balances the load of both processes.
-"""
 
 
 class DemoConsole(Protocol):

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import shlex
 import time
-from collections.abc import Mapping
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.plugin import CommandContext, EstimationError, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.warmup import CompilationAhead
     from maplab_py.simulation.evaluation import MapErrors
     from maplab_py.simulation.reports import DemoReport, ScenarioList, SimulatedMaps
     from maplab_py.simulation.scenario import Scenario
@@ -103,17 +99,13 @@ def demo(
         seed: Seed of the simulation.
         overwrite: Replace a map that is there already.
     """
-    from maplab_py.algorithms.warmup import CompilationAhead
-    from maplab_py.simulation.demo import KERNELS, MAP_KEY, SCENARIO, demonstrate
+    from maplab_py.simulation.demo import MAP_KEY, SCENARIO, demonstrate
     from maplab_py.simulation.raw_data import refuse_used_folder
 
     refuse_used_folder(map_folder, overwrite=overwrite)
     context.maps.check_new_key(MAP_KEY)
     scenario = _scenario(SCENARIO, seed)
-    jobs = tuple(chain.from_iterable(KERNELS.values()))
-    with contextlib.closing(CompilationAhead(jobs)) as ahead:
-        console = _DemoConsole(context, ahead, KERNELS)
-        return demonstrate(console, scenario, map_folder, overwrite=overwrite)
+    return demonstrate(_DemoConsole(context), scenario, map_folder, overwrite=overwrite)
 
 
 def _scenario(name: str, seed: int | None) -> Scenario:
@@ -127,11 +119,9 @@ def _scenario(name: str, seed: int | None) -> Scenario:
 
 @dataclasses.dataclass(frozen=True)
 class _DemoConsole:
-    """Runs commands in the session, each as soon as its kernels are compiled."""
+    """Runs commands in the session."""
 
     context: CommandContext
-    ahead: CompilationAhead
-    kernels: Mapping[str, tuple[str, ...]]  # by command
 
     @property
     def vi_map(self) -> VIMap:
@@ -146,8 +136,6 @@ class _DemoConsole:
     def run(self, line: str) -> float:
         self.context.progress.line(f"> {line}")
         call = self.context.session.parse(shlex.split(line))
-        for job in self.kernels.get(call.command.name, ()):
-            self.ahead.wait(job, self.context.progress)
         start = time.perf_counter()
         report = self.context.session.execute(call)
         if report.failure:

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-
 import numba
 import numpy as np
-import pytest
 from numpy.testing import assert_array_equal
 
-from maplab_py.algorithms import warmup
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
-from maplab_py.algorithms.relaxation.warmup import compile_relaxation
-from maplab_py.algorithms.warmup import CompilationAhead
 from maplab_py.compilation import compiled, is_missing_on_disk
-from maplab_py.errors import Cancelled
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.kernels.connected_parts import connected_parts
 from maplab_py.estimation.linear import selected_inverse, supernodal
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3
-from maplab_py.progress import SILENT, SilentProgress
+from maplab_py.warmup import jobs
 from tests.algorithms.relaxation.loops import simulate
 
 
 def test_a_relaxation_compiles_nothing_after_the_warmup():
-    compile_relaxation()
+    jobs()["relaxation"]()
     kernels = pose_graph_kernels(PoseError.SPLIT)
     used = (
         connected_parts,
@@ -59,7 +51,7 @@ def test_edges_that_cannot_be_written_to_compile_nothing_again():
 
 
 def test_the_disk_knows_what_was_compiled():
-    compile_relaxation()
+    jobs()["relaxation"]()
     assert not is_missing_on_disk(connected_parts)
 
     @compiled()
@@ -69,47 +61,3 @@ def test_the_disk_knows_what_was_compiled():
     assert is_missing_on_disk(never_called)
     assert not is_missing_on_disk(numba.njit(lambda x: x))  # is not to be kept
     assert not is_missing_on_disk(never_called.py_func)  # NUMBA_DISABLE_JIT
-
-
-def test_jobs_are_done_by_another_process(monkeypatch, capfd):
-    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with contextlib.closing(CompilationAhead((warmup.RELAXATION,))) as ahead:
-        process = ahead._process
-        assert process is not None
-        ahead.wait(warmup.RELAXATION, SILENT)
-        assert process.wait(60.0) == 0
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_process_that_dies_holds_nobody_up(monkeypatch):
-    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with contextlib.closing(CompilationAhead((warmup.RELAXATION, warmup.POSES))) as ahead:
-        assert ahead._process is not None
-        ahead._process.kill()
-        ahead.wait(warmup.POSES, SILENT)
-
-
-def test_waiting_can_be_cancelled_and_ends_the_process(monkeypatch):
-    class Impatient(SilentProgress):
-        def check(self) -> None:
-            raise Cancelled("enough")
-
-    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: True)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    ahead = CompilationAhead((warmup.RELAXATION,))
-    process = ahead._process
-    assert process is not None
-    with pytest.raises(Cancelled), contextlib.closing(ahead):
-        ahead.wait(warmup.RELAXATION, Impatient())
-    assert process.returncode is not None
-
-
-@pytest.mark.parametrize(("cores", "stored"), [(1, False), (2, True)])
-def test_no_process_for_a_single_core_or_what_is_on_the_disk(monkeypatch, cores, stored):
-    monkeypatch.setattr(warmup, "is_missing_on_disk", lambda _: not stored)
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
-    with contextlib.closing(CompilationAhead((warmup.POSES,))) as ahead:
-        assert ahead._process is None
-        ahead.wait(warmup.POSES, SILENT)

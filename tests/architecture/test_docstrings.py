@@ -16,7 +16,6 @@ QUESTION = re.compile(r"(What|Which|Where|How|Who|Whose|Why|When)\b")
 STILL_TO_DO = (
     "maplab_py/algorithms/evaluation",
     "maplab_py/algorithms/external_poses",
-    "maplab_py/algorithms/rig_warmup.py",
     "maplab_py/algorithms/self_calibration/estimation",
     "maplab_py/algorithms/vi_optimization",
     "maplab_py/estimation",

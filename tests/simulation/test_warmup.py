@@ -18,13 +18,13 @@ from maplab_py.simulation.scenario import (
 )
 from maplab_py.simulation.shading_kernels import pack_texels
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.warmup import compile_rendering
+from maplab_py.warmup import jobs
 
 CAMERA = CameraOptions(intrinsics=(40.0, 40.0, 40.0, 30.0), width_px=80, height_px=60)
 
 
 def test_rendering_compiles_nothing_after_the_warmup(tmp_path: Path) -> None:
-    compile_rendering()
+    jobs()["image rendering"]()
     before = [list(kernel.signatures) for kernel in (cast_rays, pack_texels)]
     assert all(before)
     scenario = Scenario(

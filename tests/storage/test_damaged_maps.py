@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.algorithms.warmup import _jobs
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status, status_of
 from maplab_py.errors import MapError
@@ -20,8 +19,8 @@ from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.message_scan import MemoryBudget, estimate, quick_estimate
 from maplab_py.storage.message_scan_kernel import count_parts
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.warmup import compile_scan
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.warmup import jobs
 from tests.e2e.support import run_program
 from tests.storage.damages import BOMB_ENTRIES, DAMAGES
 from tests.storage.damaging import BOUND_MEGABYTES, write_whole_map, zeros
@@ -232,11 +231,10 @@ def test_what_may_not_be_read_is_named_in_one_line(folder: Path, name: str) -> N
 
 
 def test_the_warmup_compiles_the_scan_of_messages_once_for_all() -> None:
-    compile_scan()
+    jobs()["message scan"]()
     signatures = list(count_parts.signatures)
     assert len(signatures) == 1
     data = pb.VIMapMetadata(files=[pb.FileTypeWithPath(path="a")]).SerializeToString()
     assert estimate(data, pb.VIMapMetadata.DESCRIPTOR) > 0
     assert estimate(bytearray(data), pb.VIMapMetadata.DESCRIPTOR) > 0
     assert list(count_parts.signatures) == signatures
-    assert compile_scan in _jobs().values()

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import time
 
-from maplab_py.algorithms.warmup import compile_kernels
 from maplab_py.compilation import is_missing_on_disk
 from maplab_py.estimation.codegen.modules import is_generated
 from maplab_py.progress import SILENT
-from maplab_py.simulation.warmup import RENDERING, compile_rendering
 from maplab_py.vision.pose_kernels import search_poses
 from maplab_py.vision.search_kernels import search_cells
+from maplab_py.warmup import compile_kernels
 
 
 def compiled_ahead() -> str:
@@ -20,5 +19,5 @@ def compiled_ahead() -> str:
     if is_generated("visual") and has_searches:
         return ""
     began = time.perf_counter()
-    compile_kernels(SILENT, {RENDERING: compile_rendering})
+    compile_kernels(SILENT)
     return f"compiled the kernels in {time.perf_counter() - began:.0f} s"

@@ -13,14 +13,13 @@ from maplab_py.vision import (
 from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.features import corner_kernels
 from maplab_py.vision.tracking import tracker, two_point_kernels
-from maplab_py.vision.warmup import SEARCH, pose_job, vision_jobs
+from maplab_py.warmup import jobs
 from tests.vision.tracking.rendered import pose, stereo
 
 
 def compile_usual_kernels():
-    jobs = vision_jobs()
-    jobs[SEARCH]()
-    jobs[pose_job(HYPOTHESES[0])]()
+    jobs()["descriptor search"]()
+    jobs()[f"absolute pose by {HYPOTHESES[0]}"]()
 
 
 def test_warmup_compiles_every_kernel_that_place_recognition_calls():
@@ -38,7 +37,7 @@ def test_warmup_compiles_every_kernel_that_place_recognition_calls():
 
 
 def test_warmup_compiles_the_search_of_numbers():
-    vision_jobs()["descriptors of numbers"]()
+    jobs()["descriptors of numbers"]()
     for kernel in (search_kernels.search_all, search_kernels.search_cells):
         words = {
             str(signature[-5 if kernel is search_kernels.search_all else 1])

@@ -65,12 +65,6 @@ CONSOLE_FLAGS = {
             "advice", BOOL, True, "After a command, one line on what to do next where it is known"
         ),
         Flag(
-            "compile_ahead",
-            BOOL,
-            True,
-            "At the prompt, compile the kernels of the map's cameras while nothing else runs",
-        ),
-        Flag(
             "complete_while_typing",
             BOOL,
             False,

@@ -6,10 +6,9 @@ import dataclasses
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from types import ModuleType
-from typing import Any
 
 from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
 from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
@@ -20,7 +19,6 @@ ENTRY_POINT_GROUP = "maplab_py.plugins"
 PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
 ALWAYS_LOADED = "console"
 BUILT_IN = "maplab_plugins."
-PROMPT_WATCHER_ATTRIBUTE = "__maplab_prompt_watcher__"
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +41,6 @@ class Registry:
     def __init__(self) -> None:
         """Start without any command."""
         self.plugins: list[Plugin] = []
-        self.prompt_watchers: dict[str, Callable[[Any], Any]] = {}  # see session.watchers
         self._commands: dict[str, Command] = {}
         self._owners: dict[str, Plugin] = {}
 
@@ -110,9 +107,6 @@ class Registry:
     def add_module(self, module: ModuleType, plugin: Plugin) -> None:
         """Register the commands that a module or package defines (not those it only imports)."""
         for value in list(vars(module).values()):
-            watcher = getattr(value, PROMPT_WATCHER_ATTRIBUTE, None)
-            if isinstance(watcher, str):
-                self.prompt_watchers.setdefault(watcher, value)
             command = getattr(value, COMMAND_ATTRIBUTE, None)
             if not isinstance(command, Command) or isinstance(value, type):
                 continue

@@ -186,8 +186,6 @@ def run_prompt(runner: Runner, first_line: str = "") -> Status:
     session.jobs.on_finish = runner.tell_of_job
     for problem in session.registry.problems:
         runner.terminal.warning(problem)
-    for name, make_watcher in session.registry.prompt_watchers.items():
-        session.watchers.set(name, make_watcher(session))
     try:
         if first_line:
             _run_line(runner, first_line)

@@ -7,12 +7,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
-from maplab_py.console.commands.registry import PROMPT_WATCHER_ATTRIBUTE
 from maplab_py.console.session.log import log_path
 from maplab_py.console.session.maps import MapManager
 
 if TYPE_CHECKING:
-    from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
 
 logger = logging.getLogger(__name__)
@@ -39,25 +37,6 @@ class LineWatcher(Protocol):
 
     def after_line(self, line: str, *, succeeded: bool) -> None:
         """Observe a line whose reports have been shown."""
-
-
-MakeWatcher = Callable[["Session"], Watcher]
-
-
-def prompt_watcher(name: str) -> Callable[[MakeWatcher], MakeWatcher]:
-    """Mark the function of a plugin that makes a watcher for a session at the prompt.
-
-    Scripts and Python programs do not have it.
-
-    Args:
-        name: Name of the watcher in `Session.watchers`.
-    """
-
-    def mark(make: MakeWatcher) -> MakeWatcher:
-        setattr(make, PROMPT_WATCHER_ATTRIBUTE, name)
-        return make
-
-    return mark
 
 
 class Watchers:

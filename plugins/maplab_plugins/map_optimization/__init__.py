@@ -1,6 +1,6 @@
-"""Commands that optimise the selected map, and what compiles their kernels ahead of time."""
+"""Commands that optimise the selected map, and `warmup`."""
 
-from maplab_plugins.map_optimization.compilation import compile_ahead, warmup
+from maplab_plugins.map_optimization.compilation import warmup
 from maplab_plugins.map_optimization.optimization import optimize_visual, optimize_visual_inertial
 
-__all__ = ["compile_ahead", "optimize_visual", "optimize_visual_inertial", "warmup"]
+__all__ = ["optimize_visual", "optimize_visual_inertial", "warmup"]

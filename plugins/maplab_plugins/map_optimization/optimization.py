@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from maplab_plugins.map_optimization.compilation import wait_for_kernels
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
@@ -43,7 +42,6 @@ def _optimize(
 ) -> VIOptimizationReport:
     from maplab_py.algorithms.vi_optimization.optimization import optimize
 
-    wait_for_kernels(context)
     result, report = optimize(
         context.vi_map,
         options,

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.landmarks.sightings import rays_in_G, residuals
-from maplab_py.algorithms.rig_warmup import RigKernels
 from maplab_py.algorithms.self_calibration.calibration import calibrate
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.vi_optimization.map_problem import build
@@ -92,7 +91,6 @@ def test_known_line_delays_need_no_other_kernels(exact: SimulatedData) -> None:
     assert still.problem.visual is not None
     assert not still.problem.visual.refresh(still.states)
     assert np.median(still.problem.visual.errors(still.states)[0]) > 1.0
-    assert [RigKernels.of_map(m).moving for m in (vi_map, still.vi_map)] == [True, False]
 
 
 def test_line_delays_survive_the_files_of_a_map(exact: SimulatedData, tmp_path: Any) -> None:
