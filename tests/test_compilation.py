@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.compilation import target_processor
+from maplab_py.compilation import BUILT_WITH, built_with, target_processor
 
 INNER = """
 from typing import NamedTuple
@@ -166,3 +167,37 @@ def test_no_writable_cache_means_compiling_again(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert run(tmp_path, tmp_path / "file" / "cache") == ["49.0", "0"]
     assert run(tmp_path, tmp_path / "file" / "cache") == ["49.0", "0"]
+
+
+PACKAGED = """
+from pathlib import Path
+from maplab_py import compilation, kernel_cache
+compilation.PACKAGED = Path({folder!r})
+kernel_cache.tell_user = print
+import maplab_py_outer
+value = maplab_py_outer.squared(3.0)
+print(value, sum(maplab_py_outer.squared.stats.cache_hits.values()))
+"""
+
+
+def test_kernels_of_the_package_come_first_and_one_line_says_why_they_do_not_fit(
+    tmp_path: Path,
+) -> None:
+    write(tmp_path)
+    (tmp_path / "outer.py").rename(tmp_path / "maplab_py_outer.py")
+    packaged, cache = tmp_path / "_kernels", tmp_path / "cache"
+    program = PACKAGED.format(folder=str(packaged))
+    assert run(tmp_path, packaged, program) == ["49.0", "0"]  # as the build of a wheel compiles
+    described = tmp_path / "_kernels" / BUILT_WITH
+    described.write_text(json.dumps({**built_with(), "processor": "x86-64-v2, x86-64-v3, generic"}))
+    assert run(tmp_path, cache, program) == ["49.0", "1"]
+    assert list((cache / "code").iterdir()) == []
+    shutil.rmtree(packaged / "code")
+    assert run(tmp_path, cache, program)[-2:] == ["49.0", "0"]  # silent, as no reason is known
+    described.write_text(json.dumps({**built_with(), "numba": "0.1", "processor": "x86-64-v9"}))
+    shutil.rmtree(cache)
+    words = " ".join(run(tmp_path, cache, program))
+    assert words.count("the installed kernels were compiled with") == 1
+    assert "numba 0.1, not" in words
+    assert "processor x86-64-v9, not" in words
+    assert words.endswith("49.0 0")
