@@ -21,7 +21,17 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-_NEEDED = ("casadi", "numba", "numpy", "opencv-python-headless", "protobuf", "pyyaml", "scipy")
+_NEEDED = (
+    "casadi",
+    "numba",
+    "numpy",
+    "opencv-python-headless",
+    "protobuf",
+    "pymetis",
+    "pyyaml",
+    "scipy",
+    "threadpoolctl",
+)
 """Packages that the compilation of kernels imports."""
 
 
