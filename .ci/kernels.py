@@ -27,7 +27,6 @@ _NEEDED = (
     "numpy",
     "opencv-python-headless",
     "protobuf",
-    "pymetis",
     "pyyaml",
     "scipy",
     "threadpoolctl",
