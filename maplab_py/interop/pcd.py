@@ -40,8 +40,9 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
         if form == "binary":
             table = np.frombuffer(data, dtype=dtype, count=count, offset=begin)
         else:
-            table = _from_text(data[begin:], dtype, count)
-    except ValueError as error:
+            with np.errstate(invalid="raise", over="raise"):  # numbers that do not fit their type
+                table = _from_text(data[begin:], dtype, count)
+    except (ValueError, FloatingPointError) as error:
         raise MapError(f"{source}: the PCD data end early or do not fit ({error})") from None
     p = np.stack([table[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
     valid = np.isfinite(p).all(axis=1)

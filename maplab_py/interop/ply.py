@@ -74,10 +74,11 @@ def parse_ply(data: bytes, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> P
     body = memoryview(data)[begin:]
     try:
         if order == "=":
-            vertices, faces = _read_ascii(body, elements)
+            with np.errstate(invalid="raise", over="raise"):  # numbers that do not fit their type
+                vertices, faces = _read_ascii(body, elements)
         else:
             vertices, faces = _read_binary(body, elements, order)
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, ArithmeticError) as error:
         raise MapError(f"{source}: the PLY data end early or do not fit ({error})") from None
     if vertices is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise MapError(f"{source}: the PLY file has no vertices with x, y, z")

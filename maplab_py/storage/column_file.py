@@ -107,11 +107,12 @@ def read_columns(path: Path, facts: Mapping[str, Any]) -> tuple[VIMap, dict[str,
         UnusableColumns: The file is not what `write_columns` has written for these facts.
         OSError: It cannot be read.
     """
-    header, data = _opened(path)
-    differing = [name for name, value in facts.items() if header["facts"].get(name) != value]
-    if differing:
-        raise UnusableColumns(f"it was written for another {differing[0]}")
     try:
+        header, data = _opened(path)
+        written_for = dict(header["facts"])
+        differing = [name for name, value in facts.items() if written_for.get(name) != value]
+        if differing:
+            raise UnusableColumns(f"it was written for another {differing[0]}")
         places = [_Place(n, d, tuple(s), o, c) for n, d, s, o, c in header["columns"]]
         columns = {place.name: _column(data, place) for place in places}
         wrong = [
@@ -121,8 +122,8 @@ def read_columns(path: Path, facts: Mapping[str, Any]) -> tuple[VIMap, dict[str,
         ]
         if wrong:
             raise UnusableColumns(f"{wrong[0]} does not have its checksum")
-        return _map_of(columns), header["facts"]
-    except (ValueError, TypeError, KeyError) as error:
+        return _map_of(columns), written_for
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise UnusableColumns(f"its columns do not make a map ({error})") from error
 
 

@@ -7,51 +7,13 @@ tests/fuzz/findings/READER once it is mended.
 from __future__ import annotations
 
 import argparse
+import random
 import sys
 import tempfile
 from pathlib import Path
 
 import maplab_py
-
-_WORDS = (
-    *(
-        "nan",
-        "inf",
-        "-1",
-        "0",
-        "1e308",
-        "1e400",
-        "9223372036854775808",
-        "-9223372036854775809",
-        "0x1",
-    ),
-    *(
-        "null",
-        "true",
-        "[",
-        "]",
-        "[]",
-        "{",
-        "}",
-        "{}",
-        ": ",
-        "- ",
-        "&a ",
-        "*a",
-        "!!",
-        "---\\x0a",
-        "\\x0a",
-    ),
-    *(
-        "\\x00",
-        "\\xff\\xff\\xff\\xff",
-        "\\xff\\xff\\xff\\xff\\xff\\xff\\xff\\x7f",
-        ",",
-        ";",
-        "\\x09",
-    ),
-)
-"""Pieces that mutations put in, in libFuzzer's notation."""
+from tests.fuzz.mutations import mutated
 
 
 def _compiled_modules() -> list[str]:
@@ -83,18 +45,28 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     for row, seed in enumerate(reader.seeds(home / "seeds")):
         (corpus / f"seed_{row}").write_bytes(seed)
-    words = home / "words"
-    words.write_text("".join(f'"{word}"\n' for word in _WORDS))
     longest = 2 * max(path.stat().st_size for path in corpus.iterdir())
     arguments = [
         f"-max_total_time={options.seconds}",
         f"-max_len={max(longest, 4096)}",
         *("-timeout=30", "-rss_limit_mb=4000", "-print_final_stats=1", "-len_control=0"),
-        f"-dict={words}",
         f"-artifact_prefix={corpus.parent}/",
         str(corpus),
     ]
-    atheris.Setup([sys.argv[0], *arguments], lambda data: check(reader, home / "work", data))
+
+    def mutate(data: bytes, max_size: int, seed: int) -> bytes:
+        rng = random.Random(seed)
+        if rng.random() < 0.3:
+            return bytes(atheris.Mutate(data, max_size))
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            data = mutated(rng, data)
+        return data[:max_size]
+
+    atheris.Setup(
+        [sys.argv[0], *arguments],
+        lambda data: check(reader, home / "work", data),
+        custom_mutator=mutate,
+    )
     atheris.Fuzz()
 
 

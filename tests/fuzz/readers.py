@@ -278,21 +278,20 @@ def _read_database(folder: Path, data: bytes) -> None:
     path.write_bytes(data)
     database = ColmapDatabase(path)
     try:
-        for name, count in _images_of(path):
-            database.features(name, count)
+        for name, uv in _keypoints_of(_prepared(folder, "database", _database_seeds)):
+            database.features(name, uv)
     finally:
         database.close()
 
 
-def _images_of(path: Path) -> list[tuple[str, int]]:
-    """Return the names of images and their numbers of keypoints, as far as they can be told."""
-    query = "SELECT name, rows FROM images JOIN keypoints USING (image_id)"
-    with (
-        contextlib.suppress(sqlite3.Error),
-        contextlib.closing(sqlite3.connect(path)) as connection,
-    ):
-        return [(str(name), rows) for name, rows in connection.execute(query)][:3]
-    return [("1.png", 0)]
+def _keypoints_of(folder: Path) -> list[tuple[str, np.ndarray]]:
+    """Return the names and keypoints (K, 2) of the first images of a valid database."""
+    query = "SELECT name, rows, cols, data FROM images JOIN keypoints USING (image_id) WHERE rows > 0 LIMIT 3"
+    with contextlib.closing(sqlite3.connect(folder / "db" / "database.db")) as connection:
+        return [
+            (name, np.frombuffer(data, "<f4").reshape(rows, cols)[:, :2].astype(np.float64))
+            for name, rows, cols, data in connection.execute(query)
+        ]
 
 
 def _prepared(folder: Path, name: str, make: Callable[[Path], object]) -> Path:

@@ -9,36 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz.mutations import mutated
 from tests.fuzz.readers import READERS, check
 
 FINDINGS = Path(__file__).parent / "findings"
-_MUTATIONS = 4
-_WORDS = (
-    b"nan",
-    b"-1",
-    b"1e400",
-    b"999999999999999999999",
-    b"\xff\xff\xff\xff",
-    b"\0" * 8,
-    b"{",
-    b"\n",
-)
-
-
-def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Return data with one piece cut, repeated, exchanged or overwritten; the first byte stays."""
-    if len(data) < 3:
-        return data
-    a, b = sorted(rng.sample(range(1, len(data)), 2))
-    b = min(b, a + 64)
-    kind = rng.randrange(4)
-    if kind == 0:
-        return data[:a] + data[b:]
-    if kind == 1:
-        return data[:b] + data[a:]
-    if kind == 2:
-        return data[:a]
-    return data[:a] + rng.choice(_WORDS) + data[min(b, a + 8) :]
+_MUTATIONS = 8
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -35,6 +35,10 @@ class ImageFeatures:
     agreement: str = ""  # of the keypoints with those of the model: "", SCALED or UNDISTORTED
 
 
+_LARGEST_KEYPOINT = 1e7
+"""Of pixels and scales; a file that is damaged has others, and numbers that are none."""
+
+
 class ColmapDatabase:
     """A database, opened for reading only."""
 
@@ -77,6 +81,8 @@ class ColmapDatabase:
             raise MapError(f"{self.path}: has no image {name}: name the database of this model")
         rows, columns, data = self._row("keypoints", "rows, cols, data", image) or (0, 2, b"")
         values = self._array(data, rows, columns, np.dtype("<f4"), name).astype(np.float64)
+        if columns < 2 or not (np.abs(values) < _LARGEST_KEYPOINT).all():
+            raise self._damaged(f"the keypoints of image {name} are no pixels")
         if rows != count:
             raise MapError(
                 f"{self.path}: image {name} has {rows} keypoints, and {count} in the model: name the "
@@ -115,6 +121,8 @@ class ColmapDatabase:
             row: tuple[int, ...] | None = self._connection.execute(query, (image,)).fetchone()
         except sqlite3.Error as error:
             raise self._damaged(str(error)) from error
+        if row is not None and not all(isinstance(value, int) for value in row[:-1]):
+            raise self._damaged(f"{table} of image {image} have no sizes")
         return row
 
     def _array(
