@@ -34,6 +34,10 @@ _OUT_OF_PLANE = 1e4
 _PLANAR = np.array([0, 1, 5])
 
 
+_LARGEST = 1e100
+"""Of poses and information: squares of larger values overflow."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses and measurements between them; planar files are read as graphs in the plane z = 0."""
@@ -168,8 +172,11 @@ def _numbers(
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(wrong):
         raise MapError(f"{path}:{lines[wrong[0]][0]}: a value is not a finite number")
+    wrong = np.flatnonzero((np.abs(values) > _LARGEST).any(axis=1))
+    if len(wrong):
+        raise MapError(f"{path}:{lines[wrong[0]][0]}: a value is beyond {_LARGEST:g}")
     if kind in (_POSE, _EDGE):
-        wrong = np.flatnonzero(~values[:, 3:7].any(axis=1))
+        wrong = np.flatnonzero(np.abs(values[:, 3:7]).max(axis=1, initial=0.0) < 1.0 / _LARGEST)
         if len(wrong):
             raise MapError(f"{path}:{lines[wrong[0]][0]}: the quaternion is zero")
     return _ids(lines, ids, path).reshape(-1, ids), values

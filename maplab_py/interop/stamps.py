@@ -171,7 +171,9 @@ class _Numbers:
         self._tokens, self._source, self._lines = tokens, source, lines
         self._digits, self._magnitude = 0, 0
         joined = "".join(tokens)
-        if joined.isascii() and joined.isdecimal() and max(map(len, tokens)) <= _INT64_DIGITS:
+        widths = [len(token) for token in tokens]
+        is_whole = joined.isascii() and joined.isdecimal() and min(widths) > 0
+        if is_whole and max(widths) <= _INT64_DIGITS:
             unsigned = np.array(tokens, dtype=np.str_).astype(np.uint64)
             if unsigned.max() >= 1 << 63:
                 row = int(np.argmax(unsigned))
