@@ -111,13 +111,13 @@ def _start(arguments: Arguments, terminal: ConsoleTerminal) -> Status:
     if arguments.mode == "command":
         status = runner.run_words(arguments.words)
     elif arguments.mode == "commands":
-        status = runner.run_text(arguments.text, keep_going=arguments.keep_going)
+        status = runner.run_script(arguments.text, keep_going=arguments.keep_going)
     elif arguments.mode == "run":
         texts = [read_script(path) for path in arguments.files]
-        status = runner.run_text("\n".join(texts), keep_going=arguments.keep_going)
+        status = runner.run_script("\n".join(texts), keep_going=arguments.keep_going)
     else:
-        status = runner.run_text(sys.stdin.read(), keep_going=arguments.keep_going)
-    return status or runner.finish(discard=arguments.discard)
+        status = runner.run_script(sys.stdin.read(), keep_going=arguments.keep_going)
+    return runner.finish(status, discard=arguments.discard)
 
 
 def make_runner(arguments: Arguments, terminal: ConsoleTerminal, registry: Registry) -> Runner:

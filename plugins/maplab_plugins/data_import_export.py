@@ -244,6 +244,7 @@ def export_mission_info(
     example="recording_info MH_01_easy --check_images",
     see_also=("simulate",),
     needs_map=False,
+    reads=("recording",),
 )
 def recording_info(
     context: CommandContext,

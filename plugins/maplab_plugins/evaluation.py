@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     example="evaluate_trajectory --ground_truth=V1_01_easy.csv --alignment=se3",
     see_also=("export_trajectory_to_csv",),
     completes={"baseline": "snapshot"},
+    reads=("ground_truth",),
 )
 def evaluate_trajectory(
     context: CommandContext,
@@ -106,6 +107,7 @@ def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport
     example="evaluate_localization --localization_csv=vil.csv --ground_truth=V1_01_easy.csv",
     needs_map=False,
     see_also=("rovioli", "localize", "evaluate_trajectory"),
+    reads=("ground_truth",),
 )
 def evaluate_localization(
     context: CommandContext,

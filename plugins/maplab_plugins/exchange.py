@@ -104,6 +104,7 @@ class CalibrationImport(Report):
     see_also=("export_calibration", "apply_calibration", "recording_info"),
     needs_map=False,
     writes_files=True,
+    reads=("calibration_file",),
 )
 def import_calibration(
     context: CommandContext,
@@ -232,6 +233,7 @@ def _imu_parameters(imu: Imu | None) -> Iterator[ReadParameter]:
     example="import_trajectory poses.csv --as=absolute --map_mission=59f0",
     see_also=("export_trajectory_to_csv", "evaluate_trajectory", "optimize_visual_inertial"),
     needs_map=False,
+    reads=("trajectory_file",),
 )
 def import_trajectory(
     context: CommandContext,
@@ -331,6 +333,7 @@ def _new_mission(
     "import_gps",
     example="import_gps track.csv --map_mission=59f0 --gps_lever_arm_m=0.1,0,0.3",
     see_also=("import_trajectory", "optimize_visual_inertial"),
+    reads=("gps_file",),
 )
 def import_gps(
     context: CommandContext,
@@ -375,6 +378,7 @@ def import_gps(
     "import_wheel_odometry",
     example="import_wheel_odometry wheels.csv --map_mission=59f0 --wheel_position_m=-0.2,0,-0.3",
     see_also=("import_trajectory", "optimize_visual_inertial"),
+    reads=("wheel_file",),
 )
 def import_wheel_odometry(
     context: CommandContext,

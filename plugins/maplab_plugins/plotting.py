@@ -64,6 +64,7 @@ def plot_trajectory(
     example="plot_errors --ground_truth=V1_01_easy.csv --plot_file=errors.png",
     see_also=("evaluate_trajectory",),
     writes_files=True,
+    reads=("ground_truth",),
 )
 def plot_errors(
     context: CommandContext,

@@ -48,7 +48,13 @@ def relax_external(
     return dataclasses.replace(report, notes=(*notes, *report.notes))
 
 
-@command("import_g2o", example="import_g2o graph.g2o", needs_map=False, see_also=("export_g2o",))
+@command(
+    "import_g2o",
+    example="import_g2o graph.g2o",
+    needs_map=False,
+    see_also=("export_g2o",),
+    reads=("file",),
+)
 def import_g2o(context: CommandContext, file: Path, *, map_key: str = "") -> Message:
     """Make a map of a pose graph: odometry along each robot, every other edge a loop closure.
 

@@ -20,6 +20,7 @@ _DEPTH = DepthImportOptions()
     "import_images",
     example="import_images images_of_v1_01 --map_mission=59f0",
     see_also=("export_images", "resource_statistics"),
+    reads=("dataset_folder",),
 )
 def import_images(
     context: CommandContext,
@@ -92,6 +93,7 @@ def export_images(
     "import_depth_maps",
     example="import_depth_maps depth_of_v1_01 --map_mission=59f0",
     see_also=("import_images", "resource_statistics"),
+    reads=("depth_folder",),
 )
 def import_depth_maps(
     context: CommandContext,
@@ -129,6 +131,7 @@ def import_depth_maps(
     "import_point_clouds",
     example="import_point_clouds clouds_of_v1_01 --map_mission=59f0 --sensor_id=5c1a",
     see_also=("visualize_xyz_pointclouds", "resource_statistics"),
+    reads=("point_cloud_folder",),
 )
 def import_point_clouds(
     context: CommandContext,

@@ -131,6 +131,7 @@ def export_mcap(
     example="bag_info walk.bag",
     see_also=("recording_info", "export_bag", "pose_to_bag"),
     needs_map=False,
+    reads=("bag",),
 )
 def bag_info(context: CommandContext, bag: Path) -> BagInfo:
     """List the topics of a ROS bag: types, numbers of messages, begin, duration, rate.
@@ -150,6 +151,7 @@ def bag_info(context: CommandContext, bag: Path) -> BagInfo:
     example="import_bag_resources images_of_v1_01.bag --resource_topic=/cam0/image_raw --camera=0 "
     "--map_mission=59f0",
     see_also=("bag_info", "import_images", "import_depth_maps", "import_point_clouds"),
+    reads=("rosbag_path",),
 )
 def import_bag_resources(
     context: CommandContext,

@@ -151,6 +151,7 @@ def collect_segments(
     "segment_database_stats",
     example="segment_database_stats --database=device.segments",
     needs_map=False,
+    reads=("database",),
 )
 def segment_database_stats(
     context: CommandContext,  # noqa: ARG001
@@ -175,6 +176,7 @@ def segment_database_stats(
     needs_map=False,
     see_also=("segment_database_stats",),
     writes_files=True,
+    reads=("database",),
 )
 def prune_segments(
     context: CommandContext,
@@ -306,6 +308,7 @@ def evaluate_segment_information(
     "apply_calibration",
     example="apply_calibration --calibration=sensors.yaml",
     see_also=("compare_calibrations", "export_calibration"),
+    reads=("calibration",),
 )
 def apply_calibration(
     context: CommandContext,
@@ -371,6 +374,7 @@ def export_calibration(
     "compare_calibrations",
     example="compare_calibrations --calibration=sensors.yaml",
     see_also=("apply_calibration",),
+    reads=("calibration",),
 )
 def compare_calibrations(
     context: CommandContext,

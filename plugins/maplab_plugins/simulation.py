@@ -64,7 +64,12 @@ def simulate(
     )
 
 
-@command("evaluate_map", example="evaluate_map --truth=simulated/truth.npz", see_also=("simulate",))
+@command(
+    "evaluate_map",
+    example="evaluate_map --truth=simulated/truth.npz",
+    see_also=("simulate",),
+    reads=("truth",),
+)
 def evaluate_map(context: CommandContext, *, truth: Path) -> MapErrors:
     """Compare the selected map with the truth of its simulation.
 

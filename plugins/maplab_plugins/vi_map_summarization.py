@@ -69,6 +69,7 @@ def generate_summary_map_and_save_to_disk(
     example="print_summary_map office_summary",
     needs_map=False,
     see_also=("generate_summary_map_and_save_to_disk",),
+    reads=("summary_map",),
 )
 def print_summary_map(
     context: CommandContext,  # noqa: ARG001

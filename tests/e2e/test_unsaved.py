@@ -81,7 +81,7 @@ def test_a_script_fails_with_unsaved_changes(tmp_path: Path, with_plugin: dict[s
     script = "create_new_map a; add_mission"
     done = run_program(tmp_path, "-c", script, extra=with_plugin)
     assert done.returncode == 2
-    assert "unsaved changes are lost: a (save them, or give --discard)" in done.stderr
+    assert "unsaved changes: a (kept in " in done.stderr
     assert run_program(tmp_path, "-c", script, "--discard", extra=with_plugin).returncode == 0
 
 

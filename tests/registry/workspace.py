@@ -57,6 +57,7 @@ PREPARED = {
     "rovioli": "",
     "cancel": "",
     "load": "",
+    "recover": "",
     "load_all": "",
     "load_merge_all_maps": "",
     "load_merge_all_submaps": "",

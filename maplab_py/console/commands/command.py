@@ -45,6 +45,7 @@ class Command:
     guards_effects: bool = False  # acts outside only inside `lasting_effect()`
     obeys_dry_run: bool = False  # acts outside, but not where `context.is_trial` is set
     completes: Mapping[str, ValueSource] = dataclasses.field(default_factory=dict)  # by flag
+    reads: tuple[str, ...] = ()  # flags that name files or folders which must exist
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,6 +89,7 @@ def command(
     guards_effects: bool = False,
     obeys_dry_run: bool = False,
     completes: Mapping[str, ValueSource] | None = None,
+    reads: tuple[str, ...] = (),
 ) -> Callable[[FunctionT], FunctionT]:
     """Register a function as a command of the console; the function is unchanged.
 
@@ -115,6 +117,8 @@ def command(
         completes: Values that the prompt proposes, by flag: "snapshot", "job", "alias", "map",
             "mission", "command", or a function of the session that returns pairs of a value and a
             note on it.
+        reads: Flags that name files or folders which must exist. A script is not started when one is
+            missing that no command before it can have made.
 
     Raises:
         TypeError: The signature cannot be a command: a type that no flag can have, or the same
@@ -135,6 +139,7 @@ def command(
             guards_effects=guards_effects,
             obeys_dry_run=obeys_dry_run,
             completes=dict(completes or {}),
+            reads=reads,
         )
         setattr(function, COMMAND_ATTRIBUTE, described)
         return function

@@ -120,8 +120,8 @@ def run_batch(
         runner = make_runner()
         runner.terminal.note(f"map folder {folder}")
         text = "\n".join(batch.commands).replace(FOLDER_TEMPLATE, escaped(folder))
-        status = runner.run_text(text, keep_going=keep_going)
-        status = status or runner.finish(discard=discard)
+        status = runner.run_script(text, keep_going=keep_going)
+        status = runner.finish(status, discard=discard)
         runner.session.watchers.close()
         failed += status != Status.OK
         first = first or status

@@ -16,6 +16,8 @@ from maplab_py.cancellation import CancelToken
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.scripts.aliases import expanded
+from maplab_py.console.scripts.checking import LEAVE, check_commands
+from maplab_py.console.scripts.rescue import rescue_unsaved
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
 from maplab_py.console.session.session import Session
@@ -25,7 +27,6 @@ from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import UserError
 from maplab_py.report import Report
 
-LEAVE = ("q", "quit", "exit")
 _MAX_ALIAS_DEPTH = 8
 _INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
 """Exit codes of a shell command after Ctrl-C: by the signal, or by a shell that reports it."""
@@ -76,25 +77,49 @@ class Runner:
             self.terminal.error(f"{len(failed)} of {len(commands)} commands failed:{lines}")
         return first
 
+    def run_script(self, text: str, *, keep_going: bool = False) -> Status:
+        """Run the commands of a text as `run_text`, after all of them have been checked.
+
+        A text with an error is not started, unless the commands after a failure shall run anyway.
+        """
+        problems = [] if keep_going else check_commands(text, self.session)
+        for problem in problems:
+            self.terminal.failed(problem, "", int(Status.USER_ERROR))
+        if problems:
+            return Status.USER_ERROR
+        return self.run_text(text, keep_going=keep_going)
+
     def run_words(self, words: Sequence[str]) -> Status:
         """Run one command and return its status."""
         return self._run(TypedCommand(" ".join(words), list(words)))
 
-    def finish(self, *, discard: bool) -> Status:
-        """End a script: wait for its jobs, then say which maps have changes that are on no disk."""
-        status = Status.OK
-        for job in self.session.jobs.jobs:
-            if not job.was_told:
-                status = status or self.run_words(["join", str(job.number)])
-        return status or self.check_unsaved(discard=discard)
+    def finish(self, status: Status = Status.OK, *, discard: bool) -> Status:
+        """End a script: wait for its jobs, then keep and name the maps whose changes are on no disk.
 
-    def check_unsaved(self, *, discard: bool) -> Status:
-        """Say at the end of a script which maps have changes that are on no disk."""
+        Args:
+            status: Status of the script so far.
+            discard: Changes may be lost.
+
+        Returns:
+            The status, or that of a user's error when a script that went well leaves changes unsaved.
+        """
+        for job in self.session.jobs.jobs:
+            if not status and not job.was_told:
+                status = self.run_words(["join", str(job.number)])
         unsaved = ", ".join(entry.key for entry in self.session.maps.unsaved)
         if not unsaved or discard:
-            return Status.OK
-        self.terminal.error(f"unsaved changes are lost: {unsaved} (save them, or give --discard)")
-        return Status.USER_ERROR
+            return status
+        try:
+            run = rescue_unsaved(self.session)
+        except Exception as error:
+            logger.exception("rescue")
+            self.terminal.error(f"unsaved changes are lost: {unsaved} ({describe(error)})")
+            return status or Status.USER_ERROR
+        self.terminal.error(
+            f"unsaved changes: {unsaved} (kept in {run}: maplab recover; else save them in the script, "
+            "or give --discard)"
+        )
+        return status or Status.USER_ERROR
 
     def report_error(
         self, command: str, error: BaseException, *, has_effects: bool = False

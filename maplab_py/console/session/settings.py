@@ -43,6 +43,12 @@ class Settings:
         self._registry = registry
         self._layers: dict[Layer, dict[str, Setting]] = {layer: {} for layer in Layer}
 
+    def copy(self) -> Settings:
+        """Return settings of the same values that change independently."""
+        result = Settings(self._registry)
+        result._layers = {layer: dict(settings) for layer, settings in self._layers.items()}
+        return result
+
     def current(self) -> dict[str, Setting]:
         """Return the winning setting of every flag that has one."""
         merged: dict[str, Setting] = {}

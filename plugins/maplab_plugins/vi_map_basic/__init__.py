@@ -17,6 +17,7 @@ from maplab_plugins.vi_map_basic.loading import (
     load_merge_all_submaps,
     load_merge_map,
     load_merge_submap,
+    recover,
 )
 from maplab_plugins.vi_map_basic.memory import (
     clear_storage,
@@ -68,6 +69,7 @@ __all__ = [
     "mission_coobservability_stats",
     "print_baseframes",
     "print_camera_calibrations",
+    "recover",
     "redo",
     "remove_resources",
     "rename_map",

@@ -123,7 +123,12 @@ class ReadingOptions(CacheOptions, SizeOptions):
 _READING = ReadingOptions()
 
 
-@command("list_maps_on_file_system", example="list_maps_on_file_system maps", needs_map=False)
+@command(
+    "list_maps_on_file_system",
+    example="list_maps_on_file_system maps",
+    needs_map=False,
+    reads=("maps_folder",),
+)
 def list_maps_on_file_system(
     context: CommandContext,  # noqa: ARG001
     maps_folder: Path,
@@ -136,7 +141,7 @@ def list_maps_on_file_system(
     return FolderList(maps_folder, tuple(str(p) for p in _folders_below(maps_folder)))
 
 
-@command("load", example="load --map_folder=maps/v1_01", needs_map=False)
+@command("load", example="load --map_folder=maps/v1_01", needs_map=False, reads=("map_folder",))
 def load(
     context: CommandContext,
     map_folder: Path,
@@ -170,10 +175,41 @@ def load(
         vi_map = with_new_ids(vi_map)
     is_saved = not (assign_new_ids or reading.repair)
     context.maps.add(key, vi_map, folder=map_folder, is_saved=is_saved, disk_copy=before)
-    return LoadedMaps((_load(key, vi_map, map_folder),), (report,))
+    return LoadedMaps((_describe(key, vi_map, map_folder),), (report,))
 
 
-@command("load_all", example="load_all --maps_folder=maps", needs_map=False)
+@command(
+    "recover",
+    example="recover",
+    needs_map=False,
+    see_also=("load", "save"),
+)
+def recover(context: CommandContext, run: str = "") -> LoadedMaps:
+    """Load the maps that the latest failed script left unsaved; save them where they shall stay.
+
+    The maps of the last five such scripts are kept.
+
+    Args:
+        run: Name of an earlier script's folder, as the error said; empty = the latest.
+    """
+    from maplab_py.console.scripts.rescue import rescue_folder, rescued_runs
+    from maplab_py.storage.native import find_maps, load_map
+
+    runs = [path for path in rescued_runs() if run in ("", path.name, str(path))]
+    if not runs:
+        wanted = f"no script '{run}'" if run else "no script"
+        raise UserError(f"recover: {wanted} has left unsaved maps in {rescue_folder()}")
+    maps, reports = [], []
+    for folder in find_maps(runs[-1]):
+        vi_map, report = load_map(folder, progress=context.progress)
+        key = context.maps.check_new_key(folder.name)
+        context.maps.add(key, vi_map, is_saved=False)
+        maps.append(_describe(key, vi_map, folder))
+        reports.append(report)
+    return LoadedMaps(tuple(maps), tuple(reports))
+
+
+@command("load_all", example="load_all --maps_folder=maps", needs_map=False, reads=("maps_folder",))
 def load_all(
     context: CommandContext,
     maps_folder: Path,
@@ -204,11 +240,16 @@ def load_all(
     for key, copy, folder, (vi_map, _) in zip(keys, before, folders, loaded, strict=True):
         value = with_new_ids(vi_map) if assign_new_ids else vi_map
         context.maps.add(key, value, folder=folder, is_saved=is_saved, disk_copy=copy)
-        lines.append(_load(key, value, folder))
+        lines.append(_describe(key, value, folder))
     return LoadedMaps(tuple(lines), ())
 
 
-@command("load_merge_map", example="load_merge_map --map_folder=maps/v1_02", needs_map=False)
+@command(
+    "load_merge_map",
+    example="load_merge_map --map_folder=maps/v1_02",
+    needs_map=False,
+    reads=("map_folder",),
+)
 def load_merge_map(
     context: CommandContext,
     map_folder: Path,
@@ -228,7 +269,12 @@ def load_merge_map(
     return _merge_all(context, [map_folder], key, reading, assign_new_ids=assign_new_ids)
 
 
-@command("load_merge_all_maps", example="load_merge_all_maps --maps_folder=maps", needs_map=False)
+@command(
+    "load_merge_all_maps",
+    example="load_merge_all_maps --maps_folder=maps",
+    needs_map=False,
+    reads=("maps_folder",),
+)
 def load_merge_all_maps(
     context: CommandContext,
     maps_folder: Path,
@@ -251,7 +297,12 @@ def load_merge_all_maps(
     return _merge_all(context, folders, key, reading, assign_new_ids=assign_new_ids)
 
 
-@command("load_merge_submap", example="load_merge_submap --map_folder=submap_1", needs_map=False)
+@command(
+    "load_merge_submap",
+    example="load_merge_submap --map_folder=submap_1",
+    needs_map=False,
+    reads=("map_folder",),
+)
 def load_merge_submap(
     context: CommandContext,
     map_folder: Path,
@@ -277,6 +328,7 @@ def load_merge_submap(
     "load_merge_all_submaps",
     example="load_merge_all_submaps --maps_folder=euroc_v1_01",
     needs_map=False,
+    reads=("maps_folder",),
 )
 def load_merge_all_submaps(
     context: CommandContext,
@@ -428,6 +480,6 @@ def _start_time_ns(vi_map: VIMap) -> int:
     return int(vi_map.vertices.timestamp_ns.min()) if len(vi_map.vertices) else 0
 
 
-def _load(key: str, vi_map: VIMap, folder: Path) -> LoadedMap:
+def _describe(key: str, vi_map: VIMap, folder: Path) -> LoadedMap:
     counts = len(vi_map.missions), len(vi_map.vertices), len(vi_map.landmarks)
     return LoadedMap(key, *counts, folder)

@@ -112,11 +112,12 @@ def test_help_flag_is_help_of_the_command(capsys: Capture) -> None:
 
 def test_unsaved_changes_are_an_error_unless_discarded(capsys: Capture) -> None:
     runner = make_runner()
-    assert runner.check_unsaved(discard=False) == Status.OK
+    assert runner.finish(discard=False) == Status.OK
     runner.session.maps.add("a", map_of(1))
-    assert runner.check_unsaved(discard=False) == Status.USER_ERROR
-    assert "unsaved changes are lost: a" in capsys.readouterr().err
-    assert runner.check_unsaved(discard=True) == Status.OK
+    assert runner.finish(discard=False) == Status.USER_ERROR
+    assert "unsaved changes are lost: a" in capsys.readouterr().err  # there is no command `save`
+    assert runner.finish(Status.FAILED, discard=False) == Status.FAILED
+    assert runner.finish(discard=True) == Status.OK
 
 
 def test_questions_are_answered_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,131 @@
+"""Errors of a chain of commands that can be seen before anything of it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from maplab_py.console.commands.flags import normalise
+from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
+from maplab_py.console.scripts.aliases import expanded
+from maplab_py.console.session.call import Call, call_from_words
+from maplab_py.console.session.session import Session
+from maplab_py.console.session.settings import Layer
+from maplab_py.errors import UserError
+
+LEAVE = ("q", "quit", "exit")
+_MAX_DEPTH = 8
+
+
+def check_commands(text: str, session: Session) -> list[str]:
+    """Return the errors of a text of commands, each with its place; nothing is run.
+
+    Names, flags, types, values that are missing, variables, and files and folders that a command reads and
+    that no command before it can have made.
+
+    Args:
+        text: The commands.
+        session: Gives aliases, variables and lasting flags; it does not change.
+    """
+    checker = _Checker(session)
+    checker.check(text)
+    return checker.problems
+
+
+class _Checker:
+    """Follows what earlier commands of the chain would do to variables, aliases and flags."""
+
+    def __init__(self, session: Session) -> None:
+        self.problems: list[str] = []
+        self._registry = session.registry
+        self._variables = dict(session.variables)
+        self._aliases = dict(session.aliases)
+        self._settings = session.settings.copy()
+        self._written: list[Path] = []
+        self._runs_shell = False  # a shell command can make any file
+
+    def check(self, text: str, place: str = "", depth: int = 0) -> None:
+        """Check the commands of a text; `place` is that of the alias that it stands for."""
+        try:
+            commands = typed_commands(text)
+        except UserError as error:
+            self.problems.append(_placed(str(error), place))
+            return
+        position = 0
+        for command in commands:
+            position = text.index(command.source, position)
+            where = place or (_place(text, position) if len(commands) > 1 else "")
+            try:
+                if self._check_command(command, where, depth):
+                    return
+            except UserError as error:
+                self.problems.append(_placed(str(error), where))
+            position += len(command.source)
+
+    def _check_command(self, typed: TypedCommand, place: str, depth: int) -> bool:
+        """Check one command; return whether it ends the chain."""
+        (command,) = typed_commands(typed.source, variable_lookup(self._variables))
+        if command.assignment is not None:
+            self._variables.update([command.assignment])
+            return False
+        self._runs_shell |= bool(command.shell)
+        if not command.words:
+            return False
+        if command.words[0] in LEAVE and len(command.words) == 1:
+            return True
+        alias = expanded(command, self._aliases)
+        if alias is not None:
+            if depth >= _MAX_DEPTH:
+                raise UserError(f"alias '{command.words[0]}' contains itself")
+            self.check(alias, place, depth + 1)
+            return False
+        call = call_from_words(command.words, self._registry, self._settings)
+        if not call.wants_help:
+            call.arguments()
+            self._check_files(call)
+            self._follow(call, command.words[1:])
+        return False
+
+    def _check_files(self, call: Call) -> None:
+        for name in call.command.reads:
+            path = call.values.get(name)
+            if not isinstance(path, Path) or path.exists() or self._runs_shell:
+                continue
+            if not any(_is_related(path, other) for other in self._written):
+                raise UserError(
+                    f"{call.command.name}: --{name}={path}: there is no such file or folder"
+                )
+        self._written += [value for value in call.values.values() if isinstance(value, Path)]
+
+    def _follow(self, call: Call, words: Sequence[str]) -> None:
+        """Do to the copies of the session's state what a command would do to it."""
+        name = call.command.name
+        if name == "set" and words:
+            self._settings.assign(words, Layer.SET, "set")
+        elif name == "unset":
+            for word in words:
+                self._settings.unset(normalise(word.lstrip("-")))
+        elif name == "alias" and words:
+            alias, _, text = words[0].partition("=")
+            self._aliases[alias] = text
+        elif name == "unalias" and words:
+            self._aliases.pop(words[0], None)
+        if call.keeps_flags:
+            kept = [f"--{flag}={text}" for flag, text in call.given.items()]
+            self._settings.assign(kept, Layer.SET, "--keep_gflags")
+
+
+def _is_related(path: Path, other: Path) -> bool:
+    """Return whether one path is the other, or lies below it."""
+    first, second = path.absolute(), other.absolute()
+    return first == second or first in second.parents or second in first.parents
+
+
+def _place(text: str, position: int) -> str:
+    line = text.count("\n", 0, position) + 1
+    column = position - (text.rfind("\n", 0, position) + 1) + 1
+    return f"line {line}, column {column}" if "\n" in text.strip() else f"column {column}"
+
+
+def _placed(message: str, place: str) -> str:
+    return f"{place}: {message}" if place else message
