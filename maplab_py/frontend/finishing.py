@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
@@ -69,6 +70,7 @@ def finish(
     try:
         if mapping.builder is not None:
             vi_map, _ = mapping.builder.finish(progress=progress)
+            notes += scale_doubts(vi_map)
             if output.optimize_map_to_localization_map:
                 try:
                     vi_map = localization_map(

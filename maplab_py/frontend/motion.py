@@ -15,6 +15,7 @@ _DISPARITY_TIME_S = 0.1
 """Time that the limit of the disparity is for."""
 _LONG_SHARE = 0.5
 """Limit over half a second, noise removed, as a share of that of two images, which see a start earlier."""
+_SURELY = 4.0
 _NOISE_FACTOR = 1.25
 """The median disparity of two images is below this multiple of its expectation."""
 
@@ -59,6 +60,7 @@ class MotionDetector:
         *,
         turn_rad: float,
         speed_mps: float,
+        visible_mps: float = np.inf,
     ) -> Motion:
         """Return the motion of the interval between two frames.
 
@@ -70,6 +72,8 @@ class MotionDetector:
             tracked: Keypoints of the later frame, and what they say about the motion.
             turn_rad: Angle of the turn between the frames, without the gyroscope's bias.
             speed_mps: Estimated speed before the interval; 0 while nothing has been estimated.
+            visible_mps: Speed at which the tracks would surely be seen to move. An estimate above it, while
+                they rest, is wrong, and must not keep the device from resting.
         """
         self._add(interval)
         self._keypoints.push(Keypoints.of_images(tracked))
@@ -77,11 +81,16 @@ class MotionDetector:
         if (
             turn_rad < options.max_turn_rate * interval.duration_s
             and self.acceleration_deviation < options.max_acceleration_deviation
-            and speed_mps < options.max_speed
+            and (speed_mps < options.max_speed or speed_mps > visible_mps)
             and self._has_still_tracks(tracked.disparity_px, interval.duration_s)
         ):
             return Motion.RESTING
         return Motion.TURNING if tracked.is_turn_only else Motion.MOVING
+
+    def visible_mps(self, depth_m: float, focal_px: float) -> float:
+        """Return the speed at which points at a distance move surely faster than the limits of rest."""
+        rate_px = self._options.max_disparity_px / _DISPARITY_TIME_S
+        return _SURELY * rate_px * depth_m / focal_px
 
     def _has_still_tracks(self, disparity_px: float, duration_s: float) -> bool:
         """Tell whether keypoints rest but for their noise.

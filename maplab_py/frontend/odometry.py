@@ -38,6 +38,7 @@ from maplab_py.interop.recordings.protocol import (
 from maplab_py.vision.tracking.replay import tracked_images_of
 from maplab_py.vision.tracking.tracker import FrameTracker
 from maplab_py.vision.tracking.tracks import TrackedImages
+from maplab_py.vision.tracking.views import focal_length_px
 
 _MAX_WAITING = 200
 """Frames that may wait for IMU samples."""
@@ -115,6 +116,7 @@ class Odometry:
         self._gap_end_ns = -1  # time of the last frame if its samples have a gap
         self._replayed: TrackedImages | None = None  # tracks of the last frame of a replay
         self._detector = MotionDetector(self.options.rest)
+        self._focal_px = min(focal_length_px(camera) for camera in device.cameras)
         self._smoother: FixedLagSmoother | None = None
         self._delays: DelayMonitor | None = None
         if make_starter is None and self.options.estimates_time_offset:
@@ -287,6 +289,7 @@ class Odometry:
                 tracked,
                 turn_rad=self._turn_rad(interval),
                 speed_mps=self._speed_mps,
+                visible_mps=self._visible_mps(),
             )
         update = OdometryUpdate(
             time_ns=time_ns,
@@ -371,6 +374,11 @@ class Odometry:
             return 0.0
         R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
         return float(np.linalg.norm(so3.log(so3.from_matrix(R_I0_I1))))
+
+    def _visible_mps(self) -> float:
+        """Return the speed at which the landmarks of the window would surely be seen to move."""
+        depth_m = np.inf if self._smoother is None else self._smoother.median_depth_m
+        return self._detector.visible_mps(depth_m, self._focal_px)
 
     def _initialised(self, update: OdometryUpdate, frame: WindowFrame) -> OdometryUpdate:
         """Offer the frame to the initialisation; start the smoother when it succeeds."""

@@ -46,6 +46,7 @@ def last(
     turn_rate: float = 0.0,
     is_turn_only: bool = False,
     frames_hz: float = 20.0,
+    visible_mps: float = np.inf,
 ) -> Motion:
     """Return the class of the last interval of 0.6 s."""
     for frame in range(round(0.6 * frames_hz)):
@@ -55,6 +56,7 @@ def last(
             images(samples, disparity_px, is_turn_only=is_turn_only),
             turn_rad=turn_rate / frames_hz,
             speed_mps=speed_mps,
+            visible_mps=visible_mps,
         )
     return motion
 
@@ -68,6 +70,16 @@ def test_all_conditions_of_rest_are_needed() -> None:
     assert last(MotionDetector(), turn_rate=0.011) is Motion.MOVING
     assert last(MotionDetector(), turn_rate=0.5, is_turn_only=True) is Motion.TURNING
     assert last(MotionDetector(), disparity_px=float("nan")) is Motion.MOVING
+
+
+def test_a_wrong_speed_does_not_keep_a_device_from_resting() -> None:
+    """After a knock the estimate is wrong; images of near things show that there is no such speed."""
+    visible_mps = MotionDetector().visible_mps(depth_m=3.0, focal_px=458.0)
+    assert 0.1 < visible_mps < 0.2
+    assert last(MotionDetector(), speed_mps=0.2, visible_mps=visible_mps) is Motion.RESTING
+    far_mps = MotionDetector().visible_mps(depth_m=50.0, focal_px=458.0)
+    assert last(MotionDetector(), speed_mps=0.2, visible_mps=far_mps) is Motion.MOVING
+    assert MotionDetector().visible_mps(np.inf, 458.0) == np.inf
 
 
 def test_the_disparity_counts_per_tenth_of_a_second() -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build
 from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.report_building import make_report
@@ -20,6 +21,8 @@ from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
 from maplab_py.progress import SILENT, Progress, SilentProgress
 from maplab_py.vimap import VIMap
+
+_DOUBTFUL_ERROR_PX = 3.0
 
 Watch = Callable[[Callable[[], VIMap]], None]
 """Called between iterations with a function that returns the current map."""
@@ -66,6 +69,13 @@ def optimize(
     )
     result = apply_states(map_problem, final, options)
     report = make_report(map_problem, final, summary)
+    doubts = [report.note] if report.note else []
+    if report.median_reprojection_after_px > _DOUBTFUL_ERROR_PX:
+        doubts.append(
+            f"the median reprojection error is {report.median_reprojection_after_px:.1f} px: the map is not "
+            "right yet; check the calibration"
+        )
+    report = dataclasses.replace(report, note="; ".join([*doubts, *scale_doubts(result)]))
     solved = time.perf_counter()
     return result, dataclasses.replace(
         report,

@@ -167,6 +167,11 @@ class FixedLagSmoother:
         """Which frames (F,) are, or will become, keyframes."""
         return self._is_keyframe
 
+    @property
+    def median_depth_m(self) -> float:
+        """Median depth of the landmarks; infinite while it is not known."""
+        return 1.0 / self._inverse_depth if self._inverse_depth > 0.0 else np.inf
+
     def scale_sigma(self) -> float:
         """Return the standard deviation of the scale of the window, as a share; infinite = unknown."""
         problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())

@@ -147,9 +147,15 @@ def check_map_consistency(context: CommandContext) -> ConsistencyReport:
     """Check the consistency of the map; fails if a rule is violated.
 
     Resources whose files are missing are errors. Files in the map's resource folder that no resource
-    refers to are warnings; `clean_up_resource_folders` deletes them.
+    refers to are warnings; `clean_up_resource_folders` deletes them. A map whose lengths contradict its
+    accelerometer has a warning, too.
     """
+    from maplab_py.algorithms.scale_check import scale_doubts
     from maplab_py.storage.resource_files import with_file_checks
-    from maplab_py.vimap.consistency import check_consistency
+    from maplab_py.vimap.consistency import Violation, check_consistency
 
-    return with_file_checks(check_consistency(context.vi_map), context.vi_map, context.map_folder)
+    report = check_consistency(context.vi_map)
+    if not report.errors:
+        doubts = tuple(Violation(doubt, 1, ()) for doubt in scale_doubts(context.vi_map))
+        report = dataclasses.replace(report, warnings=(*report.warnings, *doubts))
+    return with_file_checks(report, context.vi_map, context.map_folder)
