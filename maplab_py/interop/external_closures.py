@@ -54,6 +54,8 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
             numbers = np.array(entry["covariance"], dtype=np.float64)
             covariance[i] = numbers.reshape(6, 6)
             switch[i] = float(entry["switch_variable"]), float(entry["switch_variable_variance"])
+            if not all(np.isfinite(v[i]).all() for v in (T_G_S, T_S_T, covariance, switch)):
+                raise ValueError("a number is not finite")
             values = (T_G_S[i], T_S_T[i], covariance[i], switch[i])
             if not all(np.isfinite(part).all() for part in values):
                 raise ValueError("has entries that are not finite numbers")

@@ -21,6 +21,7 @@ _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
 _ID = re.compile(r"(^|[-_. ])id$")
+_SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")
 _TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$")
 
 
@@ -97,8 +98,13 @@ def parse_text_table(
     lines, numbers, others = _data_lines(text)
     if not lines:
         raise MapError(f"{source}: there are no rows in the file: write or copy it again")
+    if ";" in lines[0] and "," not in lines[0]:
+        lines, others = ([line.replace(";", ",") for line in part] for part in (lines, others))
     has_commas = "," in lines[0]
     header, time_name, rows = _named_cells(others, lines)
+    if len(header) > 1 and _SECONDS.fullmatch(header[0]) and _NANOSECONDS.fullmatch(header[1]):
+        header, time_name = ("time", *header[2:]), "time [s]"  # the stamp of ROS in two columns
+        rows = [[f"{row[0]}.{row[1]:0>9}", *row[2:]] if len(row) > 1 else row for row in rows]
     widths = np.array([len(row) for row in rows])
     wrong = np.flatnonzero(widths != widths[0])
     if len(wrong):
@@ -174,7 +180,9 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
         line = raw.strip()
         if not line:
             continue
-        if line.startswith(("#", "%")) or (not lines and not _is_number(_split(line)[0])):
+        if line.startswith(("#", "%")) or (
+            not lines and not _is_number(_split(line.replace(";", ","))[0])
+        ):
             others.append(line)
             continue
         lines.append(line)

@@ -28,9 +28,9 @@ from maplab_py.errors import MaplabError
 from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.calibration_import import import_calibration
 from maplab_py.interop.colmap.calibration import read_cameras
-from maplab_py.interop.colmap.database_reading import ColmapDatabase
 from maplab_py.interop.colmap.exporting import export_colmap
-from maplab_py.interop.colmap.image_times import read_times
+from maplab_py.interop.colmap.features import ColmapDatabase
+from maplab_py.interop.colmap.importing import read_times
 from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.colmap.reading import read_model
 from maplab_py.interop.external_closures import read_external_closures

@@ -118,6 +118,10 @@ ROW = "0.5 1 2 3 0.8 0.6 0 0\n"
         "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
         "field.pose.orientation.w,field.pose.orientation.x,field.pose.orientation.y,"
         "field.pose.orientation.z\n0.5,1,2,3,0.8,0.6,0,0\n",
+        "sec,nanosec,x,y,z,qw,qx,qy,qz\n0,500000000,1,2,3,0.8,0.6,0,0\n",
+        "header.stamp.secs,header.stamp.nsecs,x,y,z,qw,qx,qy,qz\n0,500000000,1,2,3,0.8,0.6,0,0\n",
+        "timestamp;tx;ty;tz;qw;qx;qy;qz\n0.5;1;2;3;0.8;0.6;0;0\n",
+        "x,y,z,qw,qx,qy,qz,timestamp [s]\n1,2,3,0.8,0.6,0,0,0.5\n",
         "time,frame_id,x,y,z,qw,qx,qy,qz\n0.5,odom,1,2,3,0.8,0.6,0,0\n",
         "time,frame_id,x,y,z,qw,qx,qy,qz,note\n0.5,,1,2,3,0.8,0.6,0,0,fast turn\n",
         "time,mission-id,x,y,z,qw,qx,qy,qz\n0.5,12345678,1,2,3,0.8,0.6,0,0\n",

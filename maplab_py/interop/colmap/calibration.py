@@ -10,9 +10,8 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.colmap.binary_reading import REMEDY, read_binary_cameras
-from maplab_py.interop.colmap.camera_models import MODELS, map_camera
-from maplab_py.interop.colmap.model import ColmapCamera, ColmapModel, SensorType
+from maplab_py.interop.colmap.binary import REMEDY, read_binary_cameras
+from maplab_py.interop.colmap.model import MODELS, ColmapCamera, ColmapModel, SensorType, map_camera
 from maplab_py.interop.colmap.reading import read_model
 from maplab_py.sensors import Camera
 

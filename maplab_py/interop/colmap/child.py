@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.child_processes import end_with_parent
+
 BINARY, TEXT = "binary", "text"
 """Folders of models below the folder of a job."""
 SYSTEM = "system: "
@@ -121,6 +123,7 @@ JOBS = {job.__name__: job for job in (write_text, write_binary, undistort, datab
 
 def main(arguments: list[str]) -> int:
     """Run a job; return the exit status."""
+    end_with_parent()
     name, folder = arguments
     try:
         JOBS[name](Path(folder))

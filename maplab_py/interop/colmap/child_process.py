@@ -9,8 +9,9 @@ import sys
 from pathlib import Path
 
 from maplab_py.cancellation import check_cancelled, cleaned_up
+from maplab_py.child_processes import kill, processors, start
 from maplab_py.errors import MapError
-from maplab_py.interop.colmap.binary_writing import binary_files
+from maplab_py.interop.colmap.binary import binary_files
 from maplab_py.interop.colmap.child import BINARY, SYSTEM
 from maplab_py.interop.colmap.model import ColmapModel
 
@@ -23,7 +24,6 @@ _FAILURES = {
     "database": "the database cannot be written: leave out --colmap_database",
 }
 _POLL_S = 0.05
-_SILENT_END_S = 5.0
 
 
 def write_job_model(model: ColmapModel, folder: Path) -> None:
@@ -48,13 +48,14 @@ def run_job(job: str, folder: Path, source: Path) -> None:
     module = "maplab_py.interop.colmap.child"
     log = folder / f"{job}.log"
     with log.open("wb") as errors:
-        process = subprocess.Popen(
+        process = start(
             [sys.executable, "-m", module, job, str(folder)],
+            threads=processors(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=errors,
         )
-        with cleaned_up(lambda: _end(process)):
+        with cleaned_up(lambda: kill(process) if process.poll() is None else None):
             while process.poll() is None:
                 check_cancelled()
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -67,9 +68,3 @@ def run_job(job: str, folder: Path, source: Path) -> None:
         last = text.rpartition("\n")[2]
         reason = last.removeprefix(SYSTEM) if last.startswith(SYSTEM) else _FAILURES[job]
         raise MapError(f"{source}: {reason}")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.kill()
-        process.wait(_SILENT_END_S)

@@ -11,7 +11,6 @@ from maplab_py.array_types import F64, I64
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.colmap.camera_models import colmap_camera
 from maplab_py.interop.colmap.model import (
     NO_POINT,
     PIXEL_CENTRE,
@@ -23,6 +22,7 @@ from maplab_py.interop.colmap.model import (
     ColmapRig,
     Sensor,
     SensorType,
+    colmap_camera,
 )
 from maplab_py.interop.colmap.side_file import SideFile
 from maplab_py.sensors import Camera

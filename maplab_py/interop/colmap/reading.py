@@ -12,7 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.colmap.binary_reading import REMEDY, read_binary
+from maplab_py.interop.colmap.binary import REMEDY, read_binary
 from maplab_py.interop.colmap.child import BINARY, TEXT
 from maplab_py.interop.colmap.child_process import run_job
 from maplab_py.interop.colmap.model import FILES, NO_POINT, ColmapModel, SensorType
@@ -134,7 +134,7 @@ def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]
     names: dict[int, str] = {}
     poses: dict[int, F64] = {}
     try:
-        with path.open(encoding="utf-8") as stream, copy.open("w", encoding="utf-8") as target:
+        with path.open(encoding="utf-8-sig") as stream, copy.open("w", encoding="utf-8") as target:
             for number, line in enumerate(stream, start=1):
                 words = line.split(maxsplit=9)
                 if not words or words[0].startswith("#"):

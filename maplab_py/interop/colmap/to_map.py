@@ -11,8 +11,13 @@ from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import apply_similarity
-from maplab_py.interop.colmap.camera_models import map_camera
-from maplab_py.interop.colmap.model import PIXEL_CENTRE, ColmapModel, ColmapRig, SensorType
+from maplab_py.interop.colmap.model import (
+    PIXEL_CENTRE,
+    ColmapModel,
+    ColmapRig,
+    SensorType,
+    map_camera,
+)
 from maplab_py.interop.colmap.side_file import SideFile
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor

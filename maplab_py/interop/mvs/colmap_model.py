@@ -6,9 +6,9 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.geometry import se3
-from maplab_py.interop.colmap.binary_writing import binary_files
-from maplab_py.interop.colmap.camera_models import MODELS
+from maplab_py.interop.colmap.binary import binary_files
 from maplab_py.interop.colmap.model import (
+    MODELS,
     PIXEL_CENTRE,
     ColmapCamera,
     ColmapFrames,

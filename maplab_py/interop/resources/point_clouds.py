@@ -77,7 +77,9 @@ def import_point_clouds(
         )
     kinds = sorted({resource_type(new.type_of(row)).name for row in range(len(new))})
     outside = int(np.count_nonzero(~inside))
-    notes = (f"{outside} files are of times outside the mission",) if outside else ()
+    notes: tuple[str, ...] = ()
+    if outside:
+        notes = (f"{outside} files are of times outside the mission",)
     notes += empty_clouds_note(empty)
     mission_id = to_hex(vi_map.missions.id[mission])
     return vi_map, ImportedResources(

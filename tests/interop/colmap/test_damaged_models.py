@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.colmap.binary_writing import binary_files
+from maplab_py.interop.colmap.binary import binary_files
 from maplab_py.interop.colmap.exporting import export_colmap
 from maplab_py.interop.colmap.from_map import model_of_map
 from maplab_py.interop.colmap.importing import import_colmap

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.colmap.image_times import image_times, read_times
+from maplab_py.interop.colmap.importing import image_times, read_times
 
 
 @pytest.mark.parametrize(

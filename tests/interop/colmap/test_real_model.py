@@ -16,7 +16,7 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.calibrations.parts import read_entry
-from maplab_py.interop.colmap.additions import with_images
+from maplab_py.interop.colmap.features import with_images
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.options import ColmapImportOptions
 from maplab_py.interop.trajectories import Trajectory, read_trajectory

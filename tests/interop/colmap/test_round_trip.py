@@ -16,11 +16,11 @@ import pytest
 from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
+from maplab_py.interop.colmap.binary import compile_kernels
 from maplab_py.interop.colmap.exporting import export_colmap
 from maplab_py.interop.colmap.from_map import model_of_map
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.colmap.point_scan_kernel import compile_kernels
 from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.sensors import Distortion, Projection
@@ -141,7 +141,7 @@ def test_a_refined_model_keeps_the_ids_that_still_apply(tmp_path: Path) -> None:
     filtered = dataclasses.replace(
         exported, images=dataclasses.replace(exported.images, point=point)
     )
-    from maplab_py.interop.colmap.binary_writing import binary_files
+    from maplab_py.interop.colmap.binary import binary_files
 
     for name, content in binary_files(filtered).items():
         (tmp_path / name).write_bytes(b"".join(content))

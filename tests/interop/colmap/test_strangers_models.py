@@ -13,8 +13,8 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.colmap.database_reading import SCALED, UNDISTORTED, agreement
 from maplab_py.interop.colmap.exporting import export_colmap
+from maplab_py.interop.colmap.features import SCALED, UNDISTORTED, agreement
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
 from maplab_py.interop.colmap.reading import read_model

@@ -1,23 +1,24 @@
-"""Read a model in COLMAP's binary format; every count is checked against the bytes that are there.
+"""Models in COLMAP's binary format, read and written.
 
-COLMAP's own reader does not look at the end of a file: it takes what memory holds for the missing part, or
-never returns.
+Every count is checked against the bytes that are there: COLMAP's own reader does not look at the end of a
+file, it takes what memory holds for the missing part, or never returns.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.compilation import compiled
 from maplab_py.errors import MapError
 from maplab_py.geometry import so3
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.colmap.binary_writing import KEYPOINT, POINT
-from maplab_py.interop.colmap.camera_models import MODELS
 from maplab_py.interop.colmap.model import (
+    MODELS,
     ColmapCamera,
     ColmapFrames,
     ColmapImages,
@@ -27,7 +28,7 @@ from maplab_py.interop.colmap.model import (
     Sensor,
     SensorType,
 )
-from maplab_py.interop.colmap.point_scan_kernel import record_starts
+from maplab_py.vimap.table import starts_of_counts
 
 _MAX_BYTES = 20_000_000_000
 _MAX_NAME_BYTES = 4096
@@ -231,3 +232,144 @@ def _integers(values: list[int]) -> I64:
 
 def _rows(values: list[F64], width: int) -> F64:
     return np.array(values, dtype=np.float64).reshape(-1, width)
+
+
+KEYPOINT = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+POINT = np.dtype(
+    [("id", "<i8"), ("p_W", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("length", "<i8")]
+)
+ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
+_TO_FILE = [3, 0, 1, 2, 4, 5, 6]  # the quaternion's w comes first
+
+
+def binary_files(model: ColmapModel) -> dict[str, Iterator[bytes]]:
+    """Return the content of the files of a model by name."""
+    return {
+        "cameras.bin": _encode_cameras(model),
+        "rigs.bin": _encode_rigs(model),
+        "frames.bin": _encode_frames(model),
+        "images.bin": _encode_images(model),
+        "points3D.bin": _encode_points(model),
+    }
+
+
+def _encode_cameras(model: ColmapModel) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(model.cameras))
+    for camera in model.cameras:
+        yield struct.pack("<IiQQ", camera.id, camera.model, camera.width_px, camera.height_px)
+        yield _doubles(camera.parameters)
+
+
+def _encode_rigs(model: ColmapModel) -> Iterator[bytes]:
+    yield struct.pack("<Q", len(model.rigs))
+    for rig in model.rigs:
+        yield struct.pack("<II", rig.id, len(rig.sensors))
+        for row, sensor in enumerate(rig.sensors):
+            yield struct.pack("<iI", *sensor)
+            if row:
+                yield b"\x01" + _doubles(rig.T_S_R[row, _TO_FILE])
+
+
+def _encode_frames(model: ColmapModel) -> Iterator[bytes]:
+    frames = model.frames
+    order = np.argsort(frames.image_frame, kind="stable")
+    images = frames.image_id[order]
+    start = starts_of_counts(np.bincount(frames.image_frame, minlength=len(frames.id)))
+    row_of_image = {image: row for row, image in enumerate(model.images.id.tolist())}
+    yield struct.pack("<Q", len(frames.id))
+    for row, (number, rig) in enumerate(zip(frames.id.tolist(), frames.rig.tolist(), strict=True)):
+        mine = images[start[row] : start[row + 1]].tolist()
+        yield struct.pack("<II", number, rig) + _doubles(frames.T_R_W[row, _TO_FILE])
+        yield struct.pack("<I", len(mine))
+        for image in mine:
+            camera = int(model.images.camera[row_of_image[image]])
+            yield struct.pack("<iIQ", SensorType.CAMERA, camera, image)
+
+
+def _encode_images(model: ColmapModel) -> Iterator[bytes]:
+    images = model.images
+    keypoints = np.zeros(len(images.uv), dtype=KEYPOINT)
+    keypoints["uv"], keypoints["point"] = images.uv, images.point
+    start = images.keypoint_start.tolist()
+    yield struct.pack("<Q", len(images.id))
+    for row, name in enumerate(images.name):
+        yield struct.pack("<I", int(images.id[row])) + _doubles(images.T_C_W[row, _TO_FILE])
+        yield struct.pack("<I", int(images.camera[row])) + name.encode() + b"\0"
+        yield struct.pack("<Q", start[row + 1] - start[row])
+        yield keypoints[start[row] : start[row + 1]].tobytes()
+
+
+def _encode_points(model: ColmapModel) -> Iterator[bytes]:
+    """Yield the records as bytes that are scattered to their places."""
+    points, images = model.points, model.images
+    observing = np.flatnonzero(images.point >= 0)
+    order = np.argsort(points.id, kind="stable")
+    row = order[np.searchsorted(points.id[order], images.point[observing])]
+    length = np.bincount(row, minlength=len(points.id))
+    by_point = np.argsort(row, kind="stable")
+    observing, row = observing[by_point], row[by_point]
+    records = np.zeros(len(points.id), dtype=POINT)
+    records["id"], records["p_W"], records["colour"] = points.id, points.p_W, points.colour
+    records["error"], records["length"] = points.error_px, length
+    image = images.keypoint_image[observing]
+    elements = np.zeros(len(observing), dtype=ELEMENT)
+    elements["image"] = images.id[image]
+    elements["keypoint"] = observing - images.keypoint_start[image]
+    start = starts_of_counts(RECORD_BYTES + ELEMENT_BYTES * length)
+    data: U8 = np.zeros(int(start[-1]), dtype=np.uint8)
+    data[start[:-1, None] + np.arange(RECORD_BYTES)] = _bytes(records, RECORD_BYTES)
+    of_point = np.arange(len(observing)) - starts_of_counts(length)[row]
+    place = start[row] + RECORD_BYTES + ELEMENT_BYTES * of_point
+    data[place[:, None] + np.arange(ELEMENT_BYTES)] = _bytes(elements, ELEMENT_BYTES)
+    yield struct.pack("<Q", len(points.id))
+    yield data.tobytes()
+
+
+def _bytes(records: np.ndarray, size: int) -> U8:
+    """Return records (N,) as bytes (N, size)."""
+    return records.view(np.uint8).reshape(len(records), size)
+
+
+def _doubles(values: F64) -> bytes:
+    return np.asarray(values, dtype="<f8").tobytes()
+
+
+RECORD_BYTES = 51
+"""Bytes of a point without its track: id, position, colour, error, length of the track."""
+ELEMENT_BYTES = 8
+"""Bytes of an element of a track: image and keypoint."""
+_LENGTH_AT = 43
+
+
+@compiled()
+def record_starts(data, first, count):  # type: ignore[no-untyped-def]
+    """Return where the records of points begin.
+
+    Args:
+        data: Bytes (N,) of the file.
+        first: Place of the first record.
+        count: Number of records.
+
+    Returns:
+        Places (count + 1,) of the records and of their end; -1 from the record on that is not
+        complete.
+    """
+    starts = np.full(count + 1, -1, dtype=np.int64)
+    place = first
+    for row in range(count):
+        if place + RECORD_BYTES > len(data):
+            return starts
+        length = np.int64(0)
+        for byte in range(8):
+            length |= np.int64(data[place + _LENGTH_AT + byte]) << np.int64(8 * byte)
+        if length < 0 or length > (len(data) - place - RECORD_BYTES) // ELEMENT_BYTES:
+            return starts
+        starts[row] = place
+        place += RECORD_BYTES + ELEMENT_BYTES * length
+    starts[count] = place
+    return starts
+
+
+def compile_kernels() -> None:
+    """Compile the kernel of this module."""
+    record_starts(np.zeros(RECORD_BYTES, dtype=np.uint8), 0, 1)
