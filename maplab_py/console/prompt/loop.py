@@ -33,7 +33,8 @@ from maplab_py.console.commands.flags import looks_like_flag, resolve_name
 from maplab_py.console.commands.lines import Word, scan
 from maplab_py.console.commands.registry import Registry
 from maplab_py.console.prompt.completion import complete
-from maplab_py.console.scripts.runner import LEAVE, Runner
+from maplab_py.console.scripts.checking import LEAVE
+from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.maps import MapEntry
 from maplab_py.console.session.paths import state_folder
 from maplab_py.console.session.session import Session
