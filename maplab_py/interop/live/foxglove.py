@@ -5,6 +5,7 @@ Source: github.com/foxglove/ws-protocol, "docs/spec.md". Needs the library webso
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import socket
 import struct
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 from maplab_py.errors import UserError
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES, Publish, Take, Topic
+from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES, Publish, Take, Topic, answer_of
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Those of foxglove_bridge from 3.0 on, and before."""
@@ -45,6 +46,8 @@ class FoxgloveClient:
         Raises:
             UserError: The library is missing, or nobody answers at the address.
         """
+        if importlib.util.find_spec("websockets") is None:
+            raise library_missing()
         self._url = network.foxglove_url
         self.name = f"Foxglove {self._url}"
         self.problems: list[str] = []
@@ -56,7 +59,7 @@ class FoxgloveClient:
         self._lock = threading.Lock()
         self._is_closed = threading.Event()
         self._has_topics = threading.Event()
-        self._connection: Any = self._connected()
+        self._connection: Any = answer_of(self._connected, network.live_wait_s)
         self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
         self._thread.start()
         self._has_topics.wait(network.live_wait_s)
@@ -106,13 +109,11 @@ class FoxgloveClient:
         """Return a new connection.
 
         Raises:
-            UserError: The library is missing, or nobody answers.
+            UserError: Nobody answers.
         """
-        try:
-            from websockets.exceptions import InvalidHandshake, InvalidURI
-            from websockets.sync.client import connect
-        except ImportError as error:
-            raise library_missing() from error
+        from websockets.exceptions import InvalidHandshake, InvalidURI
+        from websockets.sync.client import connect
+
         try:
             return connect(
                 self._url,

@@ -26,7 +26,7 @@ from maplab_py.interop.live.tcpros import (
     receive_header,
     receive_message,
 )
-from maplab_py.interop.live.transport import Publish, Take, Topic, listening_address
+from maplab_py.interop.live.transport import Publish, Take, Topic, answer_of, listening_address
 from maplab_py.interop.recordings.bag_files import message_types
 
 _MASTER_TIMEOUT_S = 5.0
@@ -60,7 +60,7 @@ class Ros1:
         self._lock = threading.Lock()
         self._is_closed = threading.Event()
         self._had_master = True
-        self.topics()  # says whether there is a master
+        answer_of(self.topics, network.live_wait_s)  # says whether there is a master
         host = listening_address(network)
         self._server = socket.create_server((host, 0))
         self._rpc = SimpleXMLRPCServer((host, 0), logRequests=False, allow_none=True)

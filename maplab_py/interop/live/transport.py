@@ -8,7 +8,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 from maplab_py.cancellation import current_token
 from maplab_py.errors import Cancelled, UserError
@@ -21,6 +21,7 @@ LOOPBACK = "127.0.0.1"
 _LOOK_EVERY_S = 0.1
 _SIOCGIFADDR = 0x8915  # <linux/sockios.h>
 
+_T = TypeVar("_T")
 Take = Callable[[bytes], None]
 """Is called with each message, in the thread that receives it."""
 Publish = Callable[[bytes], None]
@@ -89,6 +90,23 @@ def wait_for_topics(transport: Transport, names: list[str], wait_s: float) -> li
         f"{transport.name}: nobody publishes {missing} ({wait_s:g} s waited): start the publisher, or "
         f"choose other topics; seen: {listed}{problem}"
     )
+
+
+def answer_of(ask: Callable[[], _T], wait_s: float) -> _T:
+    """Ask until there is an answer; a robot may start later than this program.
+
+    Raises:
+        UserError: There is none in time.
+        Cancelled: The user does not want to wait.
+    """
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        try:
+            return ask()
+        except UserError:
+            if time.monotonic() > deadline_s:
+                raise
+        pause()
 
 
 def pause(wait_s: float = _LOOK_EVERY_S) -> None:

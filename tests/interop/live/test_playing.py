@@ -17,6 +17,7 @@ from maplab_py.interop.live.listing import list_topics
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.playing import PlayingOptions, play_recording
+from maplab_py.interop.live.transport import wait_for_topics
 from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.stream import EventStream
@@ -27,7 +28,6 @@ from tests.interop.recordings.written import (
     make_content,
     write_folder,
 )
-from tests.support.waiting import wait_until
 
 PORT = 20_000 + os.getpid() % 20_000
 
@@ -87,8 +87,10 @@ def test_a_client_of_foxglove_reads_what_the_server_plays(
     pytest.importorskip("websockets")
     network = NetworkOptions(foxglove_url=f"ws://127.0.0.1:{PORT}")
     player = play(folder, "foxglove", network)
-    with open_transport_when_there("foxglove", network) as client:
-        assert sorted(client.topics()) == ["/cam0/image_raw", "/cam1/image_raw", "/imu0"]
+    with open_transport("foxglove", network) as client:
+        names = ["/cam0/image_raw", "/cam1/image_raw", "/imu0"]
+        wait_for_topics(client, names, 10.0)
+        assert sorted(client.topics()) == names
         device = open_recording(folder).device
         source = SourceOptions(imu_topic="/imu0", camera_topics="/cam0/image_raw,/cam1/image_raw")
         recording = live(client, device, source, LiveOptions(silence_s=1.5), wait_s=5.0)
@@ -100,25 +102,13 @@ def test_a_client_of_foxglove_reads_what_the_server_plays(
     assert np.array_equal(times, content.imu_ns)
 
 
-def open_transport_when_there(kind: str, network: NetworkOptions):  # type: ignore[no-untyped-def]
-    """Return a connection as soon as there is a server."""
-
-    def is_there() -> bool:
-        try:
-            with open_transport(kind, network):
-                return True
-        except UserError:
-            return False
-
-    assert wait_until(is_there)
-    return open_transport(kind, network)
-
-
 def test_no_server_of_foxglove_is_said_with_the_remedy() -> None:
     pytest.importorskip("websockets")
     with (
         pytest.raises(UserError, match=r"does not answer .*: start foxglove_bridge"),
-        open_transport("foxglove", NetworkOptions(foxglove_url="ws://127.0.0.1:1")),
+        open_transport(
+            "foxglove", NetworkOptions(foxglove_url="ws://127.0.0.1:1", live_wait_s=0.2)
+        ),
     ):
         pass
 

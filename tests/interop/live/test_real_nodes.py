@@ -1,4 +1,4 @@
-"""The odometry on topics of real nodes of ROS 2 Jazzy and Kilted, and of ROS 1, as on the folder."""
+"""The odometry on topics of real nodes of ROS 2 Jazzy and Kilted, ROS 1 and Foxglove, as on the folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,12 @@ SECONDS = 5.0
 RATE = 0.15  # of real time: tests share the machine with other tests
 LONGEST_S = 240.0
 TOPICS = "--camera_topics=/cam0/image_raw,/cam1/image_raw --imu_topic=/imu0"
-PLAYERS = {"jazzy": "ros2_player.py", "kilted": "ros2_player.py", "noetic": "ros1_player.py"}
+PLAYERS = {
+    "jazzy": "ros2_player.py",
+    "kilted": "ros2_player.py",
+    "noetic": "ros1_player.py",
+    "foxglove": "foxglove_player.py",
+}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +96,8 @@ def run_live(recorded: Path, folder: Path, kind: str, name: str) -> tuple[dict[s
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [("ros2", "jazzy"), ("ros2", "kilted"), ("ros1", "noetic")]
+    ("kind", "name"),
+    [("ros2", "jazzy"), ("ros2", "kilted"), ("ros1", "noetic"), ("foxglove", "foxglove")],
 )
 def test_poses_are_those_of_the_folder(
     recorded: Path, tmp_path: Path, kind: str, name: str

@@ -120,7 +120,7 @@ def test_a_subscriber_of_another_type_is_refused() -> None:
 
 
 def test_no_master_is_said_with_the_remedy() -> None:
-    network = NetworkOptions(ros_master_uri="http://127.0.0.1:1")
+    network = NetworkOptions(ros_master_uri="http://127.0.0.1:1", live_wait_s=0.2)
     with (
         pytest.raises(
             UserError, match=r"does not answer .*: start roscore, or give --ros_master_uri"
