@@ -165,7 +165,7 @@ def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> tuple[Path, Di
 
 def _stream_notes(mapping: Mapping) -> list[str]:
     """Return what was left out of the recording, or looks wrong in it."""
-    read, notes = mapping.stream.statistics, []
+    read, notes = mapping.stream.statistics, list(mapping.recording_notes)
     if read.dropped_before_imu or mapping.odometry.counts.frames_before_imu:
         count = read.dropped_before_imu + mapping.odometry.counts.frames_before_imu
         notes.append(f"{counted(count, 'frame')} before the first IMU sample left out")
@@ -264,7 +264,8 @@ def _localization(mapping: Mapping) -> LocalizationSummary | None:
     if mapping.localization is None:
         return None
     csv_file = mapping.options.output.export_localized_poses_to_csv
-    return summarised(mapping.localization, mapping.statistics.first_ns, csv_file)
+    zero_ns = mapping.statistics.zero_ns or mapping.statistics.first_ns
+    return summarised(mapping.localization, zero_ns, csv_file)
 
 
 def _good(vi_map: VIMap) -> int:

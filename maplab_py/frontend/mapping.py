@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.errors import Cancelled, EstimationError, MaplabError
+from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
 from maplab_py.frontend.localization.opening import opened_localization
 from maplab_py.frontend.localization.record import LocalizationRecord
@@ -35,6 +35,8 @@ from maplab_py.progress import SILENT, Progress
 
 _HEALTH_EVERY_S = 1.0
 _STATUS_EVERY_S = 0.1
+_ZERO_SAMPLES = 50
+"""Samples after which an IMU that measures rates or accelerations only is refused."""
 _LONGEST_SLEEP_S = 0.1
 """At a low playback rate, the run looks so often whether it is to end."""
 
@@ -126,7 +128,9 @@ class Mapping:
             MaplabError: Nothing has been estimated, and the recording ended or cannot be read.
             Cancelled: The run was cancelled, or ended before anything was estimated.
         """
-        self.statistics = RunStatistics(notes=list(self._recording.device.notes))
+        self.statistics = RunStatistics(
+            zero_ns=self._recording.start_ns, notes=list(self._recording.device.notes)
+        )
         try:
             for event in self.stream:
                 self._keep_pace(event, is_to_end)
@@ -153,6 +157,11 @@ class Mapping:
                 self.builder.fill(found)
             self.builder.refine(self.odometry.window_states())
 
+    @property
+    def recording_notes(self) -> tuple[str, ...]:
+        """What the reader of the recording has to say."""
+        return self._recording.notes
+
     def trajectory(self) -> Trajectory:
         """Return the states of all frames as they were estimated at their time, in their mission."""
         rows = np.array(self._states).reshape(-1, 16)
@@ -162,6 +171,9 @@ class Mapping:
 
     def _pushed(self, event: Event) -> list[OdometryUpdate]:
         if isinstance(event, ImuBatch):
+            read = self.stream.statistics
+            if read.imu.count >= _ZERO_SAMPLES and read.zero_note:
+                raise UserError(f"{self._recording.name}: {read.zero_note}")
             return self.odometry.push_imu(event)
         if isinstance(event, FrameSet):
             return self.odometry.push_images(event)
@@ -182,7 +194,7 @@ class Mapping:
             self._build(update, self.builder)
             self.statistics.add_stage("map", 1e3 * (time.perf_counter() - begin))
         if update.note.startswith("started again"):
-            progress.line(f"{self.statistics.duration_s:.1f} s  {update.note}")
+            progress.line(f"{self.statistics.elapsed_s:.1f} s  {update.note}")
         if self.options.enable_health_checking:
             self._tell_health(update, progress)
         self._tell_status(update, progress)
@@ -207,7 +219,7 @@ class Mapping:
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_EVERY_S
             line = f"{self.statistics.status_line(update)}  {self._status()}".rstrip()
-            progress.step(self.statistics.duration_s, 0.0, line)
+            progress.step(self.statistics.elapsed_s, 0.0, line)
 
     def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
         if update.healthy_until_ns:
@@ -238,7 +250,7 @@ class Mapping:
 
     def _tell_health(self, update: OdometryUpdate, progress: Progress) -> None:
         """Print how sure the estimate is."""
-        now_s = self.statistics.duration_s
+        now_s = self.statistics.elapsed_s
         if update.state is None or update.window is None or now_s - self._told_s < _HEALTH_EVERY_S:
             return
         self._told_s = now_s

@@ -22,7 +22,7 @@ class StageTime:
 class EstimatorStart:
     """One start of the estimator, which begins a mission."""
 
-    time_s: float  # after the first frame
+    time_s: float  # after the beginning of the recording, as flags count
     waited_s: float  # since the first frame, or since the estimator was lost
     reason: str  # why it had to start
 

@@ -38,6 +38,7 @@ class RunStatistics:
 
     frames: int = 0
     estimated_frames: int = 0
+    zero_ns: int = 0  # beginning of the recording; 0 = the first frame
     first_ns: int = 0
     last_ns: int = 0
     distance_m: float = 0.0
@@ -55,6 +56,11 @@ class RunStatistics:
         """Time from the first to the last frame."""
         return (self.last_ns - self.first_ns) * 1e-9
 
+    @property
+    def elapsed_s(self) -> float:
+        """Time from the beginning of the recording to the last frame."""
+        return self._after_zero(self.last_ns)
+
     def add(self, update: OdometryUpdate) -> None:
         """Count one frame."""
         if not self.frames:
@@ -69,14 +75,14 @@ class RunStatistics:
                 update.note.removeprefix("started again: "),
                 update.time_ns,
             )
-            self.notes.append(f"at {self._after_first(update.time_ns):.2f} s {update.note}")
+            self.notes.append(f"at {self._after_zero(update.time_ns):.2f} s {update.note}")
         self.waiting_for = "" if update.state is not None else update.note
         if update.state is None:
             return
         self.estimated_frames += 1
         if update.mission == len(self.starts):
             waited_s = (update.time_ns - self._lost_ns) * 1e-9
-            start = EstimatorStart(self._after_first(update.time_ns), waited_s, self._reason)
+            start = EstimatorStart(self._after_zero(update.time_ns), waited_s, self._reason)
             self.starts.append(start)
         p = update.state.T_M_I[0, 4:]
         if self._last_p is not None and self._last_p[0] == update.mission:
@@ -90,7 +96,7 @@ class RunStatistics:
     def status_line(self, update: OdometryUpdate) -> str:
         """Return time, tracks, landmarks and time per stage in one line."""
         tracks = sum(len(camera) for camera in update.tracked.cameras)
-        parts = [f"{self.duration_s:.1f} s", f"{tracks} tracks"]
+        parts = [f"{self.elapsed_s:.1f} s", f"{tracks} tracks"]
         if update.status is OdometryStatus.INITIALISING:
             parts.append(f"not started: {update.note}" if update.note else "not started")
         elif update.window is not None:
@@ -117,5 +123,5 @@ class RunStatistics:
         """Return the duration of the recording per elapsed time."""
         return self.duration_s / max(time.perf_counter() - self.began_s, 1e-9)
 
-    def _after_first(self, time_ns: int) -> float:
-        return (time_ns - self.first_ns) * 1e-9
+    def _after_zero(self, time_ns: int) -> float:
+        return (time_ns - (self.zero_ns or self.first_ns)) * 1e-9

@@ -25,15 +25,22 @@ class ImuRecording:
 
     times_ns: NDArray[np.int64]  # (N,)
     accel_gyro: NDArray[np.float64]  # (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s
+    lines: NDArray[np.int64] | None = None  # (N,) of the file, from 1
+    note: str = ""  # one line on the unit of the stamps, where it was concluded
 
 
-def read_imu_csv(path: Path) -> ImuRecording:
+def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> ImuRecording:
     """Read an EuRoC IMU file.
+
+    Args:
+        path: File.
+        time_unit: Unit of the time stamps; empty = see `stamps`.
+        in_order: Refuse stamps that do not increase.
 
     Raises:
         MapError: The file cannot be read, has other columns, or its stamps do not increase.
     """
-    table = read_text_table(path, IMU)
+    table = read_text_table(path, IMU, unit=time_unit)
     if table.values.shape[1] != 6:
         raise MapError(
             f"{path}: 7 columns are expected (time, gyroscope xyz, accelerometer xyz), "
@@ -43,13 +50,13 @@ def read_imu_csv(path: Path) -> ImuRecording:
     if len(table.header) == 7 and table.header[1].startswith("a"):
         order = [0, 1, 2, 3, 4, 5]
     late = np.flatnonzero(np.diff(table.times_ns) <= 0)
-    if len(late):
+    if in_order and len(late):
         line = table.line_numbers[late[0] + 1]
         raise MapError(
             f"{path}:{line}: the time stamp does not come after that of the row above: sort the rows or "
             "remove this one"
         )
-    return ImuRecording(table.times_ns, table.values[:, order])
+    return ImuRecording(table.times_ns, table.values[:, order], table.line_numbers, table.note)
 
 
 def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = False) -> None:

@@ -258,11 +258,14 @@ def recording_info(
 
     Args:
         recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
-        check_images: Check size and completeness of all images.
+        check_images: Check size and completeness of all images, and list those whose files are missing.
     """
     from maplab_py.interop.recordings.opening import open_recording
     from maplab_py.interop.recordings.summary import summarise
 
+    if check_images:  # which lists all images that are missing
+        reading = dataclasses.replace(source.reading, skip_missing_images=True)
+        source = dataclasses.replace(source, reading=reading)
     return summarise(
         open_recording(recording, source),
         stream,

@@ -131,7 +131,7 @@ def rovioli(
             mapping, recording.name, map_key=key, progress=context.progress, is_to_end=is_to_end
         )
     if mapping.is_ended_early:
-        _tell_end(context, finished)
+        _tell_end(context, finished, mapping.statistics.elapsed_s)
     is_at_server = writer is not None and writer.pushed > 0 and writer.is_whole
     if writer is not None and writer.pushed:
         where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
@@ -225,10 +225,10 @@ def _observer(context: CommandContext, title: str, interval_s: float) -> Observe
     return _Pictures(viewer, title, interval_s)
 
 
-def _tell_end(context: CommandContext, finished: FinishedRun) -> None:
+def _tell_end(context: CommandContext, finished: FinishedRun, elapsed_s: float) -> None:
     """Say what has become of a recording that the user has ended."""
     report = finished.report
-    text = f"ended at {report.duration_s:.1f} s of the recording"
+    text = f"ended at {elapsed_s:.1f} s of the recording"
     if finished.vi_map is not None:
         text += f": the map of {report.vertices} vertices is in memory as '{report.map_key}'"
     if report.map_folder is not None:

@@ -170,6 +170,9 @@ def test_recording_info(tmp_path: Path) -> None:
         assert part.frame_sets == 6
         tight = session.run("recording_info", recording=folder, vio_nframe_sync_tolerance_ns=10)
         assert [camera.unmatched_images for camera in tight.cameras] == [8, 8]
-        assert tight.notes == ("no images match: raise --vio_nframe_sync_tolerance_ns",)
+        assert tight.notes == (
+            "8 of 8 images of camera 1 have no partner in camera 0; the nearest is 0.001 ms away at the "
+            "median: check the trigger, or raise --vio_nframe_sync_tolerance_ns",
+        )
         with pytest.raises(UserError, match="--imu_topic and --camera_topics apply to bags only"):
             session.run("recording_info", recording=folder, imu_topic="/imu0")

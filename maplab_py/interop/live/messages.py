@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import math
 import struct
 from typing import Any
@@ -11,12 +10,10 @@ from maplab_py.errors import MapError
 from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES
 from maplab_py.interop.recordings.bag_files import imu_sample
 from maplab_py.interop.recordings.images import image_of_message
+from maplab_py.interop.recordings.paired_imu import PairedImu as PairedImu
+from maplab_py.interop.recordings.paired_imu import Sample
 from maplab_py.interop.recordings.protocol import ImageData
 from maplab_py.sensors import Camera
-
-Sample = tuple[float, ...]
-_GYRO, _ACCEL = 0, 1  # of two joined topics, in this order
-_HISTORY = 400
 
 
 def imu_values(data: bytes, *, is_ros_2: bool) -> Sample:
@@ -58,39 +55,3 @@ def image_data(
     except Exception as error:  # the parser's own, of any type
         raise MapError(f"{name}: the message is damaged: check its publisher") from error
     return image_of_message(message, name, camera)
-
-
-class PairedImu:
-    """Joins a topic of the gyroscope with one of the accelerometer; each has its own times.
-
-    The accelerometer's values are interpolated at the times of the gyroscope.
-    """
-
-    def __init__(self) -> None:
-        """Start without samples."""
-        self._gyro: collections.deque[tuple[int, Sample]] = collections.deque(maxlen=_HISTORY)
-        self._accel: collections.deque[tuple[int, Sample]] = collections.deque(maxlen=_HISTORY)
-
-    def add(self, part: int, time_ns: int, values: Sample) -> list[tuple[int, Sample]]:
-        """Take a message of the gyroscope (part 0) or accelerometer (1); return joined samples."""
-        if part == _GYRO:
-            self._gyro.append((time_ns, values[3:]))
-        else:
-            self._accel.append((time_ns, values[:3]))
-        joined = []
-        while self._gyro and self._accel and self._gyro[0][0] <= self._accel[-1][0]:
-            gyro_ns, gyro = self._gyro.popleft()
-            while len(self._accel) > 1 and self._accel[1][0] <= gyro_ns:
-                self._accel.popleft()
-            if self._accel[0][0] > gyro_ns:
-                continue  # before the first of the accelerometer
-            joined.append((gyro_ns, (*self._accel_at(gyro_ns), *gyro)))
-        return joined
-
-    def _accel_at(self, time_ns: int) -> Sample:
-        before_ns, before = self._accel[0]
-        if len(self._accel) == 1 or before_ns == time_ns:
-            return before
-        after_ns, after = self._accel[1]
-        share = (time_ns - before_ns) / (after_ns - before_ns)
-        return tuple(a + share * (b - a) for a, b in zip(before, after, strict=True))

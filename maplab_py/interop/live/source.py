@@ -25,6 +25,7 @@ from maplab_py.interop.recordings.protocol import (
     CameraImage,
     ImuBatch,
     Item,
+    PartSpan,
     RecordedSensors,
 )
 from maplab_py.report import counted
@@ -109,7 +110,7 @@ class LiveRecording:
         self._arrivals: collections.OrderedDict[int, float] = collections.OrderedDict()
         self._latencies_ms: collections.deque[float] = collections.deque(maxlen=100_000)
         self._last_imu_ns, self._told = -1, 0
-        self._given_bits = source.image_bits
+        self._given_bits = source.reading.image_bits
         self._bits: dict[int, int] = {}  # of the values of the images, by camera
         self._first_samples: list[F64] = []
         self._is_checked = False
@@ -146,6 +147,10 @@ class LiveRecording:
     def start_ns(self) -> int:
         """Time of the first item; a live source begins now, so it has none."""
         return 0
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return no parts: a live source has no end."""
+        return ()
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield what arrives; see `Recording.items`.

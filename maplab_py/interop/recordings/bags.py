@@ -26,11 +26,22 @@ from maplab_py.interop.recordings.bag_files import (
     opened_bag,
     topic_types,
 )
+from maplab_py.interop.recordings.clocks import (
+    ClockFilter,
+    ClockRestart,
+    check_dropped,
+    dropped_note,
+    first_stamp_ns,
+    restart_error,
+)
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_of_message
+from maplab_py.interop.recordings.options import ReadingOptions
+from maplab_py.interop.recordings.paired_imu import ACCEL, GYRO, PairedImu
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
     ImuBatch,
     Item,
+    PartSpan,
     RecordedSensors,
 )
 
@@ -39,7 +50,10 @@ if TYPE_CHECKING:
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_IMU = -1
+_IMU, _ACCELEROMETER = -1, -2
+_EXAMINED = 8
+"""Messages of a topic from which its clock is known."""
+_DEFAULT = ReadingOptions()
 _LARGEST_BATCH = 200
 _DELAY_MARGIN_NS = 1_000_000_000
 """How much the delay between stamp and arrival may vary beyond that of the first messages."""
@@ -48,13 +62,15 @@ _SEEK_MARGIN_NS = 5_000_000_000
 
 @dataclasses.dataclass(frozen=True)
 class _Stream:
-    """One topic: the IMU's, or that of a camera."""
+    """One topic: the IMU's, its accelerometer's, or that of a camera."""
 
     topic: str
-    camera: int  # row, or _IMU
+    camera: int  # row, or _IMU, or _ACCELEROMETER
     time_offset_ns: int = 0
+    count: int = 0  # messages
     first_ns: int = 0  # time of the first message
     delay_ns: int = 0  # from its time to its arrival
+    arrivals_ns: tuple[int, int] | None = None  # of the part that is read
 
 
 class BagRecording:
@@ -65,25 +81,26 @@ class BagRecording:
         path: Path,
         device: RecordedSensors,
         *,
-        imu_topic: str = "",
+        imu_topics: Sequence[str] = (),
         camera_topics: Sequence[str] = (),
-        image_bits: int = 0,
+        reading: ReadingOptions = _DEFAULT,
     ) -> None:
         """Open a bag.
 
         Args:
             path: ROS 1 bag, or file or folder of a ROS 2 bag.
             device: Sensors.
-            imu_topic: Topic of the IMU; empty = as the sensor says.
+            imu_topics: Topic of the IMU, or those of gyroscope and accelerometer; () = as the sensor says.
             camera_topics: Topic of each camera; () = as the cameras say.
-            image_bits: Bits of values that are stored in 16; 0 = found.
+            reading: How stamps and images are read.
 
         Raises:
             UserError: The library is missing, or a topic is unknown, of another type, or not given.
             MapError: The bag is damaged, or a topic has no messages.
         """
-        self.name, self.device, self._path = str(path), device, path
-        self._given_bits, self._bits = image_bits, [CONTAINER_BITS] * len(device.cameras)
+        self.name, self.device, self._path, self._reading = str(path), device, path, reading
+        self._bits = [CONTAINER_BITS] * len(device.cameras)
+        self._clocks: list[ClockFilter[Any]] = []
         topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
         if len(topics) != len(device.cameras):
             raise UserError(
@@ -94,19 +111,29 @@ class BagRecording:
             for row, topic in enumerate(topics)
         ]
         if device.imu is not None:
-            streams.insert(0, _Stream(imu_topic or device.imu.topic, _IMU))
-        elif imu_topic:
-            raise UserError(f"--imu_topic={imu_topic}: the calibration has no IMU")
+            named = zip(imu_topics or (device.imu.topic,), (_IMU, _ACCELEROMETER), strict=False)
+            streams = [*(_Stream(topic, sensor) for topic, sensor in named), *streams]
+        elif imu_topics:
+            raise UserError(f"--imu_topic={','.join(imu_topics)}: the calibration has no IMU")
         with opened_bag(self._path) as reader:
             self.kind = f"ROS {2 if reader.is2 else 1} bag"
             self._streams = [self._examined(reader, stream) for stream in streams]
         if len({stream.topic for stream in self._streams}) < len(self._streams):
             raise UserError(f"{path}: two sensors have the same topic: give --camera_topics")
+        if reading.recording_part:
+            self._choose_part(reading.recording_part)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Parts of the recording that are not read, and how the others are."""
         notes = [bits_note(c, bits) for c, bits in enumerate(self._bits) if bits < CONTAINER_BITS]
+        notes += [
+            dropped_note(f"{self._path}: {stream.topic}", clock.dropped, clock.first)
+            for stream, clock in zip(self._streams, self._clocks, strict=False)
+            if clock.dropped
+        ]
+        if self._reading.use_arrival_time:
+            notes.append("times are those of arrival: --use_arrival_time")
         if not self.device.imu_id:
             notes.append(
                 "no IMU is read: the calibration has none, --imu_calibration_file names its file"
@@ -117,6 +144,26 @@ class BagRecording:
     def start_ns(self) -> int:
         """Time of the first item."""
         return min(stream.first_ns for stream in self._streams)
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return the parts into which restarts of the clock divide the recording; reads all stamps."""
+        runs = self._runs()
+        spans = []
+        for part in range(max(len(of_stream) for of_stream in runs)):
+            having = [
+                (stream, of_stream[part])
+                for stream, of_stream in zip(self._streams, runs, strict=True)
+                if part < len(of_stream)
+            ]
+            first_ns, last_ns = (
+                min(run.first_ns for _, run in having),
+                max(run.last_ns for _, run in having),
+            )
+            images = sum(run.count for stream, run in having if stream.camera >= 0)
+            samples = sum(run.count for stream, run in having if stream.camera == _IMU)
+            duration_s = (last_ns - first_ns) * 1e-9
+            spans.append(PartSpan(part + 1, first_ns, duration_s, samples, images))
+        return tuple(spans)
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
@@ -137,27 +184,25 @@ class BagRecording:
 
     def _read_bits(self, start_ns: int | None, end_ns: int | None) -> list[int]:
         """Return the bits of each camera, sought in messages that are spread over a time."""
-        cameras = [stream for stream in self._streams if stream.camera != _IMU]
         read: list[int] = []
         with opened_bag(self._path) as reader:
             first_ns = reader.start_time if start_ns is None else start_ns
             last_ns = reader.end_time if end_ns is None else min(end_ns, reader.end_time)
-            for stream in cameras:
+            for stream in (stream for stream in self._streams if stream.camera >= 0):
                 connections = [c for c in reader.connections if c.topic == stream.topic]
                 images: list[CameraImage] = []
                 for place_ns in np.linspace(first_ns, last_ns, SAMPLES, endpoint=False).tolist():
                     message = next(reader.messages(connections, int(place_ns)), None)
-                    if message is None or self._given_bits:
+                    if message is None or self._reading.image_bits:
                         break
                     content = reader.deserialize(message[2], message[0].msgtype)
                     images.append(self._image(stream, int(place_ns), content, CONTAINER_BITS))
                     with contextlib.suppress(MapError):
                         if images[0].data.bits:
                             break
-                bits = self._given_bits or camera_bits(images)
-                self._bits[stream.camera] = (
-                    CONTAINER_BITS if bits == 8 or self._given_bits else bits
-                )
+                bits = self._reading.image_bits or camera_bits(images)
+                is_usual = bits == 8 or self._reading.image_bits
+                self._bits[stream.camera] = CONTAINER_BITS if is_usual else bits
                 read.append(bits)
         return read
 
@@ -170,12 +215,21 @@ class BagRecording:
         waiting: list[tuple[int, int, int, _Stream, Any]] = []
         newest_ns = delivered_ns = -1
         number = itertools.count()
-        for time_ns, stream, message in self._messages(start_ns, end_ns):
+        restart: ClockRestart | None = None
+        messages = self._messages(start_ns, end_ns)
+        while True:
+            try:
+                time_ns, stream, message = next(messages)
+            except StopIteration:
+                break
+            except ClockRestart as error:
+                restart = error
+                break
             if time_ns < delivered_ns:
-                raise MapError(
-                    f"{self._path}: a message of {stream.topic} was recorded more than "
-                    f"{window_ns / 1e9:g} s after others of its time: correct its header stamps"
-                )
+                clock = self._clocks[self._streams.index(stream)]
+                clock.leave_out(time_ns, delivered_ns)
+                self._check_late(stream, clock)
+                continue
             heapq.heappush(waiting, (time_ns, stream.camera, next(number), stream, message))
             newest_ns = max(newest_ns, time_ns)
             while waiting[0][0] < newest_ns - window_ns:
@@ -184,43 +238,134 @@ class BagRecording:
         while waiting:
             delivered_ns, _, _, ready, content = heapq.heappop(waiting)
             yield delivered_ns, ready, content
+        if restart is not None:
+            raise restart
 
     def _messages(
         self, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[int, _Stream, Any]]:
-        """Yield time, stream and message in the order of arrival."""
+        """Yield time, stream and message in the order of arrival, accelerations with angular rates."""
         delays_ns = [stream.delay_ns for stream in self._streams]
         begin = None if start_ns is None else start_ns + min(delays_ns) - _SEEK_MARGIN_NS
         end = None if end_ns is None else end_ns + max(delays_ns) + _SEEK_MARGIN_NS
-        streams = {stream.topic: stream for stream in self._streams}
-        last_ns = dict.fromkeys(streams, -1)
+        rows = {stream.topic: row for row, stream in enumerate(self._streams)}
+        self._clocks = [
+            ClockFilter(None if begin is not None else stream.first_ns) for stream in self._streams
+        ]
+        joined = PairedImu(None) if any(s.camera == _ACCELEROMETER for s in self._streams) else None
         with opened_bag(self._path) as reader:
-            connections = [c for c in reader.connections if c.topic in streams]
-            for connection, _, data in reader.messages(connections, begin, end):
-                stream = streams[connection.topic]
-                time_ns = header_stamp_ns(data, is_ros_2=reader.is2) + stream.time_offset_ns
+            connections = [c for c in reader.connections if c.topic in rows]
+            for connection, arrival_ns, data in reader.messages(connections, begin, end):
+                row = rows[connection.topic]
+                stream, clock = self._streams[row], self._clocks[row]
+                bounds = stream.arrivals_ns
+                if bounds is not None and not bounds[0] <= arrival_ns <= bounds[1]:
+                    continue
+                stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
                 message: Any
-                if stream.camera == _IMU:
+                if stream.camera < 0:
                     message = imu_sample(data, is_ros_2=reader.is2)
                 else:
-                    message = reader.deserialize(data, connection.msgtype)
-                if time_ns <= last_ns[stream.topic]:
-                    raise MapError(
-                        f"{self._path}: {stream.topic}: the stamp "
-                        f"{time_ns - stream.time_offset_ns} does not come after that of the message "
-                        "before it: correct it, or leave it out with --vio_rosbag_start_s and "
-                        "--vio_rosbag_end_s"
-                    )
-                last_ns[stream.topic] = time_ns
-                if (start_ns is None or time_ns >= start_ns) and (
-                    end_ns is None or time_ns < end_ns
-                ):
-                    yield time_ns, stream, message
+                    message = connection.msgtype, data
+                dropped, part = clock.dropped, clock.part
+                ready = clock.push(stamp_ns + stream.time_offset_ns, message)
+                if clock.dropped > dropped and not self._is_within(stamp_ns, start_ns, end_ns):
+                    clock.dropped = dropped
+                elif clock.dropped > dropped:
+                    self._check_late(stream, clock)
+                if clock.part > part and clock.restart is not None:
+                    if end_ns is not None and clock.restart.before_ns >= end_ns:
+                        return
+                    raise restart_error(f"{self._path}: {stream.topic}", clock.restart)
+                for time_ns, content in ready:
+                    if not self._is_within(time_ns, start_ns, end_ns):
+                        continue
+                    if stream.camera >= 0:
+                        yield time_ns, stream, reader.deserialize(content[1], content[0])
+                    elif joined is None:
+                        yield time_ns, stream, content
+                    else:
+                        sensor = GYRO if stream.camera == _IMU else ACCEL
+                        for joint_ns, sample in joined.add(sensor, time_ns, content):
+                            yield joint_ns, self._streams[0], sample
+        for stream, clock in zip(self._streams, self._clocks, strict=True):
+            clock.finish()
+            self._check_late(stream, clock)
+
+    @staticmethod
+    def _is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:
+        return (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns)
+
+    def _stamp_ns(self, data: bytes, arrival_ns: int, *, is_ros_2: bool) -> int:
+        if self._reading.use_arrival_time:
+            return arrival_ns
+        return header_stamp_ns(data, is_ros_2=is_ros_2)
+
+    def _check_late(self, stream: _Stream, clock: ClockFilter[Any]) -> None:
+        check_dropped(
+            f"{self._path}: {stream.topic}",
+            clock.dropped,
+            stream.count,
+            clock.first,
+            self._reading.max_late_share,
+        )
+
+    def _runs(self) -> list[list[_Run]]:
+        """Return the runs of each stream's clock; reads the stamps of the whole bag."""
+        rows = {stream.topic: row for row, stream in enumerate(self._streams)}
+        clocks: list[ClockFilter[int]] = [ClockFilter(s.first_ns) for s in self._streams]
+        runs: list[list[_Run]] = [[_Run()] for _ in self._streams]
+        with opened_bag(self._path) as reader:
+            connections = [c for c in reader.connections if c.topic in rows]
+            for connection, arrival_ns, data in reader.messages(connections):
+                row = rows[connection.topic]
+                stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
+                time_ns = stamp_ns + self._streams[row].time_offset_ns
+                for ready_ns, ready_arrival_ns in clocks[row].push(time_ns, arrival_ns):
+                    if clocks[row].part == len(runs[row]):
+                        runs[row].append(_Run())
+                    runs[row][-1].add(ready_ns, ready_arrival_ns)
+        return runs
+
+    def _choose_part(self, part: int) -> None:
+        """Read one part only.
+
+        Raises:
+            UserError: There is no such part.
+            MapError: The sensors have different numbers of parts.
+        """
+        runs = self._runs()
+        counts = [len(of_stream) for of_stream in runs]
+        if part > max(counts):
+            raise UserError(
+                f"{self.name}: --recording_part={part}: the recording has {max(counts)} parts"
+            )
+        if len(set(counts)) > 1:
+            listed = ", ".join(
+                f"{s.topic} {count}" for s, count in zip(self._streams, counts, strict=True)
+            )
+            raise MapError(
+                f"{self.name}: the clocks of the sensors do not start again together (parts: {listed}): "
+                "record each run into a bag of its own"
+            )
+        self._streams = [
+            dataclasses.replace(
+                stream,
+                count=of_stream[part - 1].count,
+                first_ns=of_stream[part - 1].first_ns,
+                delay_ns=of_stream[part - 1].first_arrival_ns - of_stream[part - 1].first_ns,
+                arrivals_ns=(
+                    of_stream[part - 1].first_arrival_ns,
+                    of_stream[part - 1].last_arrival_ns,
+                ),
+            )
+            for stream, of_stream in zip(self._streams, runs, strict=True)
+        ]
 
     def _examined(self, reader: BagReader, stream: _Stream) -> _Stream:
         """Return the stream with the bag's name of its topic and the times of its first message."""
-        sensor = "IMU" if stream.camera == _IMU else f"camera {stream.camera}"
-        flag = "--imu_topic" if stream.camera == _IMU else "--camera_topics"
+        sensor = f"camera {stream.camera}" if stream.camera >= 0 else "IMU"
+        flag = "--camera_topics" if stream.camera >= 0 else "--imu_topic"
         types = topic_types(reader)
         present = listed_topics(types)
         if not stream.topic:
@@ -234,18 +379,34 @@ class BagRecording:
                 f"{self._path}: there is no topic {stream.topic} ({sensor}): give {flag}; the bag "
                 f"has {present}"
             )
-        wanted = (IMU_TYPE,) if stream.camera == _IMU else IMAGE_TYPES
+        wanted = IMAGE_TYPES if stream.camera >= 0 else (IMU_TYPE,)
         if types[topic] not in wanted:
+            is_video = any(word in types[topic].lower() for word in ("video", "ffmpeg"))
+            hint = " (a video: decode it to images first, as with `image_transport republish`)"
             raise UserError(
-                f"{self._path}: {topic} has messages of type {types[topic]}, {sensor} needs "
-                f"{' or '.join(wanted)}: give {flag}; the bag has {present}"
+                f"{self._path}: {topic} has messages of type {types[topic]}{hint if is_video else ''}, "
+                f"{sensor} needs {' or '.join(wanted)}: give {flag}; the bag has {present}"
             )
         connections = [c for c in reader.connections if c.topic == topic]
-        for _, arrival_ns, data in reader.messages(connections):
-            first_ns = header_stamp_ns(data, is_ros_2=reader.is2) + stream.time_offset_ns
-            delay_ns = arrival_ns - first_ns
-            return dataclasses.replace(stream, topic=topic, first_ns=first_ns, delay_ns=delay_ns)
-        raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
+        first = list(itertools.islice(reader.messages(connections), _EXAMINED))
+        if not first:
+            raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
+        stamps_ns = [self._stamp_ns(data, at, is_ros_2=reader.is2) for _, at, data in first]
+        if not any(stamps_ns) and len(stamps_ns) > 1:
+            raise MapError(
+                f"{self._path}: {topic}: the stamps of its messages are all 0, as of a driver that sets "
+                "none: give --use_arrival_time to take the times of arrival"
+            )
+        stamp_ns = first_stamp_ns(stamps_ns)
+        arrival_ns = first[stamps_ns.index(stamp_ns)][1]
+        first_ns = stamp_ns + stream.time_offset_ns
+        return dataclasses.replace(
+            stream,
+            topic=topic,
+            count=sum(connection.msgcount for connection in connections),
+            first_ns=first_ns,
+            delay_ns=arrival_ns - first_ns,
+        )
 
     def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> ImuBatch:
         assert self.device.imu is not None  # its topic is read
@@ -264,3 +425,20 @@ class BagRecording:
         name = f"{self._path}: {stream.topic} at {stamp_ns}"
         data = image_of_message(message, name, camera)
         return CameraImage(stream.camera, time_ns, stamp_ns, data, bits)
+
+
+@dataclasses.dataclass
+class _Run:
+    """Stamps between two starts of a clock."""
+
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    first_arrival_ns: int = 0
+    last_arrival_ns: int = 0
+
+    def add(self, time_ns: int, arrival_ns: int) -> None:
+        """Add a message."""
+        if not self.count:
+            self.first_ns, self.first_arrival_ns = time_ns, arrival_ns
+        self.count, self.last_ns, self.last_arrival_ns = self.count + 1, time_ns, arrival_ns

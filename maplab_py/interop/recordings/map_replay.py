@@ -11,6 +11,7 @@ from maplab_py.errors import MapError
 from maplab_py.interop.recordings.protocol import (
     ImuBatch,
     Item,
+    PartSpan,
     RecordedSensors,
     TrackedFrame,
     TrackedFrameSet,
@@ -81,6 +82,10 @@ class MapRecording:
         """Time of the first item."""
         starts = [int(times[0]) for times in (self._times_ns, self._sample_times_ns) if len(times)]
         return min(starts)
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return no parts: the clock of a mission runs on."""
+        return ()
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield frame sets and the IMU samples between them; see `Recording.items`."""

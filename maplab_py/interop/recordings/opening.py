@@ -28,32 +28,32 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
         MapError: A file of it is missing or damaged.
     """
     options = options or SourceOptions()
-    options.check()
+    options.reading.check()
     root = image_root(path)
     if root is not None:
         if options.imu_topic or options.camera_topics:
             raise UserError(
                 f"{path} is a folder: --imu_topic and --camera_topics apply to bags only"
             )
+        if options.reading.use_arrival_time:
+            raise UserError(f"{path} is a folder: --use_arrival_time applies to bags only")
         active = options.active_cameras
         device = _chosen(_calibration(options) or import_calibration(root), options)
-        return _with_sizes_checked(
-            FolderRecording(root, device, active, image_bits=options.image_bits)
-        )
+        return _with_sizes_checked(FolderRecording(root, device, active, options.reading))
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
     if not is_bag(path):
         raise UserError(
             f"{path} is no recording: wants a folder with mav0/cam0, a ROS 1 bag (.bag) or a ROS 2 "
-            "bag (folder with metadata.yaml, .db3, .mcap)"
+            "bag (a folder, or a file .db3 or .mcap)"
         )
     return _with_sizes_checked(
         BagRecording(
             path,
             given_device(options, f"{path}: a bag"),
-            imu_topic=options.imu_topic,
+            imu_topics=options.topics_of_imu,
             camera_topics=options.topics_of_cameras,
-            image_bits=options.image_bits,
+            reading=options.reading,
         )
     )
 

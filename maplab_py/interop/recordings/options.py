@@ -8,7 +8,50 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.interop.device import DeviceOptions
+from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import option
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadingOptions:
+    """How stamps and images are read."""
+
+    flag_prefix: ClassVar[str] = ""
+
+    image_bits: int = option(
+        0,
+        help="Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording",
+    )
+    recording_part: int = option(
+        0,
+        help="Part to read of a recording whose clock starts again, from 1 (see recording_info); 0 = the "
+        "only one",
+    )
+    max_late_share: float = option(
+        0.01,
+        help="Share of messages with repeated, late or wild stamps up to which they are left out; more is an "
+        "error",
+    )
+    use_arrival_time: bool = option(
+        False, help="Take the times at which messages of a bag arrived in place of their stamps"
+    )
+    skip_missing_images: bool = option(
+        False, help="Leave out images of a folder's tables whose files are missing"
+    )
+    time_unit: str = time_unit_option()
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of range.
+        """
+        if self.image_bits and not 8 <= self.image_bits <= 16:
+            raise FlagError(f"--image_bits={self.image_bits}: wants 8 to 16, or 0")
+        if self.recording_part < 0:
+            raise FlagError(f"--recording_part={self.recording_part}: wants a number from 1, or 0")
+        if not 0.0 <= self.max_late_share <= 1.0:
+            raise FlagError(f"--max_late_share={self.max_late_share:g}: wants a number from 0 to 1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +70,7 @@ class SourceOptions:
         help="File of the IMU, where the calibration has cameras alone, as kalibr's camchain",
     )
     device: DeviceOptions = DeviceOptions()
+    reading: ReadingOptions = ReadingOptions()
     rovio_active_camera_indices: str = option(
         "", help="Cameras to read, separated by commas; empty = all of the calibration"
     )
@@ -36,16 +80,14 @@ class SourceOptions:
         "says",
         unit="ns",
     )
-    imu_topic: str = option("", help="IMU topic of a bag; empty = as the calibration says")
+    imu_topic: str = option(
+        "",
+        help="IMU topic of a bag, or two, GYRO,ACCEL, that are joined; empty = as the calibration says",
+    )
     camera_topics: str = option(
         "",
         help="Image topics of a bag, separated by commas, in the order of the cameras of the "
         "calibration; empty = as it says",
-    )
-
-    image_bits: int = option(
-        0,
-        help="Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording",
     )
 
     def check(self) -> None:
@@ -54,8 +96,7 @@ class SourceOptions:
         Raises:
             FlagError: A value is out of range.
         """
-        if self.image_bits and not 8 <= self.image_bits <= 16:
-            raise FlagError(f"--image_bits={self.image_bits}: wants 8 to 16, or 0")
+        self.reading.check()
 
     @property
     def active_cameras(self) -> tuple[int, ...]:
@@ -74,6 +115,18 @@ class SourceOptions:
                 "camera indices separated by commas, as in 0,1"
             )
         return indices
+
+    @property
+    def topics_of_imu(self) -> tuple[str, ...]:
+        """IMU topic, or those of gyroscope and accelerometer; empty = as the calibration says.
+
+        Raises:
+            FlagError: There are more.
+        """
+        topics = tuple(_words(self.imu_topic))
+        if len(topics) > 2:
+            raise FlagError(f"--imu_topic={self.imu_topic}: wants one topic, or two, GYRO,ACCEL")
+        return topics
 
     @property
     def topics_of_cameras(self) -> tuple[str, ...]:

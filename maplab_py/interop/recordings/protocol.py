@@ -123,6 +123,17 @@ class TrackedFrameSet:
     frames: tuple[TrackedFrame | None, ...]  # by camera, None where the camera has no frame
 
 
+@dataclasses.dataclass(frozen=True)
+class PartSpan:
+    """A part of a recording between two starts of its clock."""
+
+    part: int  # from 1, as --recording_part takes it
+    start_ns: int
+    duration_s: float
+    imu_samples: int
+    images: int
+
+
 Item = ImuBatch | CameraImage | TrackedFrameSet
 """What readers yield, in the order of time."""
 
@@ -152,6 +163,9 @@ class Recording(Protocol):
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know: parts of the recording that are not read."""
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return the parts into which restarts of the clock divide the recording."""
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield what was recorded at start_ns or later and before end_ns, in the order of time.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from collections.abc import Iterator
 
 import numpy as np
@@ -24,6 +25,7 @@ from maplab_py.interop.recordings.protocol import (
 class Times:
     """Count, first, last and largest step of increasing times."""
 
+    all_ns: array[int] = dataclasses.field(default_factory=lambda: array("q"))  # of images
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -35,7 +37,17 @@ class Times:
             self.largest_step_ns = max(self.largest_step_ns, time_ns - self.last_ns)
         else:
             self.first_ns = time_ns
+        self.all_ns.append(time_ns)
         self.count, self.last_ns = self.count + 1, time_ns
+
+    @property
+    def largest_hole_ns(self) -> tuple[int, int]:
+        """Largest step between times, and where it begins; 0 for fewer than two."""
+        times_ns = np.asarray(self.all_ns, dtype=np.int64)
+        if len(times_ns) < 2:
+            return 0, self.first_ns
+        row = int(np.argmax(np.diff(times_ns)))
+        return int(times_ns[row + 1] - times_ns[row]), int(times_ns[row])
 
     @property
     def rate_hz(self) -> float:
@@ -52,10 +64,22 @@ class StreamStatistics:
     images: list[Times] = dataclasses.field(default_factory=list)  # by camera
     frame_sets: Times = dataclasses.field(default_factory=Times)
     saturated_samples: int = 0
+    without_acceleration: int = 0  # samples whose accelerations are 0
+    without_rate: int = 0  # samples whose angular rates are 0
     imu_gaps: int = 0
     first_imu_gap_ns: int = -1  # time at which the first gap begins
     unmatched_images: list[int] = dataclasses.field(default_factory=list)  # by camera
     dropped_before_imu: int = 0  # frame sets
+
+    @property
+    def zero_note(self) -> str:
+        """One line on an IMU that measures rates or accelerations only; empty if it does both."""
+        remedy = "--imu_topic=GYRO,ACCEL joins the topics of gyroscope and accelerometer"
+        if self.imu.count and self.without_acceleration == self.imu.count:
+            return f"all accelerations of the IMU are 0: {remedy}"
+        if self.imu.count and self.without_rate == self.imu.count:
+            return f"all angular rates of the IMU are 0: {remedy}"
+        return ""
 
 
 class EventStream:
@@ -138,6 +162,9 @@ class EventStream:
         imu.largest_step_ns = max(imu.largest_step_ns, int(steps_ns.max(initial=0)))
         imu.count, imu.last_ns = imu.count + len(batch), int(times_ns[-1])
         statistics.saturated_samples += int(batch.is_saturated.sum())
+        is_zero = batch.accel_gyro == 0.0
+        statistics.without_acceleration += int(is_zero[:, :3].all(axis=1).sum())
+        statistics.without_rate += int(is_zero[:, 3:].all(axis=1).sum())
 
     def _check_not_empty(self) -> None:
         statistics, options = self.statistics, self._options

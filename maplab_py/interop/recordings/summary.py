@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
+import numpy as np
+
+from maplab_py.interop.recordings.clocks import ClockRestart
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch, Recording
+from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch, PartSpan, Recording
 from maplab_py.interop.recordings.stream import EventStream, StreamStatistics, Times
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
 _PROGRESS_EVERY = 50
+_USUAL_ENCODINGS = {"mono8", "8UC1", "bgr8", "rgb8", "PNG", "JPEG"}
+_SLOWEST_IMU_HZ = 90.0
+_HOLE_STEPS, _HOLE_NS = 10.0, 1_000_000_000
+_SPAN_NS = 500_000_000
+"""By which an IMU may end before the images without a note."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +30,7 @@ class ImuSummary:
     rate_hz: float
     largest_interval_s: float
     gaps: int  # intervals longer than --vio_imu_gap_s
-    first_gap_s: float | None  # after the beginning of the recording
+    first_gap_s: float | None  # after the beginning of the recording, as flags count
     saturated_samples: int
 
 
@@ -44,7 +53,7 @@ class RecordingReport(Report):
 
     recording: str
     kind: str
-    start_ns: int
+    start_ns: int  # the zero of flags and notes
     duration_s: float
     frame_sets: int
     frame_set_rate_hz: float
@@ -53,6 +62,7 @@ class RecordingReport(Report):
     imu: ImuSummary | None
     cameras: tuple[CameraSummary, ...]
     notes: tuple[str, ...]
+    parts: tuple[PartSpan, ...] = ()  # where the clock starts again
 
 
 def summarise(
@@ -62,7 +72,7 @@ def summarise(
     check_images: bool = False,
     progress: Progress = SILENT,
 ) -> RecordingReport:
-    """Read a recording and report what is in it.
+    """Read a recording and report what is in it; of one whose clock starts again, its first part.
 
     Args:
         recording: Recording.
@@ -76,44 +86,46 @@ def summarise(
     """
     options = options or StreamOptions()
     stream, checked = EventStream(recording, options), 0
-    for event in stream:
-        if isinstance(event, ImuBatch):
-            continue
-        if isinstance(event, FrameSet) and check_images:
-            for image in event.images:
-                image.data.check()
-                checked += 1
-        progress.check()
-        if stream.statistics.frame_sets.count % _PROGRESS_EVERY == 0:
-            progress.line(f"{stream.statistics.frame_sets.count} frame sets")
-    return _report(recording, stream.statistics, checked, options)
+    parts: tuple[PartSpan, ...] = ()
+    encodings: dict[int, str] = {}
+    try:
+        for event in stream:
+            if isinstance(event, ImuBatch):
+                continue
+            if isinstance(event, FrameSet):
+                for image in event.images:
+                    if image.camera not in encodings:
+                        encodings[image.camera] = image.data.encoding
+                    if check_images:
+                        image.data.check()
+                        checked += 1
+            progress.check()
+            if stream.statistics.frame_sets.count % _PROGRESS_EVERY == 0:
+                progress.line(f"{stream.statistics.frame_sets.count} frame sets")
+    except ClockRestart:
+        parts = recording.parts()
+    report = _report(recording, stream.statistics, checked, options, encodings)
+    if not parts:
+        return report
+    note = f"the clock starts again: figures are of part 1 of {len(parts)}, --recording_part=N reads another"
+    return dataclasses.replace(report, parts=parts, notes=(note, *report.notes))
 
 
 def _report(
-    recording: Recording, statistics: StreamStatistics, checked: int, options: StreamOptions
+    recording: Recording,
+    statistics: StreamStatistics,
+    checked: int,
+    options: StreamOptions,
+    encodings: dict[int, str],
 ) -> RecordingReport:
     every = [times for times in (statistics.imu, *statistics.images) if times.count]
-    start_ns = min(times.first_ns for times in every)
+    start_ns, first_ns = recording.start_ns, min(times.first_ns for times in every)
     end_ns = max(times.last_ns for times in every)
-    notes = [*recording.device.notes, *recording.notes]
-    if not recording.device.imu_id and not recording.notes:
-        notes.append("there is no IMU")
-    if statistics.imu_gaps:
-        notes.append(
-            f"{statistics.imu_gaps} intervals between IMU samples are longer than "
-            f"{options.imu_gap_s:g} s"
-        )
-    if statistics.saturated_samples:
-        notes.append(f"{statistics.saturated_samples} IMU samples are saturated")
-    if statistics.dropped_before_imu:
-        notes.append(f"{statistics.dropped_before_imu} frame sets before the first IMU sample")
-    if any(statistics.unmatched_images) and not statistics.frame_sets.count:
-        notes.append("no images match: raise --vio_nframe_sync_tolerance_ns")
     return RecordingReport(
         recording=recording.name,
         kind=recording.kind,
         start_ns=start_ns,
-        duration_s=(end_ns - start_ns) / 1e9,
+        duration_s=(end_ns - first_ns) / 1e9,
         frame_sets=statistics.frame_sets.count,
         frame_set_rate_hz=statistics.frame_sets.rate_hz,
         dropped_before_imu=statistics.dropped_before_imu,
@@ -123,8 +135,95 @@ def _report(
             _camera_summary(recording, row, times, statistics.unmatched_images[row])
             for row, times in enumerate(statistics.images)
         ),
-        notes=tuple(notes),
+        notes=(*recording.notes, *_notes(recording, statistics, options, encodings)),
     )
+
+
+def _notes(
+    recording: Recording,
+    statistics: StreamStatistics,
+    options: StreamOptions,
+    encodings: dict[int, str],
+) -> Iterator[str]:
+    """Yield what is odd; times count from the beginning of the recording, as those of flags."""
+    zero_ns, imu = recording.start_ns, statistics.imu
+    if not recording.device.imu_id and not recording.notes:
+        yield "there is no IMU"
+    if set(encodings.values()) - _USUAL_ENCODINGS:
+        listed = ", ".join(f"camera {row} {name}" for row, name in sorted(encodings.items()))
+        yield f"images are converted: {listed}"
+    if statistics.imu_gaps:
+        yield (
+            f"{statistics.imu_gaps} intervals between IMU samples are longer than "
+            f"{options.imu_gap_s:g} s"
+        )
+    if imu.count > 1 and imu.rate_hz < _SLOWEST_IMU_HZ:
+        yield f"the IMU delivers {imu.rate_hz:.3g} samples per second: 100 or more are wanted"
+    if statistics.zero_note:
+        yield statistics.zero_note
+    if statistics.saturated_samples:
+        yield f"{statistics.saturated_samples} IMU samples are saturated"
+    if statistics.dropped_before_imu:
+        yield f"{statistics.dropped_before_imu} frame sets before the first IMU sample"
+    images = [times for times in statistics.images if times.count]
+    if imu.count and images:
+        yield from _span_notes(imu, images, zero_ns)
+    for row, times in enumerate(statistics.images):
+        hole_ns, begin_ns = times.largest_hole_ns
+        if times.count > 2 and hole_ns > max(_HOLE_STEPS * _usual_step_ns(times), _HOLE_NS):
+            yield (
+                f"camera {row}: no images for {hole_ns * 1e-9:.2f} s from {(begin_ns - zero_ns) * 1e-9:.2f} s"
+                " on"
+            )
+    yield from _pair_notes(statistics, options)
+
+
+def _span_notes(imu: Times, images: list[Times], zero_ns: int) -> Iterator[str]:
+    """Yield how the times of IMU and images differ, where the IMU does not cover the images."""
+    first_ns = min(times.first_ns for times in images)
+    last_ns = max(times.last_ns for times in images)
+    if imu.last_ns < first_ns or imu.first_ns > last_ns:
+        yield (
+            f"IMU and images have no time in common: IMU from {imu.first_ns} to {imu.last_ns} ns, images "
+            f"from {first_ns} to {last_ns} ns: check the clocks and units (--time_unit, "
+            "--imu_to_camera_time_offset_ns)"
+        )
+    elif imu.last_ns < last_ns - _SPAN_NS:
+        yield (
+            f"the IMU ends at {(imu.last_ns - zero_ns) * 1e-9:.2f} s, the images at "
+            f"{(last_ns - zero_ns) * 1e-9:.2f} s"
+        )
+
+
+def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterator[str]:
+    """Yield which images have no partner in camera 0, and how far away the nearest ones are."""
+    counts, unmatched = statistics.images, statistics.unmatched_images
+    if len(counts) < 2 or not any(unmatched):
+        return
+    reference = np.asarray(counts[0].all_ns, dtype=np.int64)
+    for row, times in enumerate(counts[1:], start=1):
+        other = np.asarray(times.all_ns, dtype=np.int64)
+        if not len(reference) or not len(other):
+            yield f"camera {row if len(reference) else 0} has no images"
+            continue
+        after = np.clip(np.searchsorted(reference, other), 1, max(len(reference) - 1, 1))
+        after = np.minimum(after, len(reference) - 1)
+        before = np.maximum(after - 1, 0)
+        apart_ns = np.minimum(np.abs(other - reference[after]), np.abs(other - reference[before]))
+        apart = int(np.count_nonzero(apart_ns > options.nframe_sync_tolerance_ns))
+        if apart:
+            median_ms = (
+                float(np.median(apart_ns[apart_ns > options.nframe_sync_tolerance_ns])) * 1e-6
+            )
+            yield (
+                f"{apart} of {len(other)} images of camera {row} have no partner in camera 0; the nearest is "
+                f"{median_ms:.3g} ms away at the median: check the trigger, or raise "
+                "--vio_nframe_sync_tolerance_ns"
+            )
+
+
+def _usual_step_ns(times: Times) -> float:
+    return float(np.median(np.diff(np.asarray(times.all_ns, dtype=np.int64))))
 
 
 def _imu_summary(statistics: StreamStatistics, start_ns: int) -> ImuSummary:

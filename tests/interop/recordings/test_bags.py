@@ -271,15 +271,6 @@ def _messages(content: Content) -> list[tuple[int, str, Any]]:
     return sorted(messages, key=lambda entry: entry[:2])
 
 
-def test_backward_stamps(tmp_path: Path, calibrated: SourceOptions) -> None:
-    messages = _messages(make_content())
-    rows = [row for row, (_, topic, _) in enumerate(messages) if topic == "/imu0"]
-    messages[rows[9]][2].header.stamp.sec -= 1
-    write_messages(tmp_path / "room.bag", STORE, messages)
-    with pytest.raises(MapError, match=r"/imu0: the stamp \d+ does not come after .*--vio_rosbag"):
-        list(EventStream(open_recording(tmp_path / "room.bag", calibrated)))
-
-
 def test_part_of_a_bag_whose_clock_is_another(tmp_path: Path, calibrated: SourceOptions) -> None:
     content = make_content(frames=500)  # 25 s, so that the reader can skip messages
     offset_ns = 10**15
@@ -300,7 +291,7 @@ def test_messages_that_arrive_much_too_late(tmp_path: Path, calibrated: SourceOp
     ]
     late.sort(key=lambda entry: entry[:2])
     write_messages(tmp_path / "room.bag", STORE, late)
-    with pytest.raises(MapError, match=r"/cam1/image_raw was recorded more than 1 s after others"):
+    with pytest.raises(MapError, match=r"/cam1/image_raw: 2 of 100 stamps do not come after"):
         list(EventStream(open_recording(tmp_path / "room.bag", calibrated)))
 
 

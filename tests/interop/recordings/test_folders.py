@@ -192,7 +192,10 @@ def _flip(path: Path) -> None:
 
 CAM = f"mav0/cam1/data/{START_NS + 1000 + 50_000_000}.png"
 DAMAGES = {
-    "missing image": (lambda f: (f / CAM).unlink(), r"\.png: the image is missing \(1 of 8 are\)"),
+    "missing image": (
+        lambda f: (f / CAM).unlink(),
+        r"\.png: the image is missing \(1 of 8 in cam1\)",
+    ),
     "truncated image": (lambda f: _truncate(f / CAM), r"\.png: the image is truncated"),
     "empty image": (lambda f: (f / CAM).write_bytes(b""), r"\.png: the image is empty"),
     "damaged image": (lambda f: _flip(f / CAM), r"\.png: the image is damaged"),
@@ -203,13 +206,9 @@ DAMAGES = {
     ),
     "no image folder": (lambda f: shutil.rmtree(f / "mav0/cam0/data"), "copy the images there"),
     "no image table": (lambda f: (f / "mav0/cam0/data.csv").unlink(), r"cam0/data\.csv: No such"),
-    "backward image stamp": (
-        lambda f: _edit(f / "mav0/cam0/data.csv", f"\n{START_NS + 10**8},", f"\n{START_NS - 1},"),
-        r"cam0/data\.csv:4: the time stamp does not come after",
-    ),
     "bad image row": (
         lambda f: _edit(f / "mav0/cam0/data.csv", f"\n{START_NS},", "\nsoon,"),
-        r"cam0/data\.csv:2: a row must be",
+        r"cam0/data\.csv:2: 'soon' is not a time stamp",
     ),
     "image elsewhere": (
         lambda f: _edit(f / "mav0/cam0/data.csv", f"{START_NS}.png", "../../secret.png"),
@@ -221,10 +220,6 @@ DAMAGES = {
     ),
     "no IMU table": (lambda f: (f / "mav0/imu0/data.csv").unlink(), "imu0/data.csv: the table is"),
     "no samples": (lambda f: (f / "mav0/imu0/data.csv").write_text("#t\n"), "there are no rows"),
-    "backward IMU stamp": (
-        lambda f: _edit(f / "mav0/imu0/data.csv", f"\n{START_NS}", f"\n{START_NS - 10**9}"),
-        r"imu0/data\.csv:6: the time stamp does not come after",
-    ),
     "no calibration": (
         lambda f: [p.unlink() for p in f.rglob("sensor.yaml")],
         "there is no calibration .*--sensor_calibration_file",

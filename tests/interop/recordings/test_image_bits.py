@@ -10,7 +10,7 @@ import pytest
 
 from maplab_py.errors import FlagError
 from maplab_py.interop.recordings.opening import open_recording
-from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (
@@ -35,11 +35,13 @@ def content_of(bits: int) -> Content:
 def opened(content: Content, tmp_path: Path, form: str, **options: object):
     folder = write_folder(content, tmp_path / "room")
     if form == "folder":
-        return open_recording(folder, SourceOptions(**options))
+        return open_recording(folder, SourceOptions(reading=ReadingOptions(**options)))
     calibration = write_calibration(open_recording(folder).device, tmp_path / "sensors.yaml")
     encoding = "png" if form == "png" else "mono16"
     bag = write_bag(content, tmp_path / "a.bag", encoding=encoding)
-    return open_recording(bag, SourceOptions(sensor_calibration_file=calibration, **options))
+    return open_recording(
+        bag, SourceOptions(sensor_calibration_file=calibration, reading=ReadingOptions(**options))
+    )
 
 
 @pytest.mark.parametrize("form", ["folder", "mono16", "png"])
@@ -65,7 +67,7 @@ def test_a_flag_decides(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.images[0].grey(), content.images[0][0] >> 8)
     assert recording.notes == ()
     with pytest.raises(FlagError, match="--image_bits=7: wants 8 to 16"):
-        open_recording(tmp_path / "room", SourceOptions(image_bits=7))
+        open_recording(tmp_path / "room", SourceOptions(reading=ReadingOptions(image_bits=7)))
 
 
 def test_damaged_images_outside_the_chosen_time_do_not_matter(tmp_path: Path) -> None:

@@ -1,0 +1,147 @@
+"""Stamps that do not increase: repeated, late and wild ones are dropped, restarts of a clock begin parts."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from maplab_py.array_types import I64
+from maplab_py.errors import MapError
+
+_LARGEST_STEP_NS = 86_400_000_000_000
+"""Stamps that lie further ahead are of another clock."""
+_RESTART_COUNT, _RESTART_NS = 5, 400_000_000
+"""A run of so many stamps over such a time is a clock that has started again, not late messages."""
+
+T = TypeVar("T")
+
+
+class ClockRestart(MapError):
+    """The clock of a recording starts again, and no part of it is chosen."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dropped:
+    """A stamp that was left out, and the one before it."""
+
+    stamp_ns: int
+    before_ns: int
+
+
+class ClockFilter(Generic[T]):
+    """Passes items of one sensor whose stamps increase, in the order of arrival.
+
+    Attributes:
+        part: Number of the clock's run, from 0.
+        dropped: Items that were left out.
+        first: The first of them.
+        restart: Stamps after and before the last start of the clock.
+    """
+
+    def __init__(self, first_ns: int | None = None) -> None:
+        """Start; stamps before `first_ns` are left out."""
+        self.part, self.dropped = 0, 0
+        self.first: Dropped | None = None
+        self.restart: Dropped | None = None
+        self._last_ns = None if first_ns is None else first_ns - 1
+        self._waiting: list[tuple[int, T]] = []  # out of line: late, or the beginning of a part
+
+    def push(self, stamp_ns: int, item: T) -> list[tuple[int, T]]:
+        """Take the next item; return those that are in line now, with their stamps."""
+        if self._last_ns is None or self._follows(self._last_ns, stamp_ns):
+            if self._waiting:
+                self._drop()
+            self._last_ns = stamp_ns
+            return [(stamp_ns, item)]
+        if self._waiting and not self._follows(self._waiting[-1][0], stamp_ns):
+            self._drop()
+        self._waiting.append((stamp_ns, item))
+        span_ns = stamp_ns - self._waiting[0][0]
+        if len(self._waiting) < _RESTART_COUNT or span_ns < _RESTART_NS:
+            return []
+        self.restart = Dropped(self._waiting[0][0], self._last_ns)
+        self.part, self._last_ns = self.part + 1, stamp_ns
+        ready, self._waiting = self._waiting, []
+        return ready
+
+    def finish(self) -> None:
+        """Leave out what still waits at the end."""
+        self._drop()
+
+    def leave_out(self, stamp_ns: int, before_ns: int) -> None:
+        """Count an item that is left out."""
+        self.dropped += 1
+        self.first = self.first or Dropped(stamp_ns, before_ns)
+
+    def _drop(self) -> None:
+        for stamp_ns, _ in self._waiting:
+            self.leave_out(stamp_ns, self._last_ns or 0)
+        self._waiting = []
+
+    @staticmethod
+    def _follows(before_ns: int, stamp_ns: int) -> bool:
+        return 0 < stamp_ns - before_ns <= _LARGEST_STEP_NS
+
+
+def first_stamp_ns(stamps_ns: list[int]) -> int:
+    """Return the first stamp that the one after it follows, of the first stamps of a sensor."""
+    for before, after in itertools.pairwise(stamps_ns):
+        if 0 < after - before <= _LARGEST_STEP_NS:
+            return before
+    return stamps_ns[0]
+
+
+def parts_of(stamps_ns: I64) -> tuple[list[I64], I64]:
+    """Return the rows of each part of a table, and the rows that are left out."""
+    rows = np.arange(len(stamps_ns))
+    steps_ns = np.diff(stamps_ns)
+    if np.all((steps_ns > 0) & (steps_ns <= _LARGEST_STEP_NS)):
+        return [rows], rows[:0]
+    clock: ClockFilter[int] = ClockFilter(first_stamp_ns(stamps_ns[:_RESTART_COUNT].tolist()))
+    parts: list[list[int]] = [[]]
+    for row, stamp_ns in enumerate(stamps_ns.tolist()):
+        ready = clock.push(stamp_ns, row)
+        if clock.part == len(parts):
+            parts.append([])
+        parts[-1].extend(number for _, number in ready)
+    kept = [np.array(part, dtype=np.int64) for part in parts]
+    return kept, np.setdiff1d(rows, np.concatenate(kept))
+
+
+def check_dropped(name: str, dropped: int, count: int, first: Dropped | None, share: float) -> None:
+    """Check that no more items are left out than a share of all.
+
+    Raises:
+        MapError: There are more; names the first one and the flags that help.
+    """
+    if first is not None and dropped > math.ceil(share * count):
+        raise MapError(
+            f"{name}: {dropped} of {count} stamps do not come after the one before them, the first is "
+            f"{first.stamp_ns} after {first.before_ns}: skip them by --vio_rosbag_start_s and "
+            f"--vio_rosbag_end_s, or raise --max_late_share={share:g}"
+        )
+
+
+def dropped_note(name: str, dropped: int, first: Dropped | None) -> str:
+    """Return a line on items that were left out."""
+    where = f", the first is {first.stamp_ns} after {first.before_ns}" if first is not None else ""
+    return f"{name}: left out {dropped} with repeated, late or wild stamps{where}"
+
+
+def restart_error(name: str, restart: Dropped) -> ClockRestart:
+    """Return the error that a clock starts again."""
+    return ClockRestart(
+        f"{name}: the clock starts again: {restart.stamp_ns} comes after {restart.before_ns}: recording_info "
+        "lists the parts, --recording_part=N reads one of them"
+    )
+
+
+def listed_rows(numbers: I64) -> Iterator[str]:
+    """Yield line numbers as ranges, as in "7" or "285-289"."""
+    for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
+        yield str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}"

@@ -1,0 +1,265 @@
+"""Stamps that repeat, come late, are wild or start again, in folders and bags."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings.clocks import ClockRestart, parts_of
+from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
+from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.recordings.summary import summarise
+from tests.interop.recordings.written import (
+    START_NS,
+    Content,
+    assert_content,
+    frame_sets,
+    image_message,
+    imu_message,
+    make_content,
+    samples,
+    write_calibration,
+    write_folder,
+    write_messages,
+)
+
+SECOND = 1_000_000_000
+
+
+def shifted(content: Content, shift_ns: int) -> Content:
+    stamps = tuple(stamps + shift_ns for stamps in content.stamps_ns)
+    return dataclasses.replace(content, imu_ns=content.imu_ns + shift_ns, stamps_ns=stamps)
+
+
+def bag_messages(*contents: Content, step_ns: int = 10 * SECOND) -> list[tuple[int, str, Any]]:
+    """Messages (arrival, topic, message) of recordings one after the other."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    messages: list[tuple[int, str, Any]] = []
+    for number, content in enumerate(contents):
+        delay_ns = START_NS + number * step_ns - int(content.imu_ns[0])
+        for t, v in zip(content.imu_ns.tolist(), content.accel_gyro, strict=True):
+            messages.append((t + delay_ns, "/imu0", imu_message(store, t, v, 1)))
+        for camera, (stamps, images) in enumerate(
+            zip(content.stamps_ns, content.images, strict=True)
+        ):
+            for t, image in zip(stamps.tolist(), images, strict=True):
+                message = image_message(store, t, image, "mono8", 1)
+                messages.append((t + delay_ns, f"/cam{camera}/image_raw", message))
+    return sorted(messages, key=lambda entry: entry[:2])
+
+
+def written_bag(tmp_path: Path, messages: list[tuple[int, str, Any]]) -> Path:
+    from rosbags.typesys import Stores, get_typestore
+
+    path = tmp_path / "a.bag"
+    path.unlink(missing_ok=True)
+    write_messages(path, get_typestore(Stores.ROS1_NOETIC), messages)
+    return path
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    pytest.importorskip("rosbags")
+    device = open_recording(write_folder(make_content(frames=2), tmp_path / "device")).device
+    return write_calibration(device, tmp_path / "sensors.yaml")
+
+
+def opened(path: Path, calibration: Path, imu_topic: str = "", **reading: Any):
+    options = SourceOptions(
+        sensor_calibration_file=calibration,
+        imu_topic=imu_topic,
+        reading=ReadingOptions(**reading),
+    )
+    return open_recording(path, options)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "parts", "dropped"),
+    [
+        ([1, 2, 3, 4], [[0, 1, 2, 3]], []),
+        ([1, 2, 2, 3], [[0, 1, 3]], [2]),
+        ([1, 3, 2, 4], [[0, 1, 3]], [2]),
+        ([1, 2, 3, 2, 3, 4], [[0, 1, 2, 5]], [3, 4]),  # a buffer that is delivered twice
+        ([0, 10**12, 10**12 + 1, 10**12 + 2], [[1, 2, 3]], [0]),
+        ([1, 2, 10**12, 3, 4], [[0, 1, 3, 4]], [2]),
+        ([1, 2, 3, 10**12], [[0, 1, 2]], [3]),
+    ],
+)
+def test_rows_that_are_left_out(
+    stamps: list[int], parts: list[list[int]], dropped: list[int]
+) -> None:
+    kept, left_out = parts_of(np.array(stamps) * 10**7)
+    assert [part.tolist() for part in kept] == parts
+    assert left_out.tolist() == dropped
+
+
+def test_four_runs() -> None:
+    run = np.arange(40) * 50_000_000
+    stamps = np.concatenate([run, run, run + 10**18, run])
+    kept, left_out = parts_of(stamps)
+    assert [part.tolist() for part in kept] == np.arange(160).reshape(4, 40).tolist()
+    assert not len(left_out)
+
+
+def four_runs(tmp_path: Path) -> tuple[Path, list[Content]]:
+    runs = [shifted(make_content(frames=14), -START_NS + k * SECOND // 10) for k in range(3)]
+    runs = [shifted(run, SECOND) for run in runs]
+    merged = Content(
+        np.concatenate([run.imu_ns for run in runs]),
+        np.concatenate([run.accel_gyro for run in runs]),
+        tuple(np.concatenate([run.stamps_ns[c] for run in runs]) for c in (0, 1)),
+        tuple([image for run in runs for image in run.images[c]] for c in (0, 1)),
+    )
+    folder = write_folder(merged, tmp_path / "room")
+    for camera in (0, 1):  # files of equal stamps: names of their own
+        home = folder / f"mav0/cam{camera}"
+        lines = ["#timestamp [ns],filename"]
+        import cv2
+
+        for number, (stamp, image) in enumerate(
+            zip(merged.stamps_ns[camera].tolist(), merged.images[camera], strict=True)
+        ):
+            cv2.imwrite(str(home / "data" / f"image {number}.png"), image)
+            lines.append(f"{stamp},image {number}.png")
+        (home / "data.csv").write_text("\n".join(lines) + "\n")
+    return folder, runs
+
+
+def test_parts_of_a_folder(tmp_path: Path) -> None:
+    folder, runs = four_runs(tmp_path)
+    for part, run in enumerate(runs, start=1):
+        options = SourceOptions(reading=ReadingOptions(recording_part=part))
+        assert_content(list(EventStream(open_recording(folder, options))), run)
+    report = summarise(open_recording(folder))
+    assert [part.part for part in report.parts] == [1, 2, 3]
+    assert {part.images for part in report.parts} == {28}
+    assert report.imu is not None
+    assert report.imu.samples == len(runs[0].imu_ns)
+    assert "figures are of part 1 of 3" in report.notes[0]
+    with pytest.raises(
+        ClockRestart, match=r"data.csv:\d+: the clock starts again: \d+ comes after"
+    ):
+        list(EventStream(open_recording(folder)))
+    stream = EventStream(open_recording(folder), StreamOptions(end_s=0.5))
+    assert frame_sets(list(stream))
+    with pytest.raises(UserError, match="--recording_part=4: the recording has 3 parts"):
+        list(
+            EventStream(
+                open_recording(folder, SourceOptions(reading=ReadingOptions(recording_part=4)))
+            )
+        )
+
+
+def test_parts_of_a_bag(tmp_path: Path, calibration: Path) -> None:
+    runs = [shifted(make_content(frames=14), -START_NS + SECOND + k) for k in range(3)]
+    path = written_bag(tmp_path, bag_messages(*runs))
+    for part, run in enumerate(runs, start=1):
+        recording = opened(path, calibration, recording_part=part)
+        assert recording.start_ns == int(run.imu_ns[0])
+        assert_content(list(EventStream(recording)), run)
+    report = summarise(opened(path, calibration))
+    assert [(part.part, part.images) for part in report.parts] == [(1, 28), (2, 28), (3, 28)]
+    with pytest.raises(ClockRestart, match="--recording_part=N"):
+        list(EventStream(opened(path, calibration)))
+    ended = EventStream(opened(path, calibration), StreamOptions(end_s=0.3))
+    assert frame_sets(list(ended))
+    with pytest.raises(UserError, match="--recording_part=9: the recording has 3 parts"):
+        opened(path, calibration, recording_part=9)
+
+
+def test_repeated_and_late_messages_of_a_bag(tmp_path: Path, calibration: Path) -> None:
+    content = make_content(frames=20)
+    messages = bag_messages(content)
+    imu = [row for row, entry in enumerate(messages) if entry[1] == "/imu0"]
+    images = [row for row, entry in enumerate(messages) if entry[1] == "/cam0/image_raw"]
+    repeated = [*messages[: imu[50] + 1], messages[imu[50]], *messages[imu[50] + 1 :]]
+    recording = opened(written_bag(tmp_path, repeated), calibration)
+    assert_content(list(EventStream(recording)), content)
+    (note,) = recording.notes
+    assert "/imu0: left out 1 with repeated, late or wild stamps" in note
+    stamp = messages[images[5]][2].header
+    stamp.stamp = messages[images[4]][2].header.stamp  # one image with the stamp of the one before
+    path = written_bag(tmp_path, messages)
+    assert len(frame_sets(list(EventStream(opened(path, calibration))))) == 19
+    with pytest.raises(MapError, match=r"1 of 20 stamps .*--max_late_share=0"):
+        list(EventStream(opened(path, calibration, max_late_share=0.0)))
+    late = StreamOptions(start_s=0.4)
+    strict = opened(path, calibration, max_late_share=0.0)
+    assert len(frame_sets(list(EventStream(strict, late)))) == 12
+
+
+def test_rows_of_another_clock_are_named(tmp_path: Path) -> None:
+    content = make_content(frames=4)
+    folder = write_folder(content, tmp_path / "room")
+    table = folder / "mav0/imu0/data.csv"
+    lines = table.read_text().splitlines()
+    lines[20] = "77," + lines[20].split(",", 1)[1]
+    table.write_text("\n".join(lines) + "\n")
+    recording = open_recording(folder)
+    times_ns, _ = samples(list(EventStream(recording)))
+    np.testing.assert_array_equal(times_ns, np.delete(content.imu_ns, 19))
+    (note,) = recording.notes
+    assert note.endswith(f"the first is 77 after {content.imu_ns[18]} (lines 21)")
+    for row in (21, 22, 30):
+        lines[row] = f"{row}," + lines[row].split(",", 1)[1]
+    table.write_text("\n".join(lines) + "\n")
+    with pytest.raises(MapError, match=r"imu0/data.csv:21: 4 of \d+ stamps do not come after"):
+        list(EventStream(open_recording(folder)))
+    some = SourceOptions(reading=ReadingOptions(max_late_share=0.1))
+    assert (
+        len(samples(list(EventStream(open_recording(folder, some))))[0]) == len(content.imu_ns) - 4
+    )
+
+
+def test_zero_stamps_and_arrival_times(tmp_path: Path, calibration: Path) -> None:
+    content = make_content(frames=8)
+    messages = bag_messages(content)
+    images = [entry for entry in messages if entry[1] == "/cam0/image_raw"]
+    images[0][2].header.stamp.sec = images[0][2].header.stamp.nanosec = 0
+    recording = opened(written_bag(tmp_path, messages), calibration)
+    assert recording.start_ns == int(content.imu_ns[0])
+    assert len(frame_sets(list(EventStream(recording)))) == 7
+    for entry in images:
+        entry[2].header.stamp.sec = entry[2].header.stamp.nanosec = 0
+    path = written_bag(tmp_path, messages)
+    with pytest.raises(
+        MapError, match=r"/cam0/image_raw: the stamps .* are all 0.*--use_arrival_time"
+    ):
+        opened(path, calibration)
+    arrived = opened(path, calibration, use_arrival_time=True)
+    assert len(frame_sets(list(EventStream(arrived)))) == 8
+    with pytest.raises(UserError, match="--use_arrival_time applies to bags only"):
+        open_recording(
+            tmp_path / "device", SourceOptions(reading=ReadingOptions(use_arrival_time=True))
+        )
+
+
+def test_gyroscope_and_accelerometer_on_two_topics(tmp_path: Path, calibration: Path) -> None:
+    content = make_content(frames=8)
+    ramp = np.linspace(0.0, 1.0, len(content.imu_ns))
+    content.accel_gyro[:, :3] = ramp[:, None] * [1.0, 2.0, 9.0]
+    messages = bag_messages(content)
+    gyro = [entry for entry in messages if entry[1] == "/imu0"]
+    both: list[tuple[int, str, Any]] = [entry for entry in messages if entry[1] != "/imu0"]
+    for number, (arrival, _, message) in enumerate(gyro):
+        zero = type(message.linear_acceleration)(0.0, 0.0, 0.0)
+        both.append((arrival, "/gyro", dataclasses.replace(message, linear_acceleration=zero)))
+        if number % 3 == 0:
+            both.append((arrival, "/accel", dataclasses.replace(message, angular_velocity=zero)))
+    path = written_bag(tmp_path, sorted(both, key=lambda entry: entry[:2]))
+    times_ns, values = samples(list(EventStream(opened(path, calibration, "/gyro,/accel"))))
+    np.testing.assert_array_equal(times_ns, content.imu_ns[: len(times_ns)])
+    assert len(times_ns) >= len(content.imu_ns) - 3
+    np.testing.assert_allclose(values, content.accel_gyro[: len(times_ns)], atol=1e-12)
+    report = summarise(opened(path, calibration, "/gyro"))
+    assert any(
+        "all accelerations of the IMU are 0: --imu_topic=GYRO,ACCEL" in n for n in report.notes
+    )
