@@ -44,11 +44,12 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
                 table = _from_text(data[begin:], dtype, count)
     except (ValueError, FloatingPointError) as error:
         raise MapError(f"{source}: the PCD data end early or do not fit ({error})") from None
-    p = np.stack([table[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
-    valid = np.isfinite(p).all(axis=1)
     intensity = None
-    if "intensity" in (dtype.names or ()):
-        intensity = table["intensity"].astype(np.float64)[valid]
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        p = np.stack([table[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
+        valid = np.isfinite(p).all(axis=1)
+        if "intensity" in (dtype.names or ()):
+            intensity = table["intensity"].astype(np.float64)[valid]
     colours = _colours(table)
     return PlyCloud(p[valid], None if colours is None else colours[valid], intensity)
 
@@ -65,7 +66,7 @@ def _header(data: bytes, source: str) -> tuple[dict[str, list[str]], int]:
 
 
 def _point_type(header: dict[str, list[str]], source: str) -> np.dtype[np.void]:
-    names = header["FIELDS"]
+    names = header.get("FIELDS", [])
     counts = header.get("COUNT", ["1"] * len(names))
     try:
         fields = []

@@ -83,9 +83,10 @@ def parse_ply(data: bytes, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> P
     if vertices is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise MapError(f"{source}: the PLY file has no vertices with x, y, z")
     names = vertices.dtype.names or ()
-    p = np.stack([vertices[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
-    intensity = next((vertices[n].astype(np.float64) for n in _INTENSITIES if n in names), None)
-    return PlyCloud(p, _colours(vertices), intensity, faces)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        p = np.stack([vertices[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
+        intensity = next((vertices[n].astype(np.float64) for n in _INTENSITIES if n in names), None)
+        return PlyCloud(p, _colours(vertices), intensity, faces)
 
 
 def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
@@ -172,7 +173,7 @@ def _colours(vertices: NDArray[np.void]) -> U8 | None:
         if set(triple) <= set(names):
             columns = np.stack([vertices[name] for name in triple], axis=1)
             if columns.dtype.kind == "f":
-                columns = np.round(255.0 * np.clip(columns, 0.0, 1.0))
+                columns = np.round(255.0 * np.clip(np.nan_to_num(columns), 0.0, 1.0))
             return columns.astype(np.uint8)
     return None
 
