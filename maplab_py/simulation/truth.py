@@ -19,6 +19,7 @@ from maplab_py.geometry.alignment import umeyama
 from maplab_py.input_files import read_npz
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import CameraRig, Imu, ImuIntrinsics, SensorSet
+from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.simulation.recording import Recording
 from maplab_py.simulation.sensors import Device, mission_frame
 from maplab_py.simulation.world import World
@@ -27,7 +28,7 @@ from maplab_py.vimap.ids import IdIndex, from_hex
 
 STATIONARY_MPS, STATIONARY_RADPS = 1e-3, 1e-3
 """Speed limits below which the body is at rest."""
-_MOST_PARAMETERS = 9
+_MOST_PARAMETERS = max(INTRINSICS_SIZE[p] + DISTORTION_SIZE[d] for p, d in CAMERA_MODELS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ class Truth:
     imu_T_a: F64  # (M, 3, 3)
     imu_R_A_I: F64  # (M, 3, 3)
     camera_id: U64  # (M, C, 2)
-    camera_parameters: F64  # (M, C, 9) intrinsics, then distortion, then NaN
+    camera_parameters: F64  # (M, C, 13) intrinsics, then distortion, then NaN
     T_I_C: F64  # (M, C, 7)
     point_G: F64  # (P, 3) world points
     point_look: I64  # (P,) points of equal number have the same appearance

@@ -7,10 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.sensors import Camera, CameraRig, Distortion, Projection
 from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import project
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
+from maplab_py.simulation.scenario import CameraOptions, Scenario, SessionOptions
+from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.truth import true_map
 
 PARAMETERS = {
     Distortion.NONE: [],
@@ -90,3 +93,30 @@ def test_field_of_view_ends_where_the_image_turns_back() -> None:
     assert np.all(np.diff(u) > 0.0)
     beyond = pixels_of(camera, np.array([[limit * 1.1, 0, 1.0], [limit, 0, 1.0]]))[:, 0]
     assert beyond[0] < beyond[1]
+
+
+def test_the_truth_of_a_session_holds_cameras_with_the_most_parameters() -> None:
+    cameras = tuple(
+        CameraOptions(
+            projection=projection.value,
+            distortion=distortion.value,
+            intrinsics=(*MIRROR[projection], *PINHOLE),
+            distortion_parameters=tuple(PARAMETERS[distortion]),
+        )
+        for projection, distortion in (
+            (Projection.UNIFIED, Distortion.RATIONAL),
+            (Projection.DOUBLE_SPHERE, Distortion.NONE),
+        )
+    )
+    scenario = dataclasses.replace(
+        Scenario(), sessions=(SessionOptions(duration_s=2.0),), cameras=cameras
+    )
+    data = simulate(scenario)
+    rig = next(
+        sensor
+        for sensor in true_map(data.maps[0], data.truth).sensors.sensors.values()
+        if isinstance(sensor, CameraRig)
+    )
+    for camera, options in zip(rig.cameras, cameras, strict=True):
+        assert camera.intrinsics.tolist() == list(options.intrinsics)
+        assert camera.distortion_parameters.tolist() == list(options.distortion_parameters)
