@@ -129,7 +129,7 @@ def check_dropped(name: str, dropped: int, count: int, first: Dropped | None, sh
 
 def dropped_note(name: str, dropped: int, first: Dropped | None) -> str:
     """Return a line on items that were left out."""
-    where = f", the first is {first.stamp_ns} after {first.before_ns}" if first is not None else ""
+    where = f", the first is {first.stamp_ns} beside {first.before_ns}" if first is not None else ""
     return f"{name}: left out {dropped} with repeated, late or wild stamps{where}"
 
 

@@ -116,7 +116,7 @@ class FolderRecording:
         )
         if others and self._names_all:
             notes.append(
-                f"{', '.join(others)}: not read: the calibration has {len(self._numbers)} cameras, which are "
+                f"{', '.join(others)}: not read: the cameras of the calibration ({len(self._numbers)}) are "
                 "counted from cam0 without gaps"
             )
         return tuple(notes)
@@ -215,6 +215,11 @@ class _Table:
         self._path, self.name, self.note = path, path.parent.name, note
         self.stamps_ns, self._lines = stamps_ns, lines
         self.times_ns = stamps_ns + time_offset_ns
+        if len(stamps_ns) > 1 and not stamps_ns.any():
+            raise MapError(
+                f"{path}: all time stamps are 0, as of a driver that sets none: write the times at which the "
+                "rows were recorded into the table"
+            )
         self.parts, self._dropped = parts_of(stamps_ns)
 
     @property
@@ -271,7 +276,8 @@ class _Table:
 
     def _first(self, dropped: I64) -> Dropped:
         row = int(dropped[0])
-        return Dropped(int(self.stamps_ns[row]), int(self.stamps_ns[max(row - 1, 0)]))
+        before = self.stamps_ns[row - 1] if row else self.stamps_ns[self.parts[0][0]]
+        return Dropped(int(self.stamps_ns[row]), int(before))
 
 
 class _ImuTable(_Table):

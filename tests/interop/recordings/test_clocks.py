@@ -207,7 +207,7 @@ def test_rows_of_another_clock_are_named(tmp_path: Path) -> None:
     times_ns, _ = samples(list(EventStream(recording)))
     np.testing.assert_array_equal(times_ns, np.delete(content.imu_ns, 19))
     (note,) = recording.notes
-    assert note.endswith(f"the first is 77 after {content.imu_ns[18]} (lines 21)")
+    assert note.endswith(f"the first is 77 beside {content.imu_ns[18]} (lines 21)")
     for row in (21, 22, 30):
         lines[row] = f"{row}," + lines[row].split(",", 1)[1]
     table.write_text("\n".join(lines) + "\n")
@@ -263,3 +263,43 @@ def test_gyroscope_and_accelerometer_on_two_topics(tmp_path: Path, calibration: 
     assert any(
         "all accelerations of the IMU are 0: --imu_topic=GYRO,ACCEL" in n for n in report.notes
     )
+
+
+def test_tables_of_zeros_and_a_zero_at_first(tmp_path: Path) -> None:
+    content = make_content(frames=6)
+    folder = write_folder(content, tmp_path / "room")
+    table = folder / "mav0/cam0/data.csv"
+    header, *rows = table.read_text().splitlines()
+    zeros = [f"0,{row.split(',')[1]}" for row in rows]
+    table.write_text("\n".join([header, zeros[0], *rows[1:]]) + "\n")
+    recording = open_recording(folder)
+    assert len(frame_sets(list(EventStream(recording)))) == 5
+    assert f"the first is 0 beside {content.stamps_ns[0][1]} (lines 2)" in recording.notes[0]
+    table.write_text("\n".join([header, *zeros]) + "\n")
+    with pytest.raises(MapError, match=r"cam0/data.csv: all time stamps are 0"):
+        open_recording(folder)
+
+
+def test_what_is_odd_is_noted(tmp_path: Path) -> None:
+    content = make_content(frames=30)
+    slow = dataclasses.replace(
+        content, imu_ns=content.imu_ns[:180:8], accel_gyro=content.accel_gyro[:180:8]
+    )
+    stamps = tuple(times.copy() for times in content.stamps_ns)
+    stamps[0][20:] += 60 * SECOND
+    stamps[1][:] += 7_000_000
+    folder = write_folder(dataclasses.replace(slow, stamps_ns=stamps), tmp_path / "room")
+    (folder / "mav0/cam3").mkdir()
+    notes = " | ".join(summarise(open_recording(folder)).notes)
+    for words in (
+        "cam3: not read",
+        "the IMU delivers 25 samples per second",
+        "the IMU ends at 0.88 s, the images at 61.47 s",
+        "camera 0: no images for 60.05 s from 0.97 s on",
+        "30 of 30 images of camera 1 have no partner in camera 0",
+    ):
+        assert words in notes
+    late = dataclasses.replace(content, imu_ns=content.imu_ns + 3600 * SECOND)
+    folder = write_folder(late, tmp_path / "late")
+    notes = " | ".join(summarise(open_recording(folder)).notes)
+    assert "IMU and images have no time in common" in notes
