@@ -111,9 +111,8 @@ def _slope(first: F64, second: F64) -> tuple[float, float]:
     first, second = first - first.mean(axis=0), second - second.mean(axis=0)
     slope, rows = 1.0, np.arange(len(first))
     for _ in range(_ROUNDS):
-        slope = float(
-            np.vdot(first[rows], second[rows]) / max(np.vdot(first[rows], first[rows]), 1e-12)
-        )
+        power = float(np.vdot(first[rows], first[rows])) + 1e-12
+        slope = float(np.vdot(first[rows], second[rows])) / power
         off = np.linalg.norm(second - slope * first, axis=1)
         rows = np.argsort(off, kind="stable")[: max(1, round(0.95 * len(off)))]
     return slope, float(np.sqrt(np.mean(np.sum(first[rows] ** 2, axis=1))))
