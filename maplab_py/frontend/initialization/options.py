@@ -72,7 +72,7 @@ class InitializationOptions:
         help="Time after which the limits of scale and gravity grow with the time that has passed",
     )
     provisional_s: float = option(
-        2.2,
+        2.5,
         unit="s",
         help="Time after which the estimator starts with what is known, and follows scale, velocity and "
         "biases once they show",
