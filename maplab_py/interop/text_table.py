@@ -20,6 +20,7 @@ from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
+_AXIS, _AXES = re.compile(r"(^|[^a-z])[a-z]{0,2}[wxyz]\W*(\[.*)?$"), 3
 _ID = re.compile(r"(^|[-_. ])id$")
 _SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")
 _TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$")
@@ -101,7 +102,7 @@ def parse_text_table(
     if ";" in lines[0] and "," not in lines[0]:
         lines, others = ([line.replace(";", ",") for line in part] for part in (lines, others))
     has_commas = "," in lines[0]
-    header, time_name, rows = _named_cells(others, lines)
+    header, time_name, rows = _named_cells(others, lines, source)
     if len(header) > 1 and _SECONDS.fullmatch(header[0]) and _NANOSECONDS.fullmatch(header[1]):
         header, time_name = ("time", *header[2:]), "time [s]"  # the stamp of ROS in two columns
         rows = [[f"{row[0]}.{row[1]:0>9}", *row[2:]] if len(row) > 1 else row for row in rows]
@@ -191,12 +192,15 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
 
 
 def _named_cells(
-    others: list[str], lines: list[str]
+    others: list[str], lines: list[str], source: str
 ) -> tuple[tuple[str, ...], str, list[list[str]]]:
     """Return the names of the columns, what tells the unit of the stamps, and the cells of the rows.
 
     The names are in the line that has as many as the rows have cells, wherever it stands: of several the
-    last that begins with a time stamp.
+    last that begins with a time stamp and names the most axes, as prose does not.
+
+    Raises:
+        MapError: Two lines name axes, and differently.
     """
     named = [_words(line) for line in others]
     for cells in [_cells, _split] if "," in lines[0] else [_split]:
@@ -205,7 +209,11 @@ def _named_cells(
         if fitting:
             break
     timed = [words for words in fitting if is_time_name(words[0].lower())]
-    chosen = (timed or fitting or named or [[]])[-1]
+    chosen = max(reversed(timed or fitting or named or [[]]), key=_axes)
+    if any(_axes(words) >= _AXES and words != chosen for words in timed):
+        raise MapError(
+            f"{source}: two lines name the columns, and differently ({' '.join(chosen)}): keep one of them"
+        )
     # as in "# time stamps in microseconds"
     about = [line for line in others if re.search(r"time|stamp", line.lower())]
     telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
@@ -221,6 +229,11 @@ def _named_cells(
         ]
         header = (header[place], *header[:place], *header[place + 1 :])
     return header, telling[0] if telling else "", rows
+
+
+def _axes(words: list[str]) -> int:
+    """Return how many words are names of axes, as in tx, q_w, position.x."""
+    return sum(_AXIS.search(word.strip().lower()) is not None for word in words)
 
 
 def _time_place(header: tuple[str, ...]) -> int:

@@ -90,6 +90,10 @@ def test_formats_are_told_from_content(tmp_path: Path, text: str, pose: list[flo
         ("1 2 3 4 0 0 0 2\n", r":1: the quaternion is not of unit length"),
         ("2 2 3 4 0 0 0 1\n1 2 3 4 0 0 0 1\n", r":2: the time stamp lies before"),
         ("1 2 3\n", "there is no column for px, py, pz;"),
+        (
+            "# t x y z qx qy qz qw\n1 2 3 4 0 0 0 1\n# t x y z qw qx qy qz\n",
+            "two lines name the columns",
+        ),
         ("t,x,y,z,q0,q1,q2,q3\n1,0,0,0,1,0,0,0\n", "no column for qx"),
         ("vertex index,px,py,pz,qw,qx,qy,qz\n1,2,3,4,1,0,0,0\n", "must be the time stamp"),
         ("5\n", "a time stamp and values are expected"),
@@ -111,6 +115,7 @@ ROW = "0.5 1 2 3 0.8 0.6 0 0\n"
         "# timestamp tx ty tz qw qx qy qz\n# another comment line\n" + ROW,
         "# made by a program\n# timestamp tx ty tz qw qx qy qz\n# and eight more words of a comment\n"
         + ROW,
+        "# timestamp tx ty tz qw qx qy qz\n# stamps are made in seconds by this clock\n" + ROW,
         "# a comment\ntimestamp tx ty tz qw qx qy qz\n" + ROW,
         ROW + "# timestamp tx ty tz qw qx qy qz\n",
         "# timestamp [s] tx [m] ty [m] tz [m] qw qx qy qz\n" + ROW,
