@@ -64,7 +64,7 @@ class ColmapDatabase:
             self._connection = sqlite3.connect(uri, uri=True)
             self._id_of = dict(self._connection.execute("SELECT name, image_id FROM images"))
             columns = self._connection.execute("PRAGMA table_info(descriptors)").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise self._damaged(str(error)) from error
         self._has_types = any(column[1] == "type" for column in columns)
 
@@ -126,7 +126,7 @@ class ColmapDatabase:
         query = f"SELECT {columns} FROM {table} WHERE image_id = ?"
         try:
             row: tuple[int, ...] | None = self._connection.execute(query, (image,)).fetchone()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise self._damaged(str(error)) from error
         if row is not None and not all(isinstance(value, int) for value in row[:-1]):
             raise self._damaged(f"{table} of image {image} have no sizes")

@@ -135,7 +135,11 @@ def _report(
             _camera_summary(recording, row, times, statistics.unmatched_images[row])
             for row, times in enumerate(statistics.images)
         ),
-        notes=(*recording.notes, *_notes(recording, statistics, options, encodings)),
+        notes=(
+            *recording.device.notes,
+            *recording.notes,
+            *_notes(recording, statistics, options, encodings),
+        ),
     )
 
 
