@@ -29,8 +29,7 @@ def measure_start() -> dict[str, float]:
     The seconds extra are those of a process' first optvi less those of its second.
     """
     with tempfile.TemporaryDirectory() as folder:
-        caches = {"MAPLAB_CACHE_DIR": folder, "NUMBA_CACHE_DIR": folder}
-        first, following = _in_process(1, **caches), _in_process(1, **caches)
+        first, following = (_in_process(1, MAPLAB_CACHE_DIR=folder) for _ in range(2))
     return {
         "first_on_a_machine_wall_s": first["first"]["wall_s"],
         "first_on_a_machine_cpu_s": first["first"]["cpu_s"],
