@@ -48,7 +48,7 @@ HOMES = {
     "matplotlib": ("plotting",),
     "rosbags": ("interop/recordings",),
     "cyclonedds": ("interop/live",),
-    "websockets": ("interop/live",),
+    "websockets": ("interop/live", "viewer/display"),
     "small_gicp": ("algorithms/cloud_registration",),
     "kiss_matcher": ("algorithms/cloud_registration",),
     "rich": ("console", "viewer/display"),
