@@ -90,11 +90,11 @@ class Ros2:
         with self._lock:
             condition = ReadCondition(self._publications, mask)
             publications = self._publications.read(10 * _LARGEST_TAKE, condition=condition)
-        own = {bytes(writer.guid.bytes) for writer in self._writers.values()}
+        published_here = {bytes(writer.guid.bytes) for writer in self._writers.values()}
         topics: dict[str, Topic] = {}
         for publication in publications:
             name = getattr(publication, "topic_name", "")
-            if not name.startswith(f"{_PREFIX}/") or publication.key.bytes in own:
+            if not name.startswith(f"{_PREFIX}/") or publication.key.bytes in published_here:
                 continue
             name = name.removeprefix(_PREFIX)
             reliability = publication.qos[Policy.Reliability]
@@ -229,7 +229,7 @@ def _configuration(network: NetworkOptions) -> str:
     peers += [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     listed = "".join(f'<Peer Address="{peer}"/>' for peer in peers)
     multicast = "false" if is_local else "default"
-    own = (
+    configuration = (
         '<CycloneDDS><Domain Id="any"><General><Interfaces>'
         f'<NetworkInterface address="{address}" multicast="{multicast}"/></Interfaces>'
         f"{'<AllowMulticast>false</AllowMulticast>' if is_local else ''}</General>"
@@ -243,7 +243,7 @@ def _configuration(network: NetworkOptions) -> str:
         "</Domain></CycloneDDS>"
     )
     given = os.environ.get("CYCLONEDDS_URI", "")
-    return f"{own},{given}" if given else own
+    return f"{configuration},{given}" if given else configuration
 
 
 def _socket_problems() -> list[str]:
