@@ -29,7 +29,7 @@ def pages(registry: Registry) -> dict[str, str]:
 def decisions() -> str:
     """Return the list of decision records."""
     lines = [_NOTE, "# Decisions\n"]
-    lines += ["Choices that would be costly to reverse, each with its context and consequences.\n"]
+    lines += ["Choices that would be costly to reverse, why, and what was rejected.\n"]
     for path in sorted(DECISIONS.glob("0*.md")):
         title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
         lines.append(f"- [{title}]({path.name})")

@@ -154,14 +154,14 @@ def test_python_blocks_compile() -> None:
     assert compiled >= 5
 
 
-def test_decisions_have_three_parts_and_fit_on_a_page() -> None:
+def test_decisions_say_why_and_what_was_rejected_on_a_page() -> None:
     decisions = sorted((DOCS / "decisions").glob("0*.md"))
     numbers = [int(path.name[:4]) for path in decisions]
     assert numbers == list(range(1, len(decisions) + 1))
     for number, path in zip(numbers, decisions, strict=True):
         text = path.read_text()
         assert text.startswith(f"# {number}. "), f"{path.name} has another number in its title"
-        for part in ("**Context.**", "**Decision.**", "**Consequences.**"):
+        for part in ("**Decision.**", "**Reasons.**", "**Rejected.**"):
             assert part in text, f"{path.name} lacks {part}"
         assert len(text.split()) <= 450, f"{path.name} is longer than a page"
 

@@ -111,7 +111,7 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map() -> None:
     found = {one.parameter: one for one in report.parameters}
     assert found["camera focal length u"].after == pytest.approx(459.7, abs=1.0)
     assert found["camera focal length v"].after == pytest.approx(458.5, abs=1.0)
-    # these images would move the camera by 4 cm: decision 33
+    # these images would move the camera by 4 cm: decision 18
     assert found["camera position z"].verdict.startswith("kept: the data would move the camera")
     session.run("optvi")
     after: Any = session.run("evaluate_trajectory", ground_truth=truth, alignment="se3")

@@ -31,7 +31,7 @@ from maplab_py.vision.rays_and_points import Rays, points_near_rays
 
 _RADIUS_PX = 12.0
 _MAX_SIGMAS, _BIT_FACTOR = 2.0, 0.75
-"""Limits of matches. Wider ones merge more, but on recorded maps also different points (decision 52)."""
+"""Limits of matches. Wider ones merge more, but on recorded maps also different points (decision 15)."""
 _MIN_SHARED_LANDMARKS = 5
 """Vertices that share as many landmarks with the place's vertex belong to the place."""
 _CLOSURES_AT_ONCE = 256

@@ -1,8 +1,8 @@
 """Calibration with checks that formal deviations cannot replace.
 
 Formal deviations follow from the noise of the measurements. On recorded maps they are several times
-too small for the camera's position, because they do not contain errors of the models (decisions 97
-and 99). Hence the camera's position is limited, and results on parts of the data are compared.
+too small for the camera's position, because they do not contain errors of the models (decision 18).
+Hence the camera's position is limited, and results on parts of the data are compared.
 """
 
 from __future__ import annotations

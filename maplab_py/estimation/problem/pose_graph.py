@@ -1,8 +1,8 @@
 """Pose graphs as least squares: one node of six numbers a pose, and nothing else.
 
 `Problem` has five nodes of three numbers a vertex. On graphs of some hundred poses that, and the
-Jacobians it keeps, cost several times what these blocks of 6 x 6 do (see the decision record on pose
-graphs). The solver, the trust region and the losses are the same.
+Jacobians it keeps, cost several times what these blocks of 6 x 6 do (see decision 11). The
+solver, the trust region and the losses are the same.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class FixedLagSmoother:
     A window has a number of keyframes and the latest frames. The latest become keyframes or are
     dropped, their inertial intervals joined and their observations forgotten. The oldest keyframe is
     marginalised together with the landmarks anchored in it whose tracks have ended. Landmarks still
-    tracked lose its observation and are anchored where they were seen next (see decision 40).
+    tracked lose its observation and are anchored where they were seen next (see decision 20).
     """
 
     def __init__(

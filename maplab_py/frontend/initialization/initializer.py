@@ -47,7 +47,7 @@ class Initializer:
 
     A device at rest starts by the mean of its samples; one in motion by a closed form and least squares over
     the latest seconds. Such an attempt is spread over some frames, and gives the state of the frame with
-    which it began (see decision 42). `reason` says why it has not started yet, `attempt` what the last
+    which it began (see decision 22). `reason` says why it has not started yet, `attempt` what the last
     attempt in motion has found.
     """
 

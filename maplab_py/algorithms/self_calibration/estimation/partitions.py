@@ -93,7 +93,7 @@ def parallax_rad(vi_map: VIMap) -> F64:
 
     It is the motion across the line of sight over the landmark's distance, which is clamped: from
     below by a quantile of all distances, from above by `_MAX_DISTANCE_M`. Distances of landmarks
-    without parallax are noise, and mostly too small (decision 29).
+    without parallax are noise, and mostly too small (decision 18).
     """
     rows = vi_map.observations
     landmark = vi_map.keypoints.landmark[rows]

@@ -1,4 +1,4 @@
-"""Cluster-robust covariance: errors may be correlated within a track (decision 32).
+"""Cluster-robust covariance: errors may be correlated within a track (decision 18).
 
 The formal covariance takes all observations of a landmark for independent. Where a tracker drifts,
 errors in neighbouring images are correlated, and the same number of observations contains less
