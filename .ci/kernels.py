@@ -27,6 +27,7 @@ _NEEDED = (
     "numpy",
     "opencv-python-headless",
     "protobuf",
+    "pymetis",
     "pyyaml",
     "scipy",
     "threadpoolctl",
