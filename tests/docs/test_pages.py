@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import load_registry
@@ -47,11 +49,23 @@ def test_generated_pages_are_up_to_date() -> None:
         (migration.FLAGS_PAGE, migration.flags_page(load_registry())),
     ):
         assert path.read_text() == text, "run docs/scripts/generate_migration_page.py"
+    api = script_module("generate_api_page")
+    assert api.PAGE.read_text() == api.page(), "run docs/scripts/generate_api_page.py"
     script = script_module("generate_command_pages")
     for folder, expected in (("decisions", script.decisions()), ("studies", script.studies())):
         assert (DOCS / folder / "index.md").read_text() == expected, (
             "run docs/scripts/generate_command_pages.py"
         )
+
+
+def test_tables_of_contents_are_the_menu() -> None:
+    menu = yaml.safe_load((REPOSITORY / "mkdocs.yml").read_text())["nav"]
+    titles = [title for entry in menu for title in entry]
+    assert len(titles) == 6
+    for path in (REPOSITORY / "README.md", DOCS / "index.md"):
+        table = path.read_text().split("| contents | |\n|---|---|\n", 1)[1].split("\n\n", 1)[0]
+        cells = [row.split("|")[1].strip() for row in table.splitlines()]
+        assert [re.sub(r"\[(.*)\]\(.*\)|\*\*(.*)\*\*", r"\1\2", cell) for cell in cells] == titles
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))

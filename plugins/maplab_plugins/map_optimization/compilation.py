@@ -9,7 +9,7 @@ from maplab_py.plugin import CommandContext, Report, command
 
 @dataclasses.dataclass(frozen=True)
 class WarmupReport(Report):
-    """Which kernels are ready, and where."""
+    """Number of kernels that are ready, and their folder."""
 
     kernels: list[str]
     seconds: float
