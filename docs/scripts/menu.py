@@ -1,7 +1,8 @@
-"""A hook of mkdocs: a folder in the menu stands for all of its pages, its index first."""
+"""Hooks of mkdocs: folders in the menu stand for their pages, and links to sources are for the repository."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,27 @@ def on_config(config: Any) -> Any:
     """
     config.nav = _expand(config.nav, Path(config.docs_dir))
     return config
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Turn links to files of the repository outside docs, which the site does not have, into code.
+
+    Args:
+        markdown: Text of a page.
+        page: The page.
+
+    Returns:
+        The text; links to files that do not exist stay, and fail the build.
+    """
+    source = Path(page.file.abs_src_path)
+    docs = Path(__file__).resolve().parents[1]
+
+    def as_code(match: re.Match[str]) -> str:
+        target = (source.parent / match[2]).resolve()
+        is_source = target.exists() and not target.is_relative_to(docs)
+        return f"`{match[1]}`" if is_source else match[0]
+
+    return re.sub(r"\[([^\]`]+)\]\((\.\./[^)#]+)\)", as_code, markdown)
 
 
 def _expand(entry: Any, docs: Path) -> Any:
