@@ -28,6 +28,7 @@ from maplab_py.algorithms.relaxation.graph_files import map_of_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.array_types import F64
+from maplab_py.atomic import write_file
 from maplab_py.cancellation import cleaned_up
 from maplab_py.compilation import BUILT_WITH, CODE_FOLDER, built_with
 from maplab_py.estimation.codegen import modules
@@ -122,7 +123,7 @@ def compile_for_wheel(cache: Path) -> None:
     if file.exists():
         before = json.loads(file.read_text(encoding="utf-8"))
         tells["processor"] = f"{before['processor']}, {tells['processor']}"
-    file.write_text(json.dumps(tells, indent=1), encoding="utf-8")
+    write_file(file, [json.dumps(tells, indent=1).encode()], durable=False)
 
 
 def _compile(name: str) -> None:

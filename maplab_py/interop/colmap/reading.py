@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.colmap.binary import REMEDY, read_binary
 from maplab_py.interop.colmap.child import BINARY, TEXT
@@ -134,7 +135,10 @@ def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]
     names: dict[int, str] = {}
     poses: dict[int, F64] = {}
     try:
-        with path.open(encoding="utf-8-sig") as stream, copy.open("w", encoding="utf-8") as target:
+        with (
+            path.open(encoding="utf-8-sig") as stream,
+            replaced_file(copy, durable=False) as target,
+        ):
             for number, line in enumerate(stream, start=1):
                 words = line.split(maxsplit=9)
                 if not words or words[0].startswith("#"):
@@ -151,7 +155,8 @@ def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]
                     raise MapError(f"{path}:{number}: the pose of image {image} is none; {REMEDY}")
                 names[image] = name
                 poses[image] = np.concatenate([values[[1, 2, 3, 0]] / length, values[4:]])
-                target.write(" ".join(words[:9]) + f" {image}\n" + next(stream, "\n"))
+                record = " ".join(words[:9]) + f" {image}\n" + next(stream, "\n")
+                target.write(record.encode())
     except OSError as error:
         raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
     except UnicodeDecodeError as error:

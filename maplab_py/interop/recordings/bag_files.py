@@ -90,7 +90,8 @@ def opened_bag(path: Path) -> Iterator[BagReader]:
         raise _library_missing(str(path)) from error
     try:
         _check_databases(path)
-        with BagReader(path) as reader:
+        metadata = _metadata(path)
+        with BagReader(path, _storage_files(path, metadata), metadata) as reader:
             yield reader
     except MaplabError:
         raise
@@ -101,7 +102,7 @@ def opened_bag(path: Path) -> Iterator[BagReader]:
         ) from error
 
 
-def storage_files(path: Path) -> list[Path]:
+def _storage_files(path: Path, metadata: dict[str, Any]) -> list[Path]:
     """Return the files of a ROS 2 bag: those of its metadata.yaml, or all, where it has none.
 
     Raises:
@@ -110,7 +111,7 @@ def storage_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     present = _storages_in(path)
-    listed = bag_metadata(path).get("relative_file_paths") or []
+    listed = metadata.get("relative_file_paths") or []
     named = [Path(str(name)).name for name in listed]
     if not named or not present:
         if not present:
@@ -133,7 +134,7 @@ def storage_files(path: Path) -> list[Path]:
     return files
 
 
-def bag_metadata(path: Path) -> dict[str, Any]:
+def _metadata(path: Path) -> dict[str, Any]:
     """Return what the metadata.yaml of a folder says; nothing where there is none, or it is damaged."""
     import yaml
 

@@ -11,8 +11,9 @@ import contextlib
 import heapq
 import itertools
 import shutil
+import sys
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,13 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings.bag_files import bag_metadata, storage_files
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 _ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
 _FORMATS = {
@@ -52,9 +58,16 @@ class BagReader:
         message_count: Messages of all.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Name a bag; nothing is read yet."""
-        self._path, self._stack = path, contextlib.ExitStack()
+    def __init__(self, path: Path, files: Sequence[Path], metadata: Mapping[str, Any]) -> None:
+        """Name a bag; nothing is read yet.
+
+        Args:
+            path: Bag.
+            files: Its storage files.
+            metadata: What its metadata.yaml says; empty without one.
+        """
+        self._path, self._files, self._metadata = path, files, metadata
+        self._stack = contextlib.ExitStack()
         self._storages: list[Any] = []
         self._sources: dict[int, list[tuple[Any, Connection]]] = {}
         self._stores: dict[str, Typestore] = {}
@@ -132,7 +145,7 @@ class BagReader:
     def _open(self) -> None:
         if self.is2:
             channels: dict[tuple[str, str], list[tuple[Any, Connection]]] = {}
-            for file in storage_files(self._path):
+            for file in self._files:
                 storage: Any = _McapFile(self._unpacked(file)) if ".mcap" in file.suffixes else None
                 storage = storage or _Database(self._unpacked(file))
                 storage.open()
@@ -143,7 +156,7 @@ class BagReader:
                 for source in storage.connections:
                     key = source.topic, full_type(source.msgtype)
                     channels.setdefault(key, []).append((storage, source))
-            digests = _digests(self._path)
+            digests = _digests(self._metadata)
             for (topic, kind), sources in channels.items():
                 first = sources[0][1]
                 if not first.digest and topic in digests:
@@ -169,11 +182,9 @@ class BagReader:
         """Return a file that is not compressed as a whole; a temporary one for a file .zstd."""
         if file.suffix not in (".zstd", ".zst"):
             return file
-        from backports import zstd
-
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
         target = folder / file.stem
-        with zstd.open(file, "rb") as source, target.open("wb") as copy:
+        with zstd.open(file, "rb") as source, replaced_file(target, durable=False) as copy:
             shutil.copyfileobj(source, copy)
         return target
 
@@ -189,8 +200,6 @@ class BagReader:
         for source, time_ns, data in storage.messages(sources, start, stop):
             content = data
             if data[:4] == _ZSTD_FRAME and self.is2:
-                from backports import zstd
-
                 content = zstd.decompress(data)
             yield wanted[source.id][1], time_ns, content
 
@@ -230,11 +239,11 @@ def full_type(name: str) -> str:
     return name if not rest or "/" in rest else f"{package}/msg/{rest}"
 
 
-def _digests(path: Path) -> dict[str, str]:
+def _digests(metadata: Mapping[str, Any]) -> dict[str, str]:
     """Return the digests of the types by topic, which MCAP files leave to metadata.yaml."""
     digests: dict[str, str] = {}
     with contextlib.suppress(AttributeError, KeyError, TypeError):  # the metadata may be anything
-        for entry in bag_metadata(path).get("topics_with_message_count") or []:
+        for entry in metadata.get("topics_with_message_count") or []:
             topic = entry["topic_metadata"]
             digests[topic["name"]] = str(topic.get("type_description_hash", ""))
     return digests

@@ -21,7 +21,7 @@ _NODES = Path(__file__).parent / "nodes"
 _REQUIREMENTS = {
     "jazzy": ["numpy", "-r", str(_NODES / "requirements-jazzy.txt")],
     "kilted": ["numpy", "-r", str(_NODES / "requirements-kilted.txt")],
-    "foxglove": ["numpy", "foxglove-sdk==0.30.3", "rosbags>=0.10.4"],
+    "foxglove": ["numpy", "foxglove-sdk==0.30.3", "rosbags>=0.11.7"],
 }
 _DEBIAN = (
     "python3-rosmaster python3-rospy python3-sensor-msgs python3-nav-msgs python3-geometry-msgs "
