@@ -37,18 +37,13 @@ from maplab_py.estimation.window.standstill import Standstill
 from maplab_py.estimation.window.states import WindowStates, scale_sigma
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
+from maplab_py.estimation.window.turning import is_surely_on_the_spot, shows_parallax
 from maplab_py.estimation.window.update import ReleasedStates, WindowUpdate
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Camera, Imu
 
 _MIN_KNOWN_DEPTHS = 10
 """Landmarks of which the median depth is taken."""
-_PARALLAX_TIME_NS = 350_000_000
-_MIN_PARALLAX_TRACKS = 10
-_LEAST_PARALLAX_DEG = 0.25
-"""Median parallax over that time that only motion explains; EuRoC's cameras: 2 px."""
-_NEAR_M = 2.0
-"""Distance of points whose parallax by the cameras' way around the IMU is a turn's, too."""
 _ENOUGH_LANDMARKS = 150
 """Landmarks of the window beside which none is expected: noise of tracks at rest looks like a turn."""
 
@@ -207,37 +202,13 @@ class FixedLagSmoother:
         T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)
         self._states = self._states.with_frame(T_M_I, new_motion)
         self._prior = self._prior.with_frame(T_M_I, new_motion)
-        if frame.motion is Motion.TURNING and self._shows_parallax(frame):
+        if frame.motion is Motion.TURNING and shows_parallax(
+            frame, self._time_ns, self.tracks, self._states.T_M_I, self._cameras.T_I_C,
+            self._back_projection,
+        ):  # fmt: skip
             frame = dataclasses.replace(frame, motion=Motion.MOVING)
         self._append_frame(frame, is_keyframe=False)
         return frame
-
-    def _shows_parallax(self, frame: WindowFrame) -> bool:
-        """Tell whether a new frame, already predicted, shows parallax to one of half a second before.
-
-        From one image to the next, slow motion cannot be told from turning only.
-        """
-        old = np.flatnonzero(self._time_ns <= frame.time_ns - _PARALLAX_TIME_NS)
-        if not len(old):
-            return False
-        tracks, row = self.tracks, int(old[-1])
-        seen = tracks.observations.take(tracks.observations.frame == row)
-        rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
-        # one number for a track in a camera, which has one observation in a frame
-        cameras = int(max(frame.camera.max(initial=0), seen.camera.max(initial=0))) + 1
-        before = tracks.id[seen.row] * cameras + seen.camera
-        now = frame.track_id.astype(np.int64) * cameras + frame.camera
-        now[~valid] = -1
-        _, i, j = np.intersect1d(before, now, return_indices=True)
-        if len(i) < _MIN_PARALLAX_TRACKS:
-            return False
-        poses, newest = self._poses(), np.full(len(j), -1)
-        first = poses.rays(seen.frame[i], seen.camera[i], seen.ray_C[i])
-        angle = np.linalg.norm(first - poses.rays(newest, frame.camera[j], rays[j]), axis=1)
-        # a turn moves cameras that are not at the IMU
-        lever = poses.p_M_C[[row, -1]] - self._states.T_M_I[[row, -1], None, 4:]
-        by_turn = float(np.linalg.norm(lever[1] - lever[0], axis=1).max()) / _NEAR_M
-        return bool(np.median(angle) >= np.radians(_LEAST_PARALLAX_DEG) + by_turn)
 
     def _may_replace(self, frame: WindowFrame) -> bool:
         """Tell whether the latest frame rests, too, and the joined interval is not too long."""
@@ -249,26 +220,13 @@ class FixedLagSmoother:
     def _append_frame(self, frame: WindowFrame, *, is_keyframe: bool) -> None:
         speed = float(np.linalg.norm(self._states.motion[-1, :3]))
         turns = frame.motion is Motion.TURNING and speed <= self.options.turning_max_mps
-        is_sure = turns and self._surely_turns_on_the_spot(frame)
+        is_sure = turns and is_surely_on_the_spot(
+            frame, self._states.motion[-1], self.newest_covariance, self.options
+        )
         self._time_ns = np.append(self._time_ns, frame.time_ns)
         self._is_keyframe = np.append(self._is_keyframe, is_keyframe)
         self._is_resting = np.append(self._is_resting, frame.motion is Motion.RESTING or is_sure)
         self._is_turning = np.append(self._is_turning, turns)
-
-    def _surely_turns_on_the_spot(self, frame: WindowFrame) -> bool:
-        """Tell whether the newest frame turns, with a velocity that is well known to be zero."""
-        options, v_M = self.options, self._states.motion[-1, :3]
-        rate = np.mean(frame.accel_gyro[:, 3:], axis=0) - self._states.gyro_bias[-1]
-        covariance = self.newest_covariance[6:9, 6:9]
-        if not np.isfinite(covariance).all():
-            return False
-        variance = np.linalg.eigvalsh(covariance)
-        if variance[0] <= 0.0 or variance[-1] > options.turning_max_sigma_mps**2:
-            return False
-        distance = float(v_M @ np.linalg.solve(covariance, v_M))
-        return distance <= options.gate_chi2 and (
-            float(np.linalg.norm(rate)) >= options.turning_min_radps
-        )
 
     def _see(self, frame: WindowFrame) -> None:
         """Add the observations of the newest frame."""
@@ -526,12 +484,6 @@ class FixedLagSmoother:
             costs=summary.final_costs,
             iterations=summary.iterations,
             termination=summary.termination,
-            released=self._released_states(),
+            released=ReleasedStates.of_frames(self._released),
             stage_ms=self._stage_ms,
         )
-
-    def _released_states(self) -> ReleasedStates:
-        times = np.array([t for t, _, _ in self._released], dtype=np.int64)
-        T_M_I = np.array([T for _, T, _ in self._released]).reshape(-1, 7)
-        motion = np.array([m for _, _, m in self._released]).reshape(-1, 9)
-        return ReleasedStates(times, T_M_I, motion[:, :3], motion[:, 3:6], motion[:, 6:])

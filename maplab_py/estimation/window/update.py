@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
+
 from maplab_py.array_types import F64, I64
 
 
@@ -16,6 +18,14 @@ class ReleasedStates:
     v_M: F64  # (N, 3)
     gyro_bias: F64  # (N, 3)
     accel_bias: F64  # (N, 3)
+
+    @classmethod
+    def of_frames(cls, released: list[tuple[int, F64, F64]]) -> ReleasedStates:
+        """Stack time, pose (7,) and motion (9,) of N frames."""
+        times = np.array([t for t, _, _ in released], dtype=np.int64)
+        T_M_I = np.array([T for _, T, _ in released]).reshape(-1, 7)
+        motion = np.array([m for _, _, m in released]).reshape(-1, 9)
+        return cls(times, T_M_I, motion[:, :3], motion[:, 3:6], motion[:, 6:])
 
     def __len__(self) -> int:
         return len(self.time_ns)
