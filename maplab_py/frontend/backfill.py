@@ -1,4 +1,4 @@
-"""Frames before the start: kept while the odometry waits, and read backwards from a known state.
+"""Frames before the start: kept while the odometry waits, and read backwards once the scale is known.
 
 Reading backwards is the same estimation with time reversed: accelerations and attitudes stay as they are,
 velocities, angular velocities and the gyroscope's bias change their sign.
@@ -7,6 +7,7 @@ velocities, angular velocities and the gyroscope's bias change their sign.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,9 +16,16 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.starting import Start
 
 _LONGEST_S = 120.0
 """Frames that are older are forgotten: they would need memory without limit."""
+_FRAMES_PER_FRAME = 2
+"""Frames that are read backwards with each new frame."""
+_TRUSTED_SCALE_SIGMA = 0.05
+_SCALE_CHECK_S = 0.5
+"""Time between two looks at the scale."""
+_POSITION_SIGMA_M = 1e-4
 _REVERSED_GYRO = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 
 
@@ -176,3 +184,114 @@ class BackwardReading:
             accel_gyro=after.accel_gyro[::-1] * _REVERSED_GYRO,
             motion=after.motion if self._is_resting else Motion.MOVING,
         )
+
+
+class Backfiller:
+    """Keeps frames until the scale is known, and then reads them backwards beside the new ones."""
+
+    def __init__(self, make_smoother: Callable[[], FixedLagSmoother], *, is_wanted: bool) -> None:
+        """Begin without frames.
+
+        Args:
+            make_smoother: Makes a smoother that reads backwards.
+            is_wanted: Read backwards; otherwise the scale is looked at only.
+        """
+        self.waiting = WaitingFrames()
+        self.trusted_ns: int | None = None  # since when the scale of this mission is known
+        self.scale_sigma = 0.0  # as a share of the scale, when it was looked at last
+        self._make_smoother, self._is_wanted = make_smoother, is_wanted
+        self._reading: BackwardReading | None = None
+        self._scale_check_ns: int | None = None  # time of the next; None = the scale is trusted
+
+    @property
+    def is_reading(self) -> bool:
+        """Whether frames are being read backwards."""
+        return self._reading is not None
+
+    def reset(self) -> None:
+        """Forget the frames, for a new start."""
+        self.waiting, self._reading = WaitingFrames(), None
+        self._scale_check_ns = None
+
+    def start(self, start: Start, newest: BodyStates, later: list[BodyStates]) -> None:
+        """Read backwards from a start, or watch its scale while that is not known.
+
+        Args:
+            start: The start.
+            newest: State of the newest frame.
+            later: States of the frames that have come since the start, to the newest.
+        """
+        newest_ns = int(newest.times_ns[0])
+        if start.scale_sigma > _TRUSTED_SCALE_SIGMA:
+            self._scale_check_ns, self.trusted_ns = newest_ns, None
+            return
+        self._scale_check_ns, self.trusted_ns = None, newest_ns
+        if self._is_wanted and len(self.waiting.frames) > 1 + len(later):
+            self._read_from(start.state, later, is_resting=start.is_resting)
+
+    def check_scale(
+        self,
+        smoother: FixedLagSmoother,
+        stamp_ns: int,
+        frame: WindowFrame,
+        before: tuple[I64, F64],
+    ) -> None:
+        """Look whether the scale is known now, and begin to read backwards once it is.
+
+        Args:
+            smoother: The estimator, with the frame.
+            stamp_ns: Of the frame's images.
+            frame: The newest frame.
+            before: See `WaitingFrames.push`.
+        """
+        if self._scale_check_ns is None:
+            return
+        if self._is_wanted:
+            self.waiting.push(stamp_ns, frame, before)
+        if frame.time_ns < self._scale_check_ns:
+            return
+        self._scale_check_ns = frame.time_ns + round(_SCALE_CHECK_S * 1e9)
+        self.scale_sigma = smoother.scale_sigma()
+        if self.scale_sigma <= _TRUSTED_SCALE_SIGMA:
+            self.trusted_ns = frame.time_ns
+            self._read_from_newest(smoother)
+
+    def advance(self) -> Backfill | None:
+        """Read some frames backwards; return all when the last has been read."""
+        if self._reading is None:
+            return None
+        self._reading.advance(_FRAMES_PER_FRAME)
+        return self._taken() if self._reading.is_finished else None
+
+    def finish(self, smoother: FixedLagSmoother | None) -> Backfill | None:
+        """Read backwards to the end, even with an unknown scale; None when there is nothing left."""
+        if self._scale_check_ns is not None and smoother is not None:
+            self._read_from_newest(smoother)
+        if self._reading is None:
+            return None
+        self._reading.advance(len(self.waiting.frames))
+        return self._taken()
+
+    def _read_from_newest(self, smoother: FixedLagSmoother) -> None:
+        """Begin to read backwards from the newest state."""
+        self._scale_check_ns = None
+        states = smoother.states
+        if not self._is_wanted or len(self.waiting.frames) < 2:
+            return
+        sigma = np.sqrt(np.maximum(np.diagonal(smoother.newest_covariance), 0.0))
+        if not np.isfinite(sigma).all():
+            return
+        sigma[:3] = _POSITION_SIGMA_M
+        v_M, gyro_bias, accel_bias = states.motion[-1].reshape(3, 3)
+        state = StartState(states.T_M_I[-1], v_M, gyro_bias, accel_bias, sigma)
+        self._read_from(state, [], is_resting=False)
+
+    def _read_from(self, state: StartState, later: list[BodyStates], *, is_resting: bool) -> None:
+        self._reading = BackwardReading(
+            self._make_smoother(), self.waiting, state, later, is_resting=is_resting
+        )
+
+    def _taken(self) -> Backfill | None:
+        """Return what has been read, and stop reading."""
+        reading, self._reading = self._reading, None
+        return None if reading is None else reading.result()

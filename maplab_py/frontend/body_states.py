@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64, I64
+from maplab_py.estimation.window.update import WindowUpdate
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,6 +27,24 @@ class BodyStates:
         """Return the state at one time, from columns without a first axis."""
         time = np.array([time_ns], dtype=np.int64)
         return cls(time, T_M_I[None], v_M_I[None], gyro_bias[None], accel_bias[None])
+
+    @classmethod
+    def of_motion(cls, times_ns: I64, T_M_I: F64, motion: F64) -> BodyStates:
+        """Return states whose velocities and biases are columns (N, 9) [v, b_g, b_a]."""
+        return cls(times_ns, T_M_I, motion[:, :3], motion[:, 3:6], motion[:, 6:])
+
+    @classmethod
+    def of_newest(cls, update: WindowUpdate) -> BodyStates:
+        """Return the state of the newest frame of a window."""
+        return cls.single(
+            update.time_ns, update.T_M_I, update.v_M, update.gyro_bias, update.accel_bias
+        )
+
+    @classmethod
+    def of_released(cls, update: WindowUpdate) -> BodyStates:
+        """Return the states of the frames that have left a window."""
+        past = update.released
+        return cls(past.time_ns, past.T_M_I, past.v_M, past.gyro_bias, past.accel_bias)
 
     @classmethod
     def none(cls) -> BodyStates:

@@ -11,12 +11,11 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.estimation.linear.threads import single_thread
-from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
+from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.estimation.window.update import WindowUpdate
-from maplab_py.frontend.backfill import Backfill, BackwardReading, WaitingFrames
+from maplab_py.frontend.backfill import Backfill, Backfiller
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.gyroscope import turn
 from maplab_py.frontend.health import HealthMonitor
@@ -42,16 +41,10 @@ from maplab_py.vision.tracking.views import focal_length_px
 
 _MAX_WAITING = 200
 """Frames that may wait for IMU samples."""
-_BACKWARD_FRAMES = 2
-"""Frames that are read backwards with each new frame."""
 _DELAY_STEP_NS = 2_000_000
 """Largest change of the delay of images from one frame to the next while the window has states."""
-_TRUSTED_SCALE_SIGMA = 0.05
-_POSITION_SIGMA_M = 1e-4
 _NOISE_TIME_NS = 900_000_000
 """Time after which the samples are compared with the calibrated noise."""
-_SCALE_CHECK_S, _LONGEST_DOUBT_S = 0.5, 30.0
-"""Time between two looks at the scale, and after which frames are read backwards in any case."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -124,11 +117,7 @@ class Odometry:
         self.notes: list[str] = []  # what is wrong with the calibration
         self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
         self._delay_ns = 0  # that frames have in addition to the calibrated offset
-        self._before = WaitingFrames()
-        self._backward: BackwardReading | None = None
-        self._scale_check_ns: int | None = None  # time of the next; None = the scale is trusted
-        self.trusted_ns: int | None = None  # since when the scale of this mission is known
-        self.scale_sigma = 0.0  # as a share of the scale, when it was looked at last
+        self._backfiller = Backfiller(self._plain_smoother, is_wanted=self.options.backfill)
         self._starter: Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
         self._start_again()
@@ -180,15 +169,19 @@ class Odometry:
         """Delay of the images that shows in the recording; None where it is not looked for."""
         return self._delays
 
+    @property
+    def trusted_ns(self) -> int | None:
+        """Time since when the scale of this mission is known; None while it is not."""
+        return self._backfiller.trusted_ns
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale, as a share of it, when it was looked at last."""
+        return self._backfiller.scale_sigma
+
     def finish_backfill(self) -> Backfill | None:
         """Read the frames before the start to their end; None when there are none left."""
-        if self._scale_check_ns is not None and self._smoother is not None:
-            self._read_backwards_from(self._smoother)
-        if self._backward is None:
-            return None
-        self._backward.advance(len(self._before.frames))
-        result, self._backward = self._backward.result(), None
-        return result
+        return self._backfiller.finish(self._smoother)
 
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places (L, 3) in M of the landmarks in the window."""
@@ -202,13 +195,7 @@ class Odometry:
         if smoother is None:
             return BodyStates.none()
         states = smoother.states
-        return BodyStates(
-            smoother.times_ns,
-            states.T_M_I,
-            states.motion[:, :3],
-            states.gyro_bias,
-            states.accel_bias,
-        )
+        return BodyStates.of_motion(smoother.times_ns, states.T_M_I, states.motion)
 
     # -- frames -----------------------------------------------------------------------------------
 
@@ -259,9 +246,9 @@ class Odometry:
             return
         self._delay_ns += change_ns
         self._detector.reset()
-        self._before.delay(change_ns, self._buffer.samples)
+        self._backfiller.waiting.delay(change_ns, self._buffer.samples)
         if isinstance(self._starter, Initializer):
-            self._starter.replace_frames(self._before.frames)
+            self._starter.replace_frames(self._backfiller.waiting.frames)
         if self._last_ns is not None:
             self._last_ns += change_ns
 
@@ -306,11 +293,11 @@ class Odometry:
         )
         if self._gap_end_ns >= 0:
             return update
-        frame = _window_frame(update)
+        frame = update.window_frame()
         has_new_delay = self._measure_delay(update, frame)
         if self._smoother is not None:
             return self._smoothed(update, frame, self._smoother)
-        self._before.push(update.stamp_ns, frame, self._buffer.samples)
+        self._backfiller.waiting.push(update.stamp_ns, frame, self._buffer.samples)
         self._check_noise()
         if has_new_delay:
             return dataclasses.replace(update, note="the images have other times than their stamps")
@@ -318,11 +305,11 @@ class Odometry:
 
     def _check_noise(self) -> None:
         """Once there are enough samples, doubt figures of noise that they contradict."""
-        frames = self._before.frames
+        frames = self._backfiller.waiting.frames
         if not self._noise_is_open or frames[-1].time_ns - frames[0].time_ns < _NOISE_TIME_NS:
             return
         self._noise_is_open = False
-        self._imu, notes = plausible_noise(self._imu, *self._before.samples())
+        self._imu, notes = plausible_noise(self._imu, *self._backfiller.waiting.samples())
         if notes:
             self.notes += notes
             self._device = self._device.with_imu(self._imu)
@@ -415,64 +402,24 @@ class Odometry:
         later = []
         for frame in start.later:
             # without biases and speed, turning and resting could not be told apart
-            newest = _state(smoother.add(dataclasses.replace(frame, motion=Motion.MOVING)))
+            newest = BodyStates.of_newest(
+                smoother.add(dataclasses.replace(frame, motion=Motion.MOVING))
+            )
             later.append(newest)
         self._smoother = smoother
         self._health = HealthMonitor(self.options.health)
-        self._scale_check_ns = None
-        self.trusted_ns = newest.times_ns[0]
-        if start.scale_sigma > _TRUSTED_SCALE_SIGMA:
-            self._scale_check_ns, self.trusted_ns = int(newest.times_ns[0]), None
-        elif self.options.backfill and len(self._before.frames) > 1 + len(later):
-            self._backward = BackwardReading(
-                self._plain_smoother(), self._before, state, later, is_resting=start.is_resting
-            )
+        self._backfiller.start(start, newest, later)
         return newest
-
-    def _check_scale(self, update: OdometryUpdate, frame: WindowFrame) -> None:
-        """Look whether the scale is known now, and read all frames so far backwards once it is."""
-        if self._scale_check_ns is None:
-            return
-        if self.options.backfill:
-            self._before.push(update.stamp_ns, frame, self._buffer.samples)
-        smoother = self._smoother
-        if smoother is None or update.time_ns < self._scale_check_ns:
-            return
-        self._scale_check_ns = update.time_ns + round(_SCALE_CHECK_S * 1e9)
-        self.scale_sigma = smoother.scale_sigma()
-        if self.scale_sigma <= _TRUSTED_SCALE_SIGMA:
-            self.trusted_ns = update.time_ns
-            self._read_backwards_from(smoother)
-
-    def _read_backwards_from(self, smoother: FixedLagSmoother) -> None:
-        """Begin to read backwards from the newest state."""
-        self._scale_check_ns = None
-        states = smoother.states
-        if not self.options.backfill or len(self._before.frames) < 2:
-            return
-        sigma = np.sqrt(np.maximum(np.diagonal(smoother.newest_covariance), 0.0))
-        if not np.isfinite(sigma).all():
-            return
-        sigma[:3] = _POSITION_SIGMA_M
-        v_M, gyro_bias, accel_bias = states.motion[-1].reshape(3, 3)
-        state = StartState(states.T_M_I[-1], v_M, gyro_bias, accel_bias, sigma)
-        self._backward = BackwardReading(
-            self._plain_smoother(), self._before, state, [], is_resting=False
-        )
 
     def _advance_backfill(self, update: OdometryUpdate) -> OdometryUpdate:
         """Read some frames backwards; return the update with their states at the end."""
-        backward = self._backward
-        if backward is None:
+        if not self._backfiller.is_reading:
             return update
         begin = time.perf_counter()
         with single_thread():
-            backward.advance(_BACKWARD_FRAMES)
+            backfill = self._backfiller.advance()
         update.stage_ms["backfill"] = 1e3 * (time.perf_counter() - begin)
-        if not backward.is_finished:
-            return update
-        self._backward = None
-        return dataclasses.replace(update, backfill=backward.result())
+        return dataclasses.replace(update, backfill=backfill)
 
     def _plain_smoother(self) -> FixedLagSmoother:
         device = self._device
@@ -491,7 +438,7 @@ class Odometry:
         begin = time.perf_counter()
         try:
             result = smoother.add(frame)
-            state = _state(result)
+            state = BodyStates.of_newest(result)
             tracked = sum(int((c.num_frames > 1).sum()) for c in update.tracked.cameras)
             problem = self._health.problem(state, result.covariance, tracked)
         except EstimationError as error:
@@ -505,13 +452,13 @@ class Odometry:
             )
         self._gyro_bias = result.gyro_bias
         self._speed_mps = float(np.linalg.norm(result.v_M))
-        self._check_scale(update, frame)
+        self._backfiller.check_scale(smoother, update.stamp_ns, frame, self._buffer.samples)
         return dataclasses.replace(
             self._advance_backfill(update),
             status=OdometryStatus.TRACKING,
             state=state,
-            released=_released(result),
-            window=_summary(result),
+            released=BodyStates.of_released(result),
+            window=WindowSummary.of(result),
         )
 
     def _start_again(self, reason: str = "") -> str:
@@ -524,46 +471,7 @@ class Odometry:
         self._tracker.reset()
         self._replayed = None
         self._detector.reset()
-        self._before, self._backward = WaitingFrames(), None
-        self._scale_check_ns = None
+        self._backfiller.reset()
         if self._delays is not None:
             self._delays.reset()
         return f"started again: {reason}" if reason else ""
-
-
-def _window_frame(update: OdometryUpdate) -> WindowFrame:
-    """Return a frame as the smoother takes it."""
-    cameras = update.tracked.cameras
-    none = ImuInterval(np.array([update.time_ns] * 2), np.zeros((2, 6)), 0, 0)
-    interval = update.interval or none
-    return WindowFrame(
-        time_ns=update.time_ns,
-        imu_times_ns=interval.times_ns,
-        accel_gyro=interval.accel_gyro,
-        camera=np.repeat(np.arange(len(cameras), dtype=np.int32), [len(c) for c in cameras]),
-        track_id=np.concatenate([c.track_id for c in cameras]),
-        uv_px=np.concatenate([c.uv_px for c in cameras]),
-        sigma_px=np.concatenate([c.sigma_px for c in cameras]),
-        motion=update.motion,
-    )
-
-
-def _state(result: WindowUpdate) -> BodyStates:
-    return BodyStates.single(
-        result.time_ns, result.T_M_I, result.v_M, result.gyro_bias, result.accel_bias
-    )
-
-
-def _released(result: WindowUpdate) -> BodyStates:
-    states = result.released
-    return BodyStates(states.time_ns, states.T_M_I, states.v_M, states.gyro_bias, states.accel_bias)
-
-
-def _summary(result: WindowUpdate) -> WindowSummary:
-    return WindowSummary(
-        covariance=result.covariance,
-        is_keyframe=result.is_keyframe,
-        landmarks=result.num_landmarks,
-        observations=result.num_observations,
-        median_error_px=result.median_error_px,
-    )

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 from enum import Enum
 
+import numpy as np
+
 from maplab_py.array_types import F64, U8
-from maplab_py.estimation.window.frame import Motion
+from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.window.update import WindowUpdate
 from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.imu_buffer import ImuInterval
@@ -30,6 +33,17 @@ class WindowSummary:
     landmarks: int
     observations: int
     median_error_px: float
+
+    @classmethod
+    def of(cls, update: WindowUpdate) -> WindowSummary:
+        """Take what a user sees of an update of the window."""
+        return cls(
+            covariance=update.covariance,
+            is_keyframe=update.is_keyframe,
+            landmarks=update.num_landmarks,
+            observations=update.num_observations,
+            median_error_px=update.median_error_px,
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,3 +71,19 @@ class OdometryUpdate:
     def total_ms(self) -> float:
         """Elapsed time of all stages."""
         return sum(self.stage_ms.values())
+
+    def window_frame(self) -> WindowFrame:
+        """Return the frame as the smoother takes it."""
+        cameras = self.tracked.cameras
+        none = ImuInterval(np.array([self.time_ns] * 2), np.zeros((2, 6)), 0, 0)
+        interval = self.interval or none
+        return WindowFrame(
+            time_ns=self.time_ns,
+            imu_times_ns=interval.times_ns,
+            accel_gyro=interval.accel_gyro,
+            camera=np.repeat(np.arange(len(cameras), dtype=np.int32), [len(c) for c in cameras]),
+            track_id=np.concatenate([c.track_id for c in cameras]),
+            uv_px=np.concatenate([c.uv_px for c in cameras]),
+            sigma_px=np.concatenate([c.sigma_px for c in cameras]),
+            motion=self.motion,
+        )
