@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from maplab_py.frontend.mapping import Mapping, Observer
     from maplab_py.frontend.odometry_update import OdometryUpdate
     from maplab_py.frontend.reports import MappingReport
+    from maplab_py.frontend.run_options import OutputOptions
     from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.viewer.display.viewer import Viewer
 
@@ -88,17 +89,10 @@ def rovioli(
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping
     from maplab_py.server.recorded_submaps import SubmapWriter
-    from maplab_py.storage.native import check_parent, check_target
 
     run.check()
-    output = run.output
-    folder = output.save_map_folder
-    if folder is not None:
-        check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
-        check_parent(folder)
-    for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
-        if file is not None:
-            check_writable(file, overwrite=output.overwrite_existing_map)
+    _check_output(run.output)
+    folder = run.output.save_map_folder
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
     observers: list[Observer] = []
@@ -136,15 +130,25 @@ def rovioli(
     if writer is not None and writer.pushed:
         where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
         context.terminal.note(f"pushed {counted(writer.pushed, 'submap')} to {where}")
-    if finished.vi_map is not None:
-        context.maps.add(
-            key,
-            finished.vi_map,
-            folder=finished.report.map_folder,
-            is_saved=finished.disk_copy is not None or is_at_server,
-            disk_copy=finished.disk_copy,
-        )
+    _keep_map(context, key, finished, is_at_server=is_at_server)
     return finished.report
+
+
+def _check_output(output: OutputOptions) -> None:
+    """Refuse a map folder or files of poses that cannot be written.
+
+    Raises:
+        UserError: One of them exists already, or its folder does not.
+    """
+    from maplab_py.storage.native import check_parent, check_target
+
+    folder = output.save_map_folder
+    if folder is not None:
+        check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
+        check_parent(folder)
+    for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
+        if file is not None:
+            check_writable(file, overwrite=output.overwrite_existing_map)
 
 
 def _check_live(folder: Path | None, data: DataSourceOptions, run: RunOptions) -> None:
@@ -223,6 +227,20 @@ def _observer(context: CommandContext, title: str, interval_s: float) -> Observe
     viewer = ensure_viewer(context, ViewerOptions())
     context.terminal.note(f"viewer: {viewer.url}")
     return _Pictures(viewer, title, interval_s)
+
+
+def _keep_map(
+    context: CommandContext, key: str, finished: FinishedRun, *, is_at_server: bool
+) -> None:
+    """Add the map of a run, if it has one, to those in memory."""
+    if finished.vi_map is not None:
+        context.maps.add(
+            key,
+            finished.vi_map,
+            folder=finished.report.map_folder,
+            is_saved=finished.disk_copy is not None or is_at_server,
+            disk_copy=finished.disk_copy,
+        )
 
 
 def _tell_end(context: CommandContext, finished: FinishedRun, elapsed_s: float) -> None:
