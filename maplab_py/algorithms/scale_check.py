@@ -75,14 +75,14 @@ def mission_scales(vi_map: VIMap) -> tuple[MissionScale, ...]:
     imu[:, 2] -= gravity
     change = (by_map[second] - by_map[first]) / half
     mission = vertices.mission[of_edge[first]]
-    found = []
+    scales = []
     for row in np.unique(mission).tolist():
         rows = mission == row
         if np.count_nonzero(rows) >= _MIN_CHANGES:
             scale, size = _slope(imu[rows], change[rows])
             if size >= _LEAST_ACCELERATION_MPS2:
-                found.append(MissionScale(row, scale))
-    return tuple(found)
+                scales.append(MissionScale(row, scale))
+    return tuple(scales)
 
 
 def scale_doubts(vi_map: VIMap) -> tuple[str, ...]:

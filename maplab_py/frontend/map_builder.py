@@ -109,19 +109,19 @@ class MapBuilder:
         """Forget the frames for which there is no state."""
         self._waiting.clear()
 
-    def fill(self, found: Backfill) -> None:
+    def fill(self, backfill: Backfill) -> None:
         """Make vertices of the frames before the first vertex of the mission, and refine the others."""
         mission, earlier = self._missions[-1], RecordedMission()
         first_ns = int(mission.states[0].times_ns[0]) if len(mission) else 0
-        for row, frame in enumerate(found.frames):
+        for row, frame in enumerate(backfill.frames):
             if frame.time_ns <= first_ns and row:
                 earlier.add_imu(frame.imu_times_ns, frame.accel_gyro)
-            kept = self._waiting.get(int(found.stamps_ns[row]))
+            kept = self._waiting.get(int(backfill.stamps_ns[row]))
             if frame.time_ns < first_ns and kept is not None:
-                earlier.add_vertex(found.states.row(row), *kept)
+                earlier.add_vertex(backfill.states.row(row), *kept)
         if len(earlier) and earlier.has_samples_until(first_ns):
             mission.prepend(earlier, earlier.samples())
-        mission.refine(found.states)
+        mission.refine(backfill.states)
         self._waiting.clear()
 
     def add_vertex(

@@ -152,9 +152,9 @@ class Mapping:
                 raise Cancelled("cancelled")
             raise EstimationError(self._nothing())
         if self.builder is not None:
-            found = self.odometry.finish_backfill()
-            if found is not None:
-                self.builder.fill(found)
+            backfill = self.odometry.finish_backfill()
+            if backfill is not None:
+                self.builder.fill(backfill)
             self.builder.refine(self.odometry.window_states())
 
     @property
