@@ -6,7 +6,6 @@ headers' stamps, as messages of one topic are. So some seconds of messages are k
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import heapq
 import itertools
@@ -167,10 +166,14 @@ class BagRecording:
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
-        read_bits = self._read_bits(start_ns, end_ns)
+        with opened_bag(self._path) as reader:
+            yield from self._items(reader, start_ns, end_ns)
+
+    def _items(self, reader: BagReader, start_ns: int | None, end_ns: int | None) -> Iterator[Item]:
+        read_bits = self._read_bits(reader, start_ns, end_ns)
         times_ns: list[int] = []
         samples: list[tuple[float, ...]] = []
-        for time_ns, stream, message in self._in_order(start_ns, end_ns):
+        for time_ns, stream, message in self._in_order(reader, start_ns, end_ns):
             if stream.camera == _IMU:
                 times_ns.append(time_ns)
                 samples.append(message)
@@ -182,32 +185,35 @@ class BagRecording:
         if times_ns:
             yield self._batch(times_ns, samples)
 
-    def _read_bits(self, start_ns: int | None, end_ns: int | None) -> list[int]:
+    def _read_bits(self, reader: BagReader, start_ns: int | None, end_ns: int | None) -> list[int]:
         """Return the bits of each camera, sought in messages that are spread over a time."""
+        given = self._reading.image_bits
+        if given:
+            return [given] * len(self.device.cameras)
+        first_ns = reader.start_time if start_ns is None else start_ns
+        last_ns = reader.end_time if end_ns is None else min(end_ns, reader.end_time)
+        places_ns = np.linspace(first_ns, last_ns, SAMPLES, endpoint=False, dtype=np.int64).tolist()
         read: list[int] = []
-        with opened_bag(self._path) as reader:
-            first_ns = reader.start_time if start_ns is None else start_ns
-            last_ns = reader.end_time if end_ns is None else min(end_ns, reader.end_time)
-            for stream in (stream for stream in self._streams if stream.camera >= 0):
-                connections = [c for c in reader.connections if c.topic == stream.topic]
-                images: list[CameraImage] = []
-                for place_ns in np.linspace(first_ns, last_ns, SAMPLES, endpoint=False).tolist():
-                    message = next(reader.messages(connections, int(place_ns)), None)
-                    if message is None or self._reading.image_bits:
-                        break
-                    content = reader.deserialize(message[2], message[0].msgtype)
-                    images.append(self._image(stream, int(place_ns), content, CONTAINER_BITS))
-                    with contextlib.suppress(MapError):
-                        if images[0].data.bits:
-                            break
-                bits = self._reading.image_bits or camera_bits(images)
-                is_usual = bits == 8 or self._reading.image_bits
-                self._bits[stream.camera] = CONTAINER_BITS if is_usual else bits
-                read.append(bits)
+        for stream in (stream for stream in self._streams if stream.camera >= 0):
+            bits = camera_bits(self._images_at(reader, stream, places_ns))
+            self._bits[stream.camera] = CONTAINER_BITS if bits == 8 else bits
+            read.append(bits)
         return read
 
+    def _images_at(
+        self, reader: BagReader, stream: _Stream, places_ns: list[int]
+    ) -> Iterator[CameraImage]:
+        """Yield the first image of a camera after each of some times of arrival."""
+        connections = [c for c in reader.connections if c.topic == stream.topic]
+        for place_ns in places_ns:
+            message = next(reader.messages(connections, place_ns), None)
+            if message is None:
+                return
+            content = reader.deserialize(message[2], message[0].msgtype)
+            yield self._image(stream, place_ns, content, CONTAINER_BITS)
+
     def _in_order(
-        self, start_ns: int | None, end_ns: int | None
+        self, reader: BagReader, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[int, _Stream, Any]]:
         """Yield time, stream and message in the order of time, the IMU's first among equals."""
         delays_ns = [stream.delay_ns for stream in self._streams]
@@ -216,7 +222,7 @@ class BagRecording:
         newest_ns = delivered_ns = -1
         number = itertools.count()
         restart: ClockRestart | None = None
-        messages = self._messages(start_ns, end_ns)
+        messages = self._messages(reader, start_ns, end_ns)
         while True:
             try:
                 time_ns, stream, message = next(messages)
@@ -242,7 +248,7 @@ class BagRecording:
             raise restart
 
     def _messages(
-        self, start_ns: int | None, end_ns: int | None
+        self, reader: BagReader, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[int, _Stream, Any]]:
         """Yield time, stream and message in the order of arrival, accelerations with angular rates."""
         delays_ns = [stream.delay_ns for stream in self._streams]
@@ -253,44 +259,58 @@ class BagRecording:
             ClockFilter(None if begin is not None else stream.first_ns) for stream in self._streams
         ]
         joined = PairedImu(None) if any(s.camera == _ACCELEROMETER for s in self._streams) else None
-        with opened_bag(self._path) as reader:
-            connections = [c for c in reader.connections if c.topic in rows]
-            for connection, arrival_ns, data in reader.messages(connections, begin, end):
-                row = rows[connection.topic]
-                stream, clock = self._streams[row], self._clocks[row]
-                bounds = stream.arrivals_ns
-                if bounds is not None and not bounds[0] <= arrival_ns <= bounds[1]:
-                    continue
-                stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
-                message: Any
-                if stream.camera < 0:
-                    message = imu_sample(data, is_ros_2=reader.is2)
-                else:
-                    message = connection.msgtype, data
-                dropped, part = clock.dropped, clock.part
-                ready = clock.push(stamp_ns + stream.time_offset_ns, message)
-                if clock.dropped > dropped and not self._is_within(stamp_ns, start_ns, end_ns):
-                    clock.dropped = dropped
-                elif clock.dropped > dropped:
-                    self._check_late(stream, clock)
+        connections = [c for c in reader.connections if c.topic in rows]
+        for connection, arrival_ns, data in reader.messages(connections, begin, end):
+            row = rows[connection.topic]
+            stream, clock = self._streams[row], self._clocks[row]
+            bounds = stream.arrivals_ns
+            if bounds is not None and not bounds[0] <= arrival_ns <= bounds[1]:
+                continue
+            stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
+            message: Any
+            if stream.camera < 0:
+                message = imu_sample(data, is_ros_2=reader.is2)
+            else:
+                message = connection.msgtype, data
+            ready = [(stamp_ns + stream.time_offset_ns, message)]
+            if not clock.passes(ready[0][0]):
+                part = clock.part
+                ready = self._pushed(stream, clock, stamp_ns, message, (start_ns, end_ns))
                 if clock.part > part and clock.restart is not None:
                     if end_ns is not None and clock.restart.before_ns >= end_ns:
                         return
                     raise restart_error(f"{self._path}: {stream.topic}", clock.restart)
-                for time_ns, content in ready:
-                    if not self._is_within(time_ns, start_ns, end_ns):
-                        continue
-                    if stream.camera >= 0:
-                        yield time_ns, stream, reader.deserialize(content[1], content[0])
-                    elif joined is None:
-                        yield time_ns, stream, content
-                    else:
-                        sensor = GYRO if stream.camera == _IMU else ACCEL
-                        for joint_ns, sample in joined.add(sensor, time_ns, content):
-                            yield joint_ns, self._streams[0], sample
+            for time_ns, content in ready:
+                if not self._is_within(time_ns, start_ns, end_ns):
+                    continue
+                if stream.camera >= 0:
+                    yield time_ns, stream, reader.deserialize(content[1], content[0])
+                elif joined is None:
+                    yield time_ns, stream, content
+                else:
+                    sensor = GYRO if stream.camera == _IMU else ACCEL
+                    for joint_ns, sample in joined.add(sensor, time_ns, content):
+                        yield joint_ns, self._streams[0], sample
         for stream, clock in zip(self._streams, self._clocks, strict=True):
             clock.finish()
             self._check_late(stream, clock)
+
+    def _pushed(
+        self,
+        stream: _Stream,
+        clock: ClockFilter[Any],
+        stamp_ns: int,
+        message: Any,
+        span_ns: tuple[int | None, int | None],
+    ) -> list[tuple[int, Any]]:
+        """Return the messages that are in line after one out of line; those left out of a span count."""
+        dropped = clock.dropped
+        ready = clock.push(stamp_ns + stream.time_offset_ns, message)
+        if clock.dropped > dropped and not self._is_within(stamp_ns, *span_ns):
+            clock.dropped = dropped
+        elif clock.dropped > dropped:
+            self._check_late(stream, clock)
+        return ready
 
     @staticmethod
     def _is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:

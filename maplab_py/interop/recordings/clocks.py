@@ -51,6 +51,14 @@ class ClockFilter(Generic[T]):
         self._last_ns = None if first_ns is None else first_ns - 1
         self._waiting: list[tuple[int, T]] = []  # out of line: late, or the beginning of a part
 
+    def passes(self, stamp_ns: int) -> bool:
+        """Take a stamp that simply comes after the one before it; others are for `push`."""
+        last_ns = self._last_ns
+        if last_ns is None or self._waiting or not 0 < stamp_ns - last_ns <= _LARGEST_STEP_NS:
+            return False
+        self._last_ns = stamp_ns
+        return True
+
     def push(self, stamp_ns: int, item: T) -> list[tuple[int, T]]:
         """Take the next item; return those that are in line now, with their stamps."""
         if self._last_ns is None or self._follows(self._last_ns, stamp_ns):

@@ -179,7 +179,7 @@ class FolderRecording:
         streams = []
         for row, camera in enumerate(self._cameras):
             kept = camera.rows(self._part, start_ns, end_ns)
-            samples = [camera.image(row, int(kept[k])) for k in sampled(len(kept))]
+            samples = (camera.image(row, int(kept[k])) for k in sampled(len(kept)))
             bits = self._reading.image_bits or camera_bits(samples)
             self._bits[row] = CONTAINER_BITS if bits == 8 or self._reading.image_bits else bits
             streams.append(camera.images(row, kept, bits))

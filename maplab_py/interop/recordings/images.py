@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -144,8 +144,11 @@ def image_of_message(message: Any, name: str, camera: Camera) -> EncodedImage | 
     )
 
 
-def camera_bits(images: list[CameraImage]) -> int:
-    """Return the bits of a camera, sought in those of its images that can be decoded."""
+def camera_bits(images: Iterable[CameraImage]) -> int:
+    """Return the bits of a camera, sought in those of its images that can be decoded.
+
+    The first image that tells them ends the search: only those of 16 bits are read further.
+    """
     decoded = []
     for image in images:
         with contextlib.suppress(MapError):  # whoever needs the image is told

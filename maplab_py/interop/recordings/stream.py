@@ -162,9 +162,10 @@ class EventStream:
         imu.largest_step_ns = max(imu.largest_step_ns, int(steps_ns.max(initial=0)))
         imu.count, imu.last_ns = imu.count + len(batch), int(times_ns[-1])
         statistics.saturated_samples += int(batch.is_saturated.sum())
-        is_zero = batch.accel_gyro == 0.0
-        statistics.without_acceleration += int(is_zero[:, :3].all(axis=1).sum())
-        statistics.without_rate += int(is_zero[:, 3:].all(axis=1).sum())
+        if not batch.accel_gyro.all():
+            is_zero = batch.accel_gyro == 0.0
+            statistics.without_acceleration += int(is_zero[:, :3].all(axis=1).sum())
+            statistics.without_rate += int(is_zero[:, 3:].all(axis=1).sum())
 
     def _check_not_empty(self) -> None:
         statistics, options = self.statistics, self._options

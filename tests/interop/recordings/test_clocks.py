@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.recordings.clocks import ClockRestart, parts_of
+from maplab_py.interop.recordings.clocks import ClockFilter, ClockRestart, parts_of
 from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.stream import EventStream
@@ -30,6 +30,7 @@ from tests.interop.recordings.written import (
 )
 
 SECOND = 1_000_000_000
+P_STEPS = (0.3, 0.3, 0.3, 0.05, 0.03, 0.01, 0.01)
 
 
 def shifted(content: Content, shift_ns: int) -> Content:
@@ -99,6 +100,26 @@ def test_rows_that_are_left_out(
     kept, left_out = parts_of(np.array(stamps) * 10**7)
     assert [part.tolist() for part in kept] == parts
     assert left_out.tolist() == dropped
+
+
+def test_stamps_that_simply_follow_pass_as_if_pushed() -> None:
+    rng = np.random.default_rng(8)
+    steps = rng.choice([100, 100, 100, 0, -150, -100_000, 2 * 86_400_000], size=2000, p=P_STEPS)
+    pushed: ClockFilter[int] = ClockFilter()
+    mixed: ClockFilter[int] = ClockFilter()
+    restarts = 0
+    for row, stamp_ns in enumerate((np.cumsum(steps) * 1_000_000 + START_NS).tolist()):
+        expected = pushed.push(stamp_ns, row)
+        simple = mixed.passes(stamp_ns)
+        assert expected == ([(stamp_ns, row)] if simple else mixed.push(stamp_ns, row))
+        assert (mixed.part, mixed.dropped, mixed.first) == (
+            pushed.part,
+            pushed.dropped,
+            pushed.first,
+        )
+        restarts = mixed.part
+    assert restarts > 1
+    assert mixed.dropped > 10
 
 
 def test_four_runs() -> None:

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import FlagError
+from maplab_py.interop.recordings.images import RawImage, camera_bits
 from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
+from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
+from maplab_py.sensors import Camera, Distortion, Projection
 from tests.interop.recordings.written import (
     Content,
     frame_sets,
@@ -30,6 +33,19 @@ def content_of(bits: int) -> Content:
     for camera in images:
         camera[0] = camera[0] >> 4
     return dataclasses.replace(content, images=images)
+
+
+def raw_image(pixels: np.ndarray) -> CameraImage:
+    height, width = pixels.shape
+    numbers = np.array([100.0, 100.0, 1.0, 1.0])
+    camera = Camera(
+        "c" * 32, Projection.PINHOLE, Distortion.NONE, numbers, np.zeros(0), width, height
+    )
+    encoding = "mono8" if pixels.dtype == np.uint8 else "mono16"
+    data = RawImage(
+        "an image", camera, encoding, width, height, pixels.strides[0], False, pixels.tobytes()
+    )
+    return CameraImage(0, 0, 0, data)
 
 
 def opened(content: Content, tmp_path: Path, form: str, **options: object):
@@ -68,6 +84,14 @@ def test_a_flag_decides(tmp_path: Path) -> None:
     assert recording.notes == ()
     with pytest.raises(FlagError, match="--image_bits=7: wants 8 to 16"):
         open_recording(tmp_path / "room", SourceOptions(reading=ReadingOptions(image_bits=7)))
+
+
+@pytest.mark.parametrize(("bits", "read"), [(8, 1), (12, 5)])
+def test_only_images_of_16_bits_are_searched(bits: int, read: int) -> None:
+    kind = np.uint8 if bits == 8 else np.uint16
+    images = iter([raw_image(np.full((2, 3), 200 << (bits - 8), kind)) for _ in range(5)])
+    assert camera_bits(images) == bits
+    assert len(list(images)) == 5 - read
 
 
 def test_damaged_images_outside_the_chosen_time_do_not_matter(tmp_path: Path) -> None:
