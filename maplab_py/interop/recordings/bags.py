@@ -31,6 +31,7 @@ from maplab_py.interop.recordings.clocks import (
     check_dropped,
     dropped_note,
     first_stamp_ns,
+    follows,
     restart_error,
 )
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_of_message
@@ -51,7 +52,7 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _IMU, _ACCELEROMETER = -1, -2
 _EXAMINED = 8
-"""Messages of a topic from which its clock is known."""
+"""Messages of a topic, at most, from which its clock is known."""
 _DEFAULT = ReadingOptions()
 _LARGEST_BATCH = 200
 _DELAY_MARGIN_NS = 1_000_000_000
@@ -163,6 +164,13 @@ class BagRecording:
             duration_s = (last_ns - first_ns) * 1e-9
             spans.append(PartSpan(part + 1, first_ns, duration_s, samples, images))
         return tuple(spans)
+
+    def first_images(self) -> Iterator[CameraImage]:
+        """Yield the first image of each camera."""
+        with opened_bag(self._path) as reader:
+            for stream in (stream for stream in self._streams if stream.camera >= 0):
+                begin_ns = stream.arrivals_ns[0] if stream.arrivals_ns else reader.start_time
+                yield from self._images_at(reader, stream, [begin_ns])
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
@@ -408,17 +416,22 @@ class BagRecording:
                 f"{sensor} needs {' or '.join(wanted)}: give {flag}; the bag has {present}"
             )
         connections = [c for c in reader.connections if c.topic == topic]
-        first = list(itertools.islice(reader.messages(connections), _EXAMINED))
-        if not first:
+        arrivals_ns: list[int] = []
+        stamps_ns: list[int] = []
+        for _, at_ns, data in itertools.islice(reader.messages(connections), _EXAMINED):
+            arrivals_ns.append(at_ns)
+            stamps_ns.append(self._stamp_ns(data, at_ns, is_ros_2=reader.is2))
+            if len(stamps_ns) > 1 and follows(*stamps_ns[-2:]):
+                break
+        if not stamps_ns:
             raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
-        stamps_ns = [self._stamp_ns(data, at, is_ros_2=reader.is2) for _, at, data in first]
         if not any(stamps_ns) and len(stamps_ns) > 1:
             raise MapError(
                 f"{self._path}: {topic}: the stamps of its messages are all 0, as of a driver that sets "
                 "none: give --use_arrival_time to take the times of arrival"
             )
         stamp_ns = first_stamp_ns(stamps_ns)
-        arrival_ns = first[stamps_ns.index(stamp_ns)][1]
+        arrival_ns = arrivals_ns[stamps_ns.index(stamp_ns)]
         first_ns = stamp_ns + stream.time_offset_ns
         return dataclasses.replace(
             stream,

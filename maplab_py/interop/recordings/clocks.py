@@ -53,20 +53,19 @@ class ClockFilter(Generic[T]):
 
     def passes(self, stamp_ns: int) -> bool:
         """Take a stamp that simply comes after the one before it; others are for `push`."""
-        last_ns = self._last_ns
-        if last_ns is None or self._waiting or not 0 < stamp_ns - last_ns <= _LARGEST_STEP_NS:
+        if self._last_ns is None or self._waiting or not follows(self._last_ns, stamp_ns):
             return False
         self._last_ns = stamp_ns
         return True
 
     def push(self, stamp_ns: int, item: T) -> list[tuple[int, T]]:
         """Take the next item; return those that are in line now, with their stamps."""
-        if self._last_ns is None or self._follows(self._last_ns, stamp_ns):
+        if self._last_ns is None or follows(self._last_ns, stamp_ns):
             if self._waiting:
                 self._drop()
             self._last_ns = stamp_ns
             return [(stamp_ns, item)]
-        if self._waiting and not self._follows(self._waiting[-1][0], stamp_ns):
+        if self._waiting and not follows(self._waiting[-1][0], stamp_ns):
             self._drop()
         self._waiting.append((stamp_ns, item))
         span_ns = stamp_ns - self._waiting[0][0]
@@ -91,15 +90,16 @@ class ClockFilter(Generic[T]):
             self.leave_out(stamp_ns, self._last_ns or 0)
         self._waiting = []
 
-    @staticmethod
-    def _follows(before_ns: int, stamp_ns: int) -> bool:
-        return 0 < stamp_ns - before_ns <= _LARGEST_STEP_NS
+
+def follows(before_ns: int, stamp_ns: int) -> bool:
+    """Return whether a stamp comes after another, of the same clock."""
+    return 0 < stamp_ns - before_ns <= _LARGEST_STEP_NS
 
 
 def first_stamp_ns(stamps_ns: list[int]) -> int:
     """Return the first stamp that the one after it follows, of the first stamps of a sensor."""
     for before, after in itertools.pairwise(stamps_ns):
-        if 0 < after - before <= _LARGEST_STEP_NS:
+        if follows(before, after):
             return before
     return stamps_ns[0]
 

@@ -172,6 +172,11 @@ class FolderRecording:
         """Time of the first item."""
         return min(int(table.times(self._part)[0]) for table in self._tables)
 
+    def first_images(self) -> Iterator[CameraImage]:
+        """Yield the first image of each camera."""
+        for row, camera in enumerate(self._cameras):
+            yield camera.image(row, int(camera.rows(self._part, None, None)[0]))
+
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
         for table in self._tables:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import contextlib
 from pathlib import Path
 
 from maplab_py.errors import MaplabError, UserError
@@ -14,10 +14,7 @@ from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
 from maplab_py.interop.recordings.images import EncodedImage, RawImage, check_size
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import CameraImage, Recording
-
-_FIRST_ITEMS = 5000
-"""Items among which first images are looked for."""
+from maplab_py.interop.recordings.protocol import Recording
 
 
 def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
@@ -58,32 +55,20 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
     )
 
 
-def _with_sizes_checked(recording: Recording) -> Recording:
+def _with_sizes_checked(recording: BagRecording | FolderRecording) -> Recording:
     """Return the recording if the first image of each camera has the size that was calibrated.
 
     Raises:
         MapError: It has another size.
     """
-    sizes = _first_sizes_px(recording)
-    for row, camera in enumerate(recording.device.cameras):
-        if row in sizes:
-            check_size(f"{recording.name}: camera {row}", camera, *sizes[row])
-    return recording
-
-
-def _first_sizes_px(recording: Recording) -> dict[int, tuple[int, int]]:
-    """Return width and height of the first image of each camera, as far as they are soon found."""
     sizes: dict[int, tuple[int, int]] = {}
-    try:
-        for item in itertools.islice(recording.items(), _FIRST_ITEMS):
-            if isinstance(item, CameraImage) and item.camera not in sizes:
-                if isinstance(item.data, EncodedImage | RawImage):
-                    sizes[item.camera] = item.data.size_px()
-                if len(sizes) == len(recording.device.cameras):
-                    break
-    except MaplabError:  # the run names it, if it is not skipped
-        return sizes
-    return sizes
+    with contextlib.suppress(MaplabError):  # the run names it, if it is not skipped
+        for image in recording.first_images():
+            if isinstance(image.data, EncodedImage | RawImage):
+                sizes[image.camera] = image.data.size_px()
+    for row, size_px in sizes.items():
+        check_size(f"{recording.name}: camera {row}", recording.device.cameras[row], *size_px)
+    return recording
 
 
 def given_device(options: SourceOptions, source: str) -> RecordedSensors:
