@@ -49,6 +49,11 @@ class _Decoded:
     encoding: str
     bits: int
 
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height as recorded."""
+        height, width = self.pixels.shape[:2]
+        return width, height
+
     def check(self) -> None:
         """Do nothing: they are whole."""
 

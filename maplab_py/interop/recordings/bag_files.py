@@ -88,11 +88,22 @@ def opened_bag(path: Path) -> Iterator[BagReader]:
         from maplab_py.interop.recordings.bag_reader import BagReader
     except ImportError as error:
         raise _library_missing(str(path)) from error
-    try:
+    with damage_named(path):
         _check_databases(path)
         metadata = _metadata(path)
         with BagReader(path, _storage_files(path, metadata), metadata) as reader:
             yield reader
+
+
+@contextlib.contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Raise whatever a parser says of damage as a MapError.
+
+    Raises:
+        MapError: The bag is damaged, or without index.
+    """
+    try:
+        yield
     except MaplabError:
         raise
     except Exception as error:

@@ -6,6 +6,7 @@ headers' stamps, as messages of one topic are. So some seconds of messages are k
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import heapq
 import itertools
@@ -19,6 +20,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
 from maplab_py.interop.recordings.bag_files import (
+    damage_named,
     header_stamp_ns,
     imu_sample,
     listed_topics,
@@ -74,7 +76,11 @@ class _Stream:
 
 
 class BagRecording:
-    """Reads a bag."""
+    """Reads a bag.
+
+    Attributes:
+        first_sizes_px: Width and height of the first image of cameras, where it can be read.
+    """
 
     def __init__(
         self,
@@ -100,6 +106,7 @@ class BagRecording:
         """
         self.name, self.device, self._path, self._reading = str(path), device, path, reading
         self._bits = [CONTAINER_BITS] * len(device.cameras)
+        self.first_sizes_px: dict[int, tuple[int, int]] = {}
         self._clocks: list[ClockFilter[Any]] = []
         topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
         if len(topics) != len(device.cameras):
@@ -164,13 +171,6 @@ class BagRecording:
             duration_s = (last_ns - first_ns) * 1e-9
             spans.append(PartSpan(part + 1, first_ns, duration_s, samples, images))
         return tuple(spans)
-
-    def first_images(self) -> Iterator[CameraImage]:
-        """Yield the first image of each camera."""
-        with opened_bag(self._path) as reader:
-            for stream in (stream for stream in self._streams if stream.camera >= 0):
-                begin_ns = stream.arrivals_ns[0] if stream.arrivals_ns else reader.start_time
-                yield from self._images_at(reader, stream, [begin_ns])
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
@@ -419,6 +419,12 @@ class BagRecording:
         arrivals_ns: list[int] = []
         stamps_ns: list[int] = []
         for _, at_ns, data in itertools.islice(reader.messages(connections), _EXAMINED):
+            if stream.camera >= 0 and not stamps_ns:
+                with contextlib.suppress(MapError), damage_named(self._path):
+                    image = self._image(
+                        stream, at_ns, reader.deserialize(data, types[topic]), CONTAINER_BITS
+                    )
+                    self.first_sizes_px[stream.camera] = image.data.size_px()
             arrivals_ns.append(at_ns)
             stamps_ns.append(self._stamp_ns(data, at_ns, is_ros_2=reader.is2))
             if len(stamps_ns) > 1 and follows(*stamps_ns[-2:]):

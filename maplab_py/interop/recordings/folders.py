@@ -5,6 +5,7 @@ TUM-VI's folders have the same form, with images of 8 or 16 bits.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import os
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.input_files import read_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
@@ -172,10 +173,15 @@ class FolderRecording:
         """Time of the first item."""
         return min(int(table.times(self._part)[0]) for table in self._tables)
 
-    def first_images(self) -> Iterator[CameraImage]:
-        """Yield the first image of each camera."""
-        for row, camera in enumerate(self._cameras):
-            yield camera.image(row, int(camera.rows(self._part, None, None)[0]))
+    @property
+    def first_sizes_px(self) -> dict[int, tuple[int, int]]:
+        """Width and height of the first image of cameras, where it can be read."""
+        sizes: dict[int, tuple[int, int]] = {}
+        with contextlib.suppress(MaplabError):  # the run names it, if it is not skipped
+            for row, camera in enumerate(self._cameras):
+                image = camera.image(row, int(camera.rows(self._part, None, None)[0]))
+                sizes[row] = image.data.size_px()
+        return sizes
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""

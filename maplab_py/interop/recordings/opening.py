@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
-from maplab_py.errors import MaplabError, UserError
+from maplab_py.errors import UserError
 from maplab_py.interop.calibration_import import import_calibration, read_calibration
 from maplab_py.interop.calibrations.euroc import HOW_TO_CALIBRATE
 from maplab_py.interop.device import RecordedSensors, with_cameras, with_time_offset
 from maplab_py.interop.recordings.bag_files import is_bag
 from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
-from maplab_py.interop.recordings.images import EncodedImage, RawImage, check_size
+from maplab_py.interop.recordings.images import check_size
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
 
@@ -61,12 +60,7 @@ def _with_sizes_checked(recording: BagRecording | FolderRecording) -> Recording:
     Raises:
         MapError: It has another size.
     """
-    sizes: dict[int, tuple[int, int]] = {}
-    with contextlib.suppress(MaplabError):  # the run names it, if it is not skipped
-        for image in recording.first_images():
-            if isinstance(image.data, EncodedImage | RawImage):
-                sizes[image.camera] = image.data.size_px()
-    for row, size_px in sizes.items():
+    for row, size_px in recording.first_sizes_px.items():
         check_size(f"{recording.name}: camera {row}", recording.device.cameras[row], *size_px)
     return recording
 

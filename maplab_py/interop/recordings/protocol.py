@@ -55,6 +55,13 @@ class ImageData(Protocol):
     def bits(self) -> int:
         """Bits of a value; 0 = only the values tell."""
 
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height as recorded.
+
+        Raises:
+            MapError: The image cannot be read.
+        """
+
     def check(self) -> None:
         """Check size and completeness without decoding.
 
