@@ -52,8 +52,9 @@ This file is a template: it is compiled as one module with `camera` and the came
 # mypy: ignore-errors
 # --- kernels ---
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns):
+def reproject(poses, k, cameras, c, points, landmark, uv, o, out, columns):
     """Write residual, depth and Jacobian of one observation to `out`; the camera's if it has columns."""
+    axes, parameters = cameras
     R = rotation(poses, k)
     x, y, z = (
         points[landmark, 0] - poses[k, 4],
@@ -86,8 +87,9 @@ def reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, colum
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def reproject_only(poses, k, axes, c, parameters, points, landmark, uv, o, out):
+def reproject_only(poses, k, cameras, c, points, landmark, uv, o, out):
     """Write residual and depth of one observation to `out`."""
+    axes, parameters = cameras
     R = rotation(poses, k)
     x, y, z = (
         points[landmark, 0] - poses[k, 4],
@@ -363,7 +365,9 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
                         Y[n] = 0.0
                         continue
                     k, c = pose_of[o], camera_of[o]
-                    reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns)
+                    reproject(
+                        poses, k, (axes, parameters), c, points, landmark, uv, o, out, columns
+                    )
                     if columns > 0:
                         add_delay(out, uv_motion, timing, o, c)
                     loss, factor = weighted(out, inverse_sigma[o], loss_kind, scale2[o])
@@ -421,7 +425,7 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
                 if inverse_sigma[o] == 0.0:
                     continue
                 k, c = pose_of[o], camera_of[o]
-                reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, columns)
+                reproject(poses, k, (axes, parameters), c, points, landmark, uv, o, out, columns)
                 if columns > 0:
                     add_delay(out, uv_motion, timing, o, c)
                     add_delay_columns(out, uv_motion, timing, o)
@@ -447,7 +451,7 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
                     continue
                 k, c = pose_of[o], camera_of[o]
                 reproject_only(
-                    new_poses, k, new_axes, c, new_parameters, new_points, landmark, uv, o, out
+                    new_poses, k, (new_axes, new_parameters), c, new_points, landmark, uv, o, out
                 )
                 if columns > 0:
                     add_delay(out, uv_motion, new_timing, o, c)
@@ -470,7 +474,7 @@ def evaluate(data, at, error_depth):
         out = np.empty(NUM_OUT)
         for o in range(start[landmark], start[landmark + 1]):
             k, c = pose_of[o], camera_of[o]
-            reproject_only(poses, k, axes, c, parameters, points, landmark, uv, o, out)
+            reproject_only(poses, k, (axes, parameters), c, points, landmark, uv, o, out)
             error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
             error_depth[o, 1] = out[2]
 
@@ -485,7 +489,7 @@ def pixel_motion(data, at, tangent, motion):
         out = np.empty(NUM_OUT)
         for o in range(start[landmark], start[landmark + 1]):
             k, c = pose_of[o], camera_of[o]
-            reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, 0)
+            reproject(poses, k, (axes, parameters), c, points, landmark, uv, o, out, 0)
             a, b = 0.0, 0.0
             for e in range(6):
                 a += out[POSE + 2 * e] * tangent[k, e]

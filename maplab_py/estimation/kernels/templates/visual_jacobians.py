@@ -75,7 +75,7 @@ def keep_jacobians(data, at, prior, loss_kind, chunk_start, kept, sums, cost):
                         jacobian[o, c] = 0.0
                     continue
                 k, c = pose_of[o], camera_of[o]
-                reproject(poses, k, axes, c, parameters, points, landmark, uv, o, out, 0)
+                reproject(poses, k, (axes, parameters), c, points, landmark, uv, o, out, 0)
                 rho += weighted(out, inverse_sigma[o], loss_kind, scale2[o])[0]
                 add_gradients(out, chunk, k, gradient, g)
                 keep_rounded(out, o, jacobian)

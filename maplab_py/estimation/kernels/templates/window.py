@@ -49,8 +49,12 @@ def anchored_ray(poses, a, k, axes, d, h, n):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def reproject(poses, a, k, axes, d, c, parameters, h, n, uv, o, out):
+def reproject(poses, rows, cameras, h, n, uv, o, out):
     """Write residual, depth times 1 / z, and Jacobians by frame k, anchor a and h to `out`."""
+    (a, d, k, c), (axes, parameters) = (
+        rows,
+        cameras,
+    )  # frame and camera of the anchor, and those that see
     w = h[n, 2]
     a0, a1, a2, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
     A, R = rotation(poses, a), rotation(poses, k)
@@ -85,8 +89,12 @@ def reproject(poses, a, k, axes, d, c, parameters, h, n, uv, o, out):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
-def reproject_only(poses, a, k, axes, d, c, parameters, h, n, uv, o, out):
+def reproject_only(poses, rows, cameras, h, n, uv, o, out):
     """Write residual, and depth times 1 / z, to `out`."""
+    (a, d, k, c), (axes, parameters) = (
+        rows,
+        cameras,
+    )  # frame and camera of the anchor, and those that see
     w, R = h[n, 2], rotation(poses, k)
     _, _, _, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
     b0 = R[0] * x + R[3] * y + R[6] * z - w * axes[c, 9]
@@ -188,11 +196,11 @@ def eliminate(data, at, rule, system, kept):
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
             if is_elsewhere[a] or is_elsewhere[k]:
-                reproject_only(poses, a, k, axes, d, c, parameters, points, n, uv, o, now)
-                reproject(poses_0, a, k, axes, d, c, parameters, points, n, uv, o, out)
+                reproject_only(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, now)
+                reproject(poses_0, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
                 out[0], out[1], out[2] = now[0], now[1], now[2]
             else:
-                reproject(poses, a, k, axes, d, c, parameters, points, n, uv, o, out)
+                reproject(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
             if not out[2] > 0.0:
                 total += rho_and_weight(loss, BEHIND, scale2[o])[0]
                 continue
@@ -266,7 +274,7 @@ def substitute(data, at, rule, kept, step, new):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, a, k, axes, d, c, parameters, new_points, n, uv, o, out)
+            reproject_only(poses, (a, d, k, c), (axes, parameters), new_points, n, uv, o, out)
             e2 = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma[o] * inverse_sigma[o]
             total += rho_and_weight(loss, e2 if out[2] > 0.0 else BEHIND, scale2[o])[0]
         r = expected[n, 1] * (new_points[n, 2] - expected[n, 0])
@@ -285,7 +293,7 @@ def evaluate(data, at, error_depth):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, a, k, axes, d, c, parameters, points, n, uv, o, out)
+            reproject_only(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
             error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
             error_depth[o, 1] = out[2] / points[n, 2]
 
