@@ -28,8 +28,11 @@ def project(camera: Camera, p_C: ArrayLike) -> tuple[F64, Mask]:
     to one; whether the pixel lies inside the image is `is_inside_image`. Pixels of points that
     are not visible are finite but without meaning.
     """
-    uv, _, _, visible = project_with_jacobians(camera, p_C)
-    return uv, visible
+    _, focal, centre = _intrinsics(camera)
+    x, _, visible = _normalise(camera, np.asarray(p_C, dtype=np.float64))
+    x = np.where(visible[..., None], x, 0.0)
+    x_d, _, _ = distortion.distort(camera.distortion, camera.distortion_parameters, x)
+    return focal * x_d + centre, visible
 
 
 def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F64, Mask]:
