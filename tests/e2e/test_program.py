@@ -62,9 +62,11 @@ def test_json_is_one_object_per_command(tmp_path: Path) -> None:
 
 
 def test_errors_and_tracebacks_go_to_the_log(tmp_path: Path) -> None:
-    run_program(tmp_path, "-c", "nosuch")
+    run_program(tmp_path, "nosuch")
+    run_program(tmp_path, "-c", "list; other")
     log = (tmp_path / "state" / "maplab" / "maplab.log").read_text()
     assert "command: nosuch" in log
+    assert "not started: column 7: unknown command 'other'" in log
     assert "Traceback" in log
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
 

@@ -22,14 +22,18 @@ from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.vimap import MissionSensor
 from maplab_py.vimap.ids import to_hex
-from tests.registry.workspace import MERGED, SLOW, digest, lines_before, make_workspace
+from tests.registry.workspace import MERGED, SLOW, WITH_ROBOT, digest, lines_before, make_workspace
 from tests.support.data import REPOSITORY
 
 Capture = pytest.CaptureFixture[str]
 
 REGISTRY = load_registry()
 COMMANDS = [command for command in REGISTRY.commands if REGISTRY.is_built_in(command)]
-NAMES = [pytest.param(c.name, marks=pytest.mark.slow if c.name in SLOW else ()) for c in COMMANDS]
+NAMES = [
+    pytest.param(c.name, marks=pytest.mark.slow if c.name in SLOW else ())
+    for c in COMMANDS
+    if c.name not in WITH_ROBOT
+]
 ALL_NAMES = [command.name for command in COMMANDS]
 
 

@@ -132,6 +132,9 @@ PREPARED["push"] = ""
 _PUSHED = "push submap_1 --spool=spool --robot_name=ant"
 PREPARED["serve"] = _PUSHED
 _SERVING = "serve --spool=spool --maplab_server_merged_map_folder=city --serve_stop_when_idle_s=5"
+WITH_ROBOT = ("live_topics", "play_recording", "record_bag")
+"""Commands that talk to the programs of a running robot: tests/interop/live has some."""
+
 SERVED = (
     "delete_all_robot_missions",
     "delete_mission",

@@ -84,6 +84,7 @@ class Runner:
         """
         problems = [] if keep_going else check_commands(text, self.session)
         for problem in problems:
+            logger.error("not started: %s", problem)
             self.terminal.failed(problem, "", int(Status.USER_ERROR))
         if problems:
             return Status.USER_ERROR

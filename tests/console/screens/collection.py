@@ -18,11 +18,12 @@ from maplab_py.vimap import MissionSensor
 from maplab_py.vimap.ids import to_hex
 from tests.console.screens.recording import WIDTHS, Screen, changed, screen_of, text_of
 from tests.console.screens.stable import Stable
-from tests.registry.workspace import MERGED, SERVED, SLOW, lines_before, make_workspace
+from tests.registry.workspace import MERGED, SERVED, SLOW, WITH_ROBOT, lines_before, make_workspace
 
 GOLDEN = Path(__file__).with_name("golden")
 NOT_RECORDED = {
     **dict.fromkeys((*SERVED, "get_dense_map_in_range"), "asks a server: tests/server"),
+    **dict.fromkeys(WITH_ROBOT, "waits for a robot: tests/interop/live"),
     "recover": "loads what a failed script left: tests/console/scripts/test_checking.py",
     "resource_cache_statistics": "counts what the whole process has read",
     "save_view": "needs a browser: tests/viewer",
