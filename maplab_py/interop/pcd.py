@@ -36,6 +36,12 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
         raise MapError(f"{source}: compressed PCD is not read: save it as binary or ascii")
     if form not in ("ascii", "binary"):
         raise MapError(f"{source}: the PCD header has no line DATA ascii or DATA binary")
+    if any(
+        dtype[name].shape for name in ("x", "y", "z", "intensity") if name in (dtype.names or ())
+    ):
+        raise MapError(
+            f"{source}: the PCD header gives a coordinate or intensity several values (COUNT)"
+        )
     try:
         if form == "binary":
             table = np.frombuffer(data, dtype=dtype, count=count, offset=begin)

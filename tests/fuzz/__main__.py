@@ -36,6 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("reader", choices=sorted(READERS))
     parser.add_argument("--seconds", type=int, default=20)
+    parser.add_argument("--runs", type=int, default=-1, help="at most, from a fixed seed")
     parser.add_argument("--corpus", type=Path)
     options = parser.parse_args()
     reader = READERS[options.reader]
@@ -48,6 +49,7 @@ def main() -> None:
     longest = 2 * max(path.stat().st_size for path in corpus.iterdir())
     arguments = [
         f"-max_total_time={options.seconds}",
+        *((f"-runs={options.runs}", "-seed=1") if options.runs >= 0 else ()),
         f"-max_len={max(longest, 4096)}",
         *("-timeout=30", "-rss_limit_mb=4000", "-print_final_stats=1", "-len_control=0"),
         f"-artifact_prefix={corpus.parent}/",

@@ -48,6 +48,7 @@ def test_nothing_is_found_in_20_s(name: str, tmp_path: Path) -> None:
         "tests.fuzz",
         name,
         "--seconds=20",
+        "--runs=400",
         f"--corpus={tmp_path / 'c'}",
     ]
     root = Path(__file__).parents[2]
