@@ -87,12 +87,14 @@ def plot_errors(
     from maplab_py.plotting import figure, time_series
 
     figure.check_plot_file(plot_file, overwrite=overwrite)
+    context.progress.step(0, 2, "compare with ground truth")
     drawn, rmse_m = time_series.errors_over_time(
         context.vi_map,
         read_trajectory(ground_truth, options.time_unit, needs_orientation=False),
         options,
         context.mission_rows("", map_mission_list),
     )
+    context.progress.step(1, 2, "draw")
     figure.write_figure(drawn, plot_file)
     return Plot(plot_file, f"errors over time, RMSE {rmse_m:.4f} m")
 

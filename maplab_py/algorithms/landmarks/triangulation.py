@@ -40,7 +40,7 @@ def retriangulate(
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """
-    progress.check()
+    progress.step(0, 2, "triangulate landmarks")
     chosen = np.flatnonzero(landmark_mask(vi_map, missions))
     rows = chosen[~is_lidar(vi_map, chosen)]
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, rows)]
@@ -50,7 +50,7 @@ def retriangulate(
     enough = np.diff(start) >= 2
     with np.errstate(over="ignore"):  # from beyond 1e154 m
         shift = np.linalg.norm(p_G[placed] - vi_map.p_G[rows[placed]], axis=1)
-    progress.check()
+    progress.step(1, 2, "judge landmarks")
     moved = with_p_G(vi_map, rows[placed], p_G[placed])
     judged, quality = evaluate_quality(moved, options, missions=missions, progress=progress)
     report = RetriangulationReport(
