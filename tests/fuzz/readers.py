@@ -50,7 +50,7 @@ from maplab_py.server.requests import answers
 from maplab_py.storage.column_file import UnusableColumns, read_columns, write_columns
 from maplab_py.storage.native import load_map, save_map
 from tests.interop import test_pcd
-from tests.interop.calibrations import test_oddities, test_programs
+from tests.interop.calibrations import small_files, test_oddities
 from tests.interop.recordings.written import (
     make_content,
     sensor_yaml,
@@ -109,12 +109,12 @@ _CALIBRATIONS = ("c.yaml", "c.json", "camera.txt", "cameras.txt")
 def _calibration_seeds(folder: Path) -> list[bytes]:
     texts = [
         *(test_oddities.CAMERA, test_oddities.IMU, test_oddities.EUROC, test_oddities.OLD_IMU),
-        *(test_oddities.NCAMERA, test_oddities.OKVIS, test_programs.VINS_MONO, test_programs.MEI),
-        *(test_programs.ORB_NEW, test_programs.ORB_OLD, test_programs.OKVIS, test_programs.SVO),
-        *(test_programs.CAMERA_INFO, test_programs.ECHOED, test_programs.KANNALA, sensor_yaml(0)),
+        *(test_oddities.NCAMERA, test_oddities.OKVIS, small_files.VINS_MONO, small_files.MEI),
+        *(small_files.ORB_NEW, small_files.ORB_OLD, small_files.OKVIS, small_files.SVO),
+        *(small_files.CAMERA_INFO, small_files.ECHOED, small_files.KANNALA, sensor_yaml(0)),
     ]
     seeds = [b"\0" + text.encode() for text in texts]
-    seeds.append(b"\1" + test_programs.realsense().encode())
+    seeds.append(b"\1" + small_files.realsense().encode())
     seeds.append(b"\2RadTan 458 457 320 240 -0.28 0.07 0 0\n640 480\ncrop\n640 480\n")
     seeds.append(b"\3# cameras\n1 OPENCV 640 480 500 500 320 240 0.1 0 0 0\n")
     return seeds

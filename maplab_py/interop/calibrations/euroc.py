@@ -13,9 +13,10 @@ import numpy as np
 from maplab_py.errors import MapError
 from maplab_py.interop.calibrations.kalibr import read_camera_chain, read_kalibr_imu
 from maplab_py.interop.calibrations.models import (
+    KALIBR_NOISE,
     note_line_delays,
     read_camera,
-    read_imu_noise,
+    read_imu,
     read_time_shift_ns,
 )
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry, with_imu
@@ -55,7 +56,9 @@ def read_imu_file(entry: Entry) -> Parts:
     Raises:
         MapError: A key is missing or wrong.
     """
-    imu = read_imu_noise(entry, description=entry.text("comment"), topic=entry.text("rostopic"))
+    imu = read_imu(
+        entry, KALIBR_NOISE, description=entry.text("comment"), topic=entry.text("rostopic")
+    )
     T_B_I = entry.pose("T_BS")
     is_kimera = "imu_preintegration_type" in entry or "n_gravity" in entry
     if "n_gravity" in entry:

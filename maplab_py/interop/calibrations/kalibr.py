@@ -15,7 +15,12 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibrations.models import note_line_delays, read_camera, read_imu_noise
+from maplab_py.interop.calibrations.models import (
+    KALIBR_NOISE,
+    note_line_delays,
+    read_camera,
+    read_imu,
+)
 from maplab_py.interop.calibrations.parts import Parts, compare_poses, note_unknown_keys
 from maplab_py.sensors import Camera, Imu, ImuIntrinsics
 from maplab_py.sensors.yaml_entry import Entry
@@ -120,7 +125,7 @@ def read_kalibr_imu(top: Entry, form: str = "kalibr") -> Parts:
         raise MapError(f"{entry.where}: key 'T_i_b' of the only IMU must be the identity")
     if abs(entry.number("time_offset", 0.0)) > 0.0:
         raise MapError(f"{entry.where}: key 'time_offset' of the only IMU must be 0")
-    imu = read_imu_noise(entry, topic=entry.text("rostopic"))
+    imu = read_imu(entry, KALIBR_NOISE, topic=entry.text("rostopic"))
     imu, T_I_i = with_measurement_matrices(imu, *_measurement_matrices(entry))
     notes = note_unknown_keys(top, (*_NOT_OF_THE_CALIBRATION, "integration_sigma"))
     return Parts(form, imu=imu, T_B_I=se3.inverse(T_I_i), notes=notes)

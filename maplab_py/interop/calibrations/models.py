@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,14 @@ _DISTORTIONS = {
 """Names of distortion models; the count of coefficients tells the polynomial ones apart."""
 _BY_COUNT = {4: Distortion.RADTAN, 5: Distortion.RADTAN5, 8: Distortion.RATIONAL}
 _MAX_TIME_SHIFT_S = 10.0
+_NOISE_FIELDS = (
+    *("acc_noise_density", "acc_bias_random_walk_noise_density"),
+    *("gyro_noise_density", "gyro_bias_random_walk_noise_density"),
+)
+KALIBR_NOISE = (
+    *("accelerometer_noise_density", "accelerometer_random_walk"),
+    *("gyroscope_noise_density", "gyroscope_random_walk"),
+)
 
 
 def make_camera(
@@ -183,17 +191,23 @@ def note_line_delays(entry: Entry, cameras: Sequence[Camera]) -> list[str]:
     return notes
 
 
-def read_imu_noise(entry: Entry, **more: Any) -> Imu:
-    """Return the IMU of an entry with kalibr's names of noise densities; its id is empty.
+def read_imu(
+    entry: Entry, noise: Sequence[str], limits: Mapping[str, str] | None = None, **more: Any
+) -> Imu:
+    """Return the IMU of an entry without id.
+
+    Args:
+        entry: Entry with the noise.
+        noise: Keys of the noise density and the random walk of the accelerometer, then of the gyroscope.
+        limits: Keys that may be missing, by the field of the IMU.
+        more: Further fields of the IMU.
 
     Raises:
         MapError: A key is missing or not positive.
     """
-    return Imu(
-        id="",
-        acc_noise_density=entry.number("accelerometer_noise_density", positive=True),
-        acc_bias_random_walk_noise_density=entry.number("accelerometer_random_walk", positive=True),
-        gyro_noise_density=entry.number("gyroscope_noise_density", positive=True),
-        gyro_bias_random_walk_noise_density=entry.number("gyroscope_random_walk", positive=True),
-        **more,
-    )
+    default = Imu(id="")
+    for field, key in (limits or {}).items():
+        more[field] = entry.number(key, getattr(default, field), positive=True)
+    for field, key in zip(_NOISE_FIELDS, noise, strict=True):
+        more[field] = entry.number(key, positive=True)
+    return Imu("", **more)

@@ -15,12 +15,15 @@ from maplab_py.errors import MapError
 from maplab_py.interop.calibrations.models import (
     make_camera,
     note_line_delays,
+    read_imu,
     read_time_shift_ns,
 )
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
-from maplab_py.sensors import Camera, Imu
+from maplab_py.sensors import Camera
 from maplab_py.sensors.yaml_entry import Entry
 
+_OKVIS_NOISE = ("sigma_a_c", "sigma_aw_c", "sigma_g_c", "sigma_gw_c")
+_SVO_NOISE = ("sigma_acc_c", "sigma_acc_bias_c", "sigma_omega_c", "sigma_omega_bias_c")
 _SVO_DISTORTIONS = {"fisheye": "fov"}  # vikit's fisheye is the model of one field of view
 
 
@@ -73,27 +76,17 @@ def read_okvis(entry: Entry) -> Parts:
     imu = None
     for key in ("imu_parameters", "imu_params"):
         if key in entry and imu is None:
-            imu = _okvis_imu(entry.child(key))
+            imu = read_imu(entry.child(key), _OKVIS_NOISE, _limits("a_max", "g_max"))
     notes = note_unknown_keys(entry, settings=True)
     return Parts("OKVIS", cameras, np.stack(poses), imu, notes=notes)
 
 
-def _okvis_imu(entry: Entry) -> Imu:
-    default = Imu(id="")
-    return Imu(
-        id="",
-        acc_noise_density=entry.number("sigma_a_c", positive=True),
-        acc_bias_random_walk_noise_density=entry.number("sigma_aw_c", positive=True),
-        gyro_noise_density=entry.number("sigma_g_c", positive=True),
-        gyro_bias_random_walk_noise_density=entry.number("sigma_gw_c", positive=True),
-        saturation_accel_max_mps2=entry.number(
-            "a_max", default.saturation_accel_max_mps2, positive=True
-        ),
-        saturation_gyro_max_radps=entry.number(
-            "g_max", default.saturation_gyro_max_radps, positive=True
-        ),
-        gravity_magnitude_mps2=entry.number("g", default.gravity_magnitude_mps2, positive=True),
-    )
+def _limits(accel_key: str, gyro_key: str) -> dict[str, str]:
+    return {
+        "saturation_accel_max_mps2": accel_key,
+        "saturation_gyro_max_radps": gyro_key,
+        "gravity_magnitude_mps2": "g",
+    }
 
 
 def read_svo(entry: Entry) -> Parts:
@@ -130,27 +123,9 @@ def read_svo(entry: Entry) -> Parts:
         part = entry.child("imu_params")
         shift_ns = read_time_shift_ns(part, "delay_imu_cam", sign=-1)
         cameras = [dataclasses.replace(camera, time_offset_ns=shift_ns) for camera in cameras]
-        imu = _svo_imu(part)
+        imu = read_imu(part, _SVO_NOISE, _limits("acc_max", "omega_max"))
     notes = note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
     return Parts("SVO", cameras, np.stack(poses), imu, notes=notes)
-
-
-def _svo_imu(entry: Entry) -> Imu:
-    default = Imu(id="")
-    return Imu(
-        id="",
-        acc_noise_density=entry.number("sigma_acc_c", positive=True),
-        acc_bias_random_walk_noise_density=entry.number("sigma_acc_bias_c", positive=True),
-        gyro_noise_density=entry.number("sigma_omega_c", positive=True),
-        gyro_bias_random_walk_noise_density=entry.number("sigma_omega_bias_c", positive=True),
-        saturation_accel_max_mps2=entry.number(
-            "acc_max", default.saturation_accel_max_mps2, positive=True
-        ),
-        saturation_gyro_max_radps=entry.number(
-            "omega_max", default.saturation_gyro_max_radps, positive=True
-        ),
-        gravity_magnitude_mps2=entry.number("g", default.gravity_magnitude_mps2, positive=True),
-    )
 
 
 def _old_svo_camera(entry: Entry) -> Camera:

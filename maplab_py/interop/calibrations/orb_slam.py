@@ -13,7 +13,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibrations.models import make_camera
+from maplab_py.interop.calibrations.models import make_camera, read_imu
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
 from maplab_py.sensors import Camera, Imu
 from maplab_py.sensors.yaml_entry import Entry
@@ -182,10 +182,4 @@ def _unrectified(
 def _imu(entry: Entry) -> Imu | None:
     if "IMU.NoiseGyro" not in entry and "IMU.NoiseAcc" not in entry:
         return None
-    return Imu(
-        id="",
-        acc_noise_density=entry.number("IMU.NoiseAcc", positive=True),
-        acc_bias_random_walk_noise_density=entry.number("IMU.AccWalk", positive=True),
-        gyro_noise_density=entry.number("IMU.NoiseGyro", positive=True),
-        gyro_bias_random_walk_noise_density=entry.number("IMU.GyroWalk", positive=True),
-    )
+    return read_imu(entry, ("IMU.NoiseAcc", "IMU.AccWalk", "IMU.NoiseGyro", "IMU.GyroWalk"))

@@ -17,6 +17,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibrations.models import (
     make_camera,
     note_line_delays,
+    read_imu,
     read_time_shift_ns,
 )
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry
@@ -133,15 +134,8 @@ def _line_delay_ns(entry: Entry, camera: Camera) -> int:
 def _imu(entry: Entry) -> Imu | None:
     if not entry.integer("imu", int("acc_n" in entry)):
         return None
-    return Imu(
-        id="",
-        acc_noise_density=entry.number("acc_n", positive=True),
-        acc_bias_random_walk_noise_density=entry.number("acc_w", positive=True),
-        gyro_noise_density=entry.number("gyr_n", positive=True),
-        gyro_bias_random_walk_noise_density=entry.number("gyr_w", positive=True),
-        gravity_magnitude_mps2=entry.number("g_norm", 9.81, positive=True),
-        topic=entry.text("imu_topic"),
-    )
+    noise, limits = ("acc_n", "acc_w", "gyr_n", "gyr_w"), {"gravity_magnitude_mps2": "g_norm"}
+    return read_imu(entry, noise, limits, topic=entry.text("imu_topic"))
 
 
 def _compare_sizes(entry: Entry, cameras: list[Camera]) -> list[str]:
