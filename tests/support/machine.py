@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import resource
+import subprocess
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 _REFERENCE_SECONDS = 0.04
@@ -26,6 +30,24 @@ def _loop_seconds() -> float:
         total += number
     assert total == 499_999_500_000
     return time.process_time() - start
+
+
+def libraries_start_s() -> float:
+    """Return the processor time of a Python that imports libraries of the console and scipy [s].
+
+    A peer for the time that the console needs to start: imports feel a machine's memory and disk,
+    which the loop of `slowness` does not.
+    """
+    code = "import numpy, prompt_toolkit.shortcuts, scipy.optimize"
+    return child_cpu_s(lambda: subprocess.run([sys.executable, "-c", code], check=True))
+
+
+def child_cpu_s(run: Callable[[], object]) -> float:
+    """Return the processor time of the child processes that a function starts and waits for [s]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def descendants_cpu_s() -> float:

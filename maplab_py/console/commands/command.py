@@ -207,7 +207,12 @@ def _flags_of(
     parameter: inspect.Parameter, hint: Any, documentation: Mapping[str, str]
 ) -> Iterator[Flag]:
     if _is_options(hint):
-        yield from _group_flags(_default_group(parameter, hint), (parameter.name,))
+        default = parameter.default
+        yield from (
+            _default_flags(hint, parameter.name)
+            if default is parameter.empty
+            else _group_flags(default, (parameter.name,))
+        )
         return
     yield Flag(
         normalise(parameter.name).rstrip("_"),
@@ -216,6 +221,12 @@ def _flags_of(
         _flag_help(documentation.get(parameter.name, "")),
         path=(parameter.name,),
     )
+
+
+@functools.cache
+def _default_flags(group: type, parameter: str) -> tuple[Flag, ...]:
+    """Return the flags of an options dataclass with its own defaults; many commands share one."""
+    return tuple(_group_flags(group(), (parameter,)))
 
 
 def _group_flags(group: Any, path: tuple[str, ...]) -> Iterator[Flag]:

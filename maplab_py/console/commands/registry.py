@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gc
 import logging
 import os
 from collections.abc import Iterable
@@ -157,9 +158,15 @@ def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
             f"{PLUGINS_VARIABLE} names plugins that are not installed: {', '.join(sorted(missing))}"
         )
     registry = Registry()
-    for entry in installed:
-        if not names or entry.name in names or entry.name == ALWAYS_LOADED:
-            registry.load(entry)
+    collects = gc.isenabled()
+    gc.disable()  # what plugins define stays, so that collecting it is a tenth of the start in vain
+    try:
+        for entry in installed:
+            if not names or entry.name in names or entry.name == ALWAYS_LOADED:
+                registry.load(entry)
+    finally:
+        if collects:
+            gc.enable()
     return registry
 
 
