@@ -31,10 +31,10 @@ def visualize_xyz_pointclouds(
     *,
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the clouds of plain points, coloured by height."""
-    return _show(context, "point_cloud", clouds, options, viewer)
+    return _show(context, "point_cloud", clouds, options, display)
 
 
 @command(
@@ -48,10 +48,10 @@ def visualize_xyzi_pointclouds(
     *,
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the clouds whose points have intensities, as those of a lidar."""
-    return _show(context, "point_cloud_w_intensity", clouds, options, viewer)
+    return _show(context, "point_cloud_w_intensity", clouds, options, display)
 
 
 @command("visualize_xyzi_pointclouds_from_mission", acts_outside=True, guards_effects=True)
@@ -61,7 +61,7 @@ def visualize_xyzi_pointclouds_from_mission(
     map_mission: str = "",
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the clouds with intensities of one mission.
 
@@ -69,7 +69,7 @@ def visualize_xyzi_pointclouds_from_mission(
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     row = context.mission_row(map_mission)
-    return _show(context, "point_cloud_w_intensity", clouds, options, viewer, np.array([row]))
+    return _show(context, "point_cloud_w_intensity", clouds, options, display, np.array([row]))
 
 
 @command("visualize_xyzi_pointclouds_sequentially", acts_outside=True, guards_effects=True)
@@ -79,10 +79,10 @@ def visualize_xyzi_pointclouds_sequentially(
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
     playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Play the missions with their clouds with intensities."""
-    return _show(context, "point_cloud_w_intensity", clouds, options, viewer, playback=playback)
+    return _show(context, "point_cloud_w_intensity", clouds, options, display, playback=playback)
 
 
 @command(
@@ -96,10 +96,10 @@ def visualize_xyzrgbn_pointclouds(
     *,
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the coloured clouds and meshes."""
-    return _show(context, "color_point_cloud", clouds, options, viewer)
+    return _show(context, "color_point_cloud", clouds, options, display)
 
 
 @command("visualize_raw_depth_map_pointclouds", acts_outside=True, guards_effects=True)
@@ -108,10 +108,10 @@ def visualize_raw_depth_map_pointclouds(
     *,
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the raw depth maps as points in space."""
-    return _show(context, "raw_depth_maps", clouds, options, viewer)
+    return _show(context, "raw_depth_maps", clouds, options, display)
 
 
 @command("visualize_optimized_depth_map_pointclouds", acts_outside=True, guards_effects=True)
@@ -120,10 +120,10 @@ def visualize_optimized_depth_map_pointclouds(
     *,
     clouds: PointCloudOptions = _CLOUDS,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the optimised depth maps as points in space."""
-    return _show(context, "optimized_depth_maps", clouds, options, viewer)
+    return _show(context, "optimized_depth_maps", clouds, options, display)
 
 
 def _show(
@@ -131,7 +131,7 @@ def _show(
     name: str,
     clouds: PointCloudOptions,
     options: VisualizationOptions,
-    viewer: ViewerOptions,
+    display: ViewerOptions,
     missions: np.ndarray[tuple[int, ...], np.dtype[np.int64]] | None = None,
     playback: PlaybackOptions | None = None,
 ) -> ViewReport:
@@ -146,7 +146,7 @@ def _show(
     if clouds.export_accumulated_pc_to_ply_path:
         _write(loaded, Path(clouds.export_accumulated_pc_to_ply_path))
     subject = Subject(context.vi_map, context.map_key, options, clouds=loaded)
-    return show(context, subject, viewer, playback=playback, plays=playback is not None)
+    return show(context, subject, display, playback=playback, plays=playback is not None)
 
 
 def _write(clouds: tuple[Cloud, ...], path: Path) -> None:

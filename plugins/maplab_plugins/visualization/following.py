@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from maplab_py.cancellation import check_cancelled, lasting_effect
@@ -27,10 +28,19 @@ NAME = "viewer"
 
 @dataclasses.dataclass(frozen=True)
 class ViewerOptions:
-    """Address and appearance of the page."""
+    """Program that shows the map; address and appearance of the page in the browser."""
 
     flag_prefix: ClassVar[str] = "viewer_"
 
+    program: str = option(
+        "browser",
+        help="Program that shows the map: a page in the browser, or Rerun (extra rerun)",
+        choices=("browser", "rerun"),
+        flag="viewer",
+    )
+    file: Path | None = option(
+        None, help="With --viewer=rerun: write this file .rrd in place of opening a window"
+    )
     port: int = option(8080, help="Port on this machine; a busy one gives the next, 0 = any.")
     dark: bool = option(False, help="Dark theme; the panel can change it.")
     open_page: bool = option(
@@ -166,8 +176,14 @@ def show(
         plays: Start to play at once.
     """
     began = time.perf_counter()
-    viewer = ensure_viewer(context, viewer_options)
     images = image_of or images_of_map(context, subject.vi_map)
+    if viewer_options.program == "rerun":
+        return _show_in_rerun(subject, viewer_options, images)
+    if viewer_options.file is not None:
+        raise UserError(
+            "--viewer_file is for --viewer=rerun; export_view writes the page to a file"
+        )
+    viewer = ensure_viewer(context, viewer_options)
     check_cancelled()
     viewer.show(subject, playback=playback, image_of=images)
     if plays:
@@ -179,6 +195,24 @@ def show(
     visible = viewer.visible_layers
     lines = tuple(LayerLine(la.title, la.total, la.name in visible) for la in scene.layers)
     return ViewReport(viewer.url, subject.title, lines, scene.notes, time.perf_counter() - began)
+
+
+def _show_in_rerun(subject: Subject, options: ViewerOptions, images: ImageOf) -> ViewReport:
+    """Show a subject in Rerun, or write it to a file."""
+    from maplab_py.viewer.display.rerun_scene import show_in_rerun
+    from maplab_py.viewer.vertex_images import VertexImages
+
+    if options.file is None and not _has_desktop():
+        raise UserError(
+            "--viewer=rerun opens a window, and there is no desktop here: give --viewer_file=map.rrd and "
+            "open the file elsewhere, or leave out --viewer to see the map in a browser"
+        )
+    began = time.perf_counter()
+    of_vertices = images if isinstance(images, VertexImages) else None
+    scene = show_in_rerun(subject, of_vertices, options.file)
+    lines = tuple(LayerLine(la.title, la.total, la.is_visible) for la in scene.layers)
+    place = "Rerun" if options.file is None else str(options.file)
+    return ViewReport(place, subject.title, lines, scene.notes, time.perf_counter() - began)
 
 
 def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:

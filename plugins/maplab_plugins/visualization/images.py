@@ -20,9 +20,9 @@ def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewRe
         context: CommandContext,
         *,
         playback: PlaybackOptions = _PLAYBACK,
-        viewer: ViewerOptions = _VIEWER,
+        display: ViewerOptions = _VIEWER,
     ) -> ViewReport:
-        return _show(context, resource, playback, viewer)
+        return _show(context, resource, playback, display)
 
     play.__doc__ = f"Play the missions with {what}."
     return command(
@@ -44,7 +44,7 @@ visualize_optimized_depth_maps = _player("optimized_depth_maps", "their optimise
 
 
 def _show(
-    context: CommandContext, name: str, playback: PlaybackOptions, viewer: ViewerOptions
+    context: CommandContext, name: str, playback: PlaybackOptions, display: ViewerOptions
 ) -> ViewReport:
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.resource_clouds import resource_rows
@@ -53,4 +53,4 @@ def _show(
     resource_rows(context.vi_map, name)
     images = VertexImages(context.vi_map, context.map_folder or Path(), name)
     subject = Subject(context.vi_map, context.map_key)
-    return show(context, subject, viewer, playback=playback, image_of=images, plays=True)
+    return show(context, subject, display, playback=playback, image_of=images, plays=True)

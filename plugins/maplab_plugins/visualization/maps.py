@@ -44,7 +44,7 @@ def visualize(
     context: CommandContext,
     *,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
     ground_truth: Path | None = None,
     informative_segments: Path | None = None,
 ) -> ViewReport:
@@ -69,7 +69,7 @@ def visualize(
         from maplab_py.viewer.segment_file import read_segments
 
         subject = subject.replace(segments=read_segments(informative_segments, context.vi_map))
-    return show(context, subject, viewer)
+    return show(context, subject, display)
 
 
 @command(
@@ -86,14 +86,14 @@ def visualize_sequentially(
     chosen: MissionChoice = ALL_MISSIONS,
     options: VisualizationOptions = _OPTIONS,
     playback: PlaybackOptions = _PLAYBACK,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Play the missions in the browser: the map grows as it was recorded."""
     from maplab_py.viewer.building import Subject
 
     missions = chosen.rows(context.vi_map)
     subject = Subject(_only(context.vi_map, missions), context.map_key, options)
-    return show(context, subject, viewer, playback=playback, plays=True)
+    return show(context, subject, display, playback=playback, plays=True)
 
 
 @command(
@@ -106,13 +106,13 @@ def visualize_landmark_observers(
     context: CommandContext,
     *,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the rays from every observing camera to the good landmarks."""
     from maplab_py.viewer.building import Subject
 
     subject = Subject(context.vi_map, context.map_key, options, shows_observers=True)
-    return show(context, subject, viewer)
+    return show(context, subject, display)
 
 
 @command(
@@ -122,13 +122,13 @@ def visualize_landmark_observers(
     guards_effects=True,
 )
 def visualize_sensor_extrinsics(
-    context: CommandContext, *, viewer: ViewerOptions = _VIEWER
+    context: CommandContext, *, display: ViewerOptions = _VIEWER
 ) -> ViewReport:
     """Show how the sensors are mounted: each as axes on its base sensor."""
     from maplab_py.viewer.building import Subject
 
     title = f"{context.map_key}: sensors"
-    return show(context, Subject(context.vi_map, title, shows_sensors=True), viewer)
+    return show(context, Subject(context.vi_map, title, shows_sensors=True), display)
 
 
 @command(
@@ -141,7 +141,7 @@ def visualize_loop_closures(
     context: CommandContext,
     *,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show loop closures on the trajectories: edges by switch value, remembered ones by weight.
 
@@ -161,7 +161,7 @@ def visualize_loop_closures(
         vi_map, context.map_key, options,
         only_layers=("trajectories", "vertices", "loop_closures", LOOP_CLOSURES, ACCEPTED),
     )  # fmt: skip
-    return show(context, subject, viewer)
+    return show(context, subject, display)
 
 
 @command(
@@ -178,7 +178,7 @@ def visualize_difference(
     with_snapshot: str = "",
     side_by_side: bool = False,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> DifferenceReport:
     """Show the selected map over or beside another state of it or another map.
 
@@ -204,7 +204,7 @@ def visualize_difference(
     subject = Subject(
         context.vi_map, context.map_key, options, other, name, side_by_side=side_by_side
     )
-    view = show(context, subject, viewer)
+    view = show(context, subject, display)
     missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)
     mean_m, largest_m = (distance.mean(), distance.max()) if len(here) else (np.nan, np.nan)
     return DifferenceReport(name, len(here), missing, float(mean_m), float(largest_m), view)

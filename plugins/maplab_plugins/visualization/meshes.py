@@ -30,7 +30,7 @@ def visualize_mesh(
     dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
     dense_result_mesh_colours: bool = False,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the map with the mesh of its grids, or with a mesh from a file.
 
@@ -61,7 +61,7 @@ def visualize_mesh(
         )  # fmt: skip
     mesh = coloured_mesh(mesh, mesh_colouring, reference)
     subject = Subject(context.vi_map, context.map_key, options, clouds=(mesh,))
-    return show(context, subject, viewer)
+    return show(context, subject, display)
 
 
 @command(
@@ -77,7 +77,7 @@ def visualize_esdf(
     missions: MissionChoice = ALL_MISSIONS,
     dense_esdf_slice_height_m: float | None = None,
     options: VisualizationOptions = _OPTIONS,
-    viewer: ViewerOptions = _VIEWER,
+    display: ViewerOptions = _VIEWER,
 ) -> ViewReport:
     """Show the map with a horizontal slice through its distance field, coloured by the distance.
 
@@ -92,4 +92,4 @@ def visualize_esdf(
     folder = context.map_folder or Path()
     cloud = field_slice(context.vi_map, folder, rows, dense_esdf_slice_height_m)
     subject = Subject(context.vi_map, context.map_key, options, clouds=(cloud,))
-    return show(context, subject, viewer)
+    return show(context, subject, display)

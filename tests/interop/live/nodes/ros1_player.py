@@ -5,10 +5,7 @@ Runs with Debian's Python, not in the environment of the tests.
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from pathlib import Path
+from typing import Any
 
 import events
 import rospy
@@ -17,57 +14,43 @@ from sensor_msgs.msg import Image, Imu
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("recording", type=Path)
-    parser.add_argument("--rate", type=float, default=1.0)
-    options = parser.parse_args()
+    player = events.Player(events.options())
     rospy.init_node("player", disable_signals=True)
     publishers = {-1: rospy.Publisher("/imu0", Imu, queue_size=500, tcp_nodelay=True)}
-    for camera in (0, 1):
+    for camera in player.cameras:
         topic = f"/cam{camera}/image_raw"
         publishers[camera] = rospy.Publisher(topic, Image, queue_size=50, tcp_nodelay=True)
-    sent_s: dict[int, float] = {}
-    latencies_ms: list[float] = []
-    odometry: list[Odometry] = []
+    last: list[Odometry] = []
 
     def take(message: Odometry) -> None:
-        stamp_ns = message.header.stamp.to_nsec()
-        if stamp_ns in sent_s:
-            latencies_ms.append(1e3 * (time.monotonic() - sent_s[stamp_ns]))
-        odometry.append(message)
+        player.take(message.header.stamp.to_nsec())
+        last[:] = [message]
 
     rospy.Subscriber("/maplab/odometry", Odometry, take, queue_size=50)
-    recorded = events.load(options.recording)
-    deadline_s = time.monotonic() + 60.0
-    while time.monotonic() < deadline_s:
-        if all(publisher.get_num_connections() for publisher in publishers.values()):
-            break
-        time.sleep(0.05)
-    time.sleep(1.0)  # both sides know of each other
-    sent = dict.fromkeys(publishers, 0)
-    for stamp_ns, sensor, content in events.paced(recorded, options.rate):
-        if sensor < 0:
-            message = Imu()
-            accel, gyro = message.linear_acceleration, message.angular_velocity
-            accel.x, accel.y, accel.z, gyro.x, gyro.y, gyro.z = map(float, content)
-        else:
-            height, width = content.shape
-            message = Image(height=height, width=width, step=width, encoding="mono8")
-            message.data = content.tobytes()
+
+    def send(stamp_ns: int, sensor: int, content: Any) -> None:
+        message = _imu(content) if sensor < 0 else _image(content)
         message.header.stamp = rospy.Time(*divmod(stamp_ns, 10**9))
-        sent_s[stamp_ns] = time.monotonic()
         publishers[sensor].publish(message)
-        sent[sensor] += 1
-    events.wait_while_growing(odometry)
-    report = {
-        "sent": {str(sensor): count for sensor, count in sent.items()},
-        "odometry": len(odometry),
-        "latency_ms": sorted(latencies_ms),
-    }
-    if odometry:
-        report["frames"] = [odometry[-1].header.frame_id, odometry[-1].child_frame_id]
-    print(json.dumps(report), flush=True)
+
+    player.play(lambda: all(p.get_num_connections() for p in publishers.values()), send)
+    frames = [last[0].header.frame_id, last[0].child_frame_id] if last else []
+    player.report(frames=frames)
     rospy.signal_shutdown("end")
+
+
+def _imu(sample: Any) -> Imu:
+    message = Imu()
+    accel, gyro = message.linear_acceleration, message.angular_velocity
+    accel.x, accel.y, accel.z, gyro.x, gyro.y, gyro.z = map(float, sample)
+    return message
+
+
+def _image(pixels: Any) -> Image:
+    height, width = pixels.shape
+    message = Image(height=height, width=width, step=width, encoding="mono8")
+    message.data = pixels.tobytes()
+    return message
 
 
 if __name__ == "__main__":

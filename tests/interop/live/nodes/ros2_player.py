@@ -5,12 +5,9 @@ Runs in an environment of ROS 2, not in that of the tests.
 
 from __future__ import annotations
 
-import argparse
 import array
-import json
 import threading
-import time
-from pathlib import Path
+from typing import Any
 
 import events
 import rclpy
@@ -21,14 +18,8 @@ from sensor_msgs.msg import Image, Imu
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("recording", type=Path)
-    parser.add_argument("--rate", type=float, default=1.0)
-    parser.add_argument("--best_effort", action="store_true")
-    parser.add_argument("--no_wait", action="store_true")
-    parser.add_argument("--cameras", type=int, default=2)
-    parser.add_argument("--limit", type=int, default=0, help="events to send; 0 = all")
-    options = parser.parse_args()
+    options = events.options()
+    player = events.Player(options)
     rclpy.init()
     node = rclpy.create_node("player")
     reliability = (
@@ -39,64 +30,53 @@ def main() -> None:
         return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
 
     publishers = {-1: node.create_publisher(Imu, "/imu0", quality(200))}
-    for camera in range(options.cameras):
+    for camera in player.cameras:
         topic = f"/cam{camera}/image_raw"
         publishers[camera] = node.create_publisher(Image, topic, quality(10))
-    sent_s: dict[int, float] = {}
-    latencies_ms: list[float] = []
-    odometry: list[Odometry] = []
-    poses: list[PoseStamped] = []
+    last: list[Odometry] = []
+    poses = 0
 
     def take(message: Odometry) -> None:
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        if stamp_ns in sent_s:
-            latencies_ms.append(1e3 * (time.monotonic() - sent_s[stamp_ns]))
-        odometry.append(message)
+        player.take(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+        last[:] = [message]
+
+    def take_pose(_: PoseStamped) -> None:
+        nonlocal poses
+        poses += 1
 
     node.create_subscription(Odometry, "/maplab/odometry", take, 50)
-    node.create_subscription(PoseStamped, "/maplab/pose_in_map", poses.append, 50)
+    node.create_subscription(PoseStamped, "/maplab/pose_in_map", take_pose, 50)
     spinning = threading.Thread(target=rclpy.spin, args=(node,), daemon=True)
     spinning.start()
-    recorded = [e for e in events.load(options.recording) if e[1] < options.cameras]
-    recorded = recorded[: options.limit or None]
-    deadline_s = time.monotonic() + (0.0 if options.no_wait else 60.0)
-    while time.monotonic() < deadline_s:
-        if all(p.get_subscription_count() for p in publishers.values()):
-            break
-        time.sleep(0.05)
-    time.sleep(1.0)  # both sides know of each other
-    sent = dict.fromkeys(publishers, 0)
-    for stamp_ns, sensor, content in events.paced(recorded, options.rate):
-        message = Imu() if sensor < 0 else Image()
+
+    def send(stamp_ns: int, sensor: int, content: Any) -> None:
+        message = _imu(content) if sensor < 0 else _image(content)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        if sensor < 0:
-            fill_imu(message, content)
-        else:
-            message.height, message.width = content.shape
-            message.step, message.encoding = content.shape[1], "mono8"
-            message.data = array.array("B", content.tobytes())
-        sent_s[stamp_ns] = time.monotonic()
         publishers[sensor].publish(message)
-        sent[sensor] += 1
-    events.wait_while_growing(odometry)
-    report = {
-        "sent": {str(sensor): count for sensor, count in sent.items()},
-        "odometry": len(odometry),
-        "poses_in_map": len(poses),
-        "latency_ms": sorted(latencies_ms),
-    }
-    if odometry:
-        last = odometry[-1]
-        report["frames"] = [last.header.frame_id, last.child_frame_id]
-        report["sigma_x"] = last.pose.covariance[0] ** 0.5
-    print(json.dumps(report), flush=True)
+
+    player.play(lambda: all(p.get_subscription_count() for p in publishers.values()), send)
+    more: dict[str, Any] = {"poses_in_map": poses}
+    if last:
+        more["frames"] = [last[0].header.frame_id, last[0].child_frame_id]
+        more["sigma_x"] = last[0].pose.covariance[0] ** 0.5
+    player.report(**more)
     rclpy.shutdown()
     spinning.join(5.0)
 
 
-def fill_imu(message: Imu, sample) -> None:
+def _imu(sample: Any) -> Imu:
+    message = Imu()
     accel, gyro = message.linear_acceleration, message.angular_velocity
     accel.x, accel.y, accel.z, gyro.x, gyro.y, gyro.z = map(float, sample)
+    return message
+
+
+def _image(pixels: Any) -> Image:
+    message = Image(encoding="mono8")
+    message.height, message.width = pixels.shape
+    message.step = message.width
+    message.data = array.array("B", pixels.tobytes())
+    return message
 
 
 if __name__ == "__main__":

@@ -1,0 +1,134 @@
+"""Maps in files of Rerun, read back with its own library."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.session.session import Session
+from maplab_py.errors import UserError
+from maplab_py.sensors.projection import back_project
+from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.rerun_scene import show_in_rerun
+from maplab_py.viewer.layers.cameras import mission_cameras
+from maplab_py.viewer.vertex_images import VertexImages
+from maplab_py.vimap.queries import mission_labels
+from tests.interop.bags.small_bags import map_with_resources
+from tests.vimap.builders import walk_map
+
+needs_rerun = pytest.mark.skipif(
+    importlib.util.find_spec("rerun") is None,
+    reason="no rerun-sdk: pip install 'maplab-py[rerun]'",
+)
+
+
+def read(file: Path) -> dict[str, list[Any]]:
+    """Return the record batches of each entity."""
+    from rerun.chunk import RrdReader
+
+    batches: dict[str, list[Any]] = {}
+    for chunk in RrdReader(str(file)).store().stream():
+        path = chunk.entity_path.replace("\\ ", " ")
+        batches.setdefault(path, []).append(chunk.to_record_batch())
+    return batches
+
+
+def values(batches: list[Any], component: str) -> list[Any]:
+    """Return the rows of a component, in the order of the rows."""
+    columns = [b.column(component).to_pylist() for b in batches if component in b.schema.names]
+    return [value for column in columns for value in column if value is not None]
+
+
+@needs_rerun
+def test_layers_are_those_of_the_scene(tmp_path: Path) -> None:
+    subject = Subject(walk_map(), "walk")
+    scene = show_in_rerun(subject, None, tmp_path / "walk.rrd")
+    batches = read(tmp_path / "walk.rrd")
+    names = {mission.id: mission.name for mission in scene.missions}
+    assert scene.names == build_scene(subject).names
+    for layer in scene.layers:
+        drawn = [
+            f"/map/{layer.title}/{names[m]}" if m else f"/map/{layer.title}" for m in layer.parts
+        ]
+        assert set(drawn) <= set(batches)
+    (landmarks,) = scene.layer("landmarks").parts.values()
+    (positions,) = values(batches[f"/map/Landmarks/{scene.missions[0].name}"], "Points3D:positions")
+    assert np.array_equal(np.float32(positions), landmarks.p)  # type: ignore[union-attr]
+    closures = values(batches["/map/Loop closures"], "LineStrips3D:strips")
+    assert sum(map(len, closures)) == 2
+
+
+@needs_rerun
+def test_poses_and_images_have_the_times_of_the_vertices(tmp_path: Path) -> None:
+    vi_map, images, _ = map_with_resources()
+    pictures = VertexImages(vi_map, tmp_path)
+    show_in_rerun(Subject(vi_map, "room"), pictures, tmp_path / "room.rrd")
+    batches = read(tmp_path / "room.rrd")
+    body = f"/map/Body/{mission_labels(vi_map)[0]}"
+    rows = slice(*vi_map.vertex_start[:2].tolist())
+    (poses,) = batches[body]
+    times_ns = poses.column("time").cast("int64").to_numpy()
+    assert np.array_equal(times_ns, vi_map.vertices.timestamp_ns[rows])
+    p = np.squeeze(values(batches[body], "Transform3D:translation"))
+    q = np.squeeze(values(batches[body], "Transform3D:quaternion"))
+    assert np.allclose(np.hstack([q, p]), vi_map.T_G_I[rows], atol=1e-6)
+    blobs = [blob for (blob,) in values(batches[f"{body}/cam0"], "EncodedImage:blob")]
+    assert len(blobs) == len(images)
+    for blob, image in zip(blobs, images, strict=True):
+        decoded = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert decoded.shape == image.shape
+        assert np.abs(decoded.astype(float) - image).mean() < 12.0  # noise, as JPEG
+
+
+@needs_rerun
+def test_the_corners_of_the_pinhole_are_those_of_the_camera(tmp_path: Path) -> None:
+    vi_map = walk_map()
+    show_in_rerun(Subject(vi_map, "walk"), None, tmp_path / "walk.rrd")
+    batches = read(tmp_path / "walk.rrd")
+    place = f"/map/Body/{mission_labels(vi_map)[0]}/cam0"
+    (K,) = np.array(values(batches[place], "Pinhole:image_from_camera"))
+    K = K.reshape(3, 3).T  # columns
+    camera = mission_cameras(vi_map, 0)[0].camera
+    corners = np.array([[0.0, 0.0], [camera.width_px, camera.height_px]])
+    rays, _ = back_project(camera, corners)
+    assert np.allclose((rays / rays[:, 2:] @ K.T)[:, :2], corners, atol=1e-3)
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(load_registry()) as session:
+        session.maps.add("walk", walk_map())
+        yield session
+
+
+@needs_rerun
+def test_visualize_writes_the_file_and_keeps_one_that_exists(
+    session: Session, tmp_path: Path
+) -> None:
+    file = tmp_path / "walk.rrd"
+    report = session.run("visualize", viewer="rerun", viewer_file=f"{file}")
+    assert report.url == str(file)
+    assert ("Vertices", 12, True) in [(la.layer, la.in_map, la.visible) for la in report.layers]
+    with pytest.raises(UserError, match=r"walk\.rrd exists"):
+        session.run("visualize", viewer="rerun", viewer_file=f"{file}")
+
+
+def test_what_rerun_needs_is_said(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UserError, match=r"no desktop here: give --viewer_file=map\.rrd"):
+        session.run("visualize", viewer="rerun")
+    with pytest.raises(UserError, match="--viewer_file is for --viewer=rerun"):
+        session.run("visualize", viewer_file=f"{tmp_path}/walk.rrd")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"pip install 'maplab-py\[rerun\]'"):
+        session.run("visualize", viewer="rerun", viewer_file=f"{tmp_path}/walk.rrd")
