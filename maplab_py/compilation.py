@@ -1,32 +1,22 @@
 """The decorator that compiles kernels with numba and keeps their machine code; `prange`, `numba`.
 
-This is the only module that imports numba: before, it fixes the processor that numba compiles for
-(x86-64-v3, x86-64-v2, or the generic processor of another architecture), so that kernels give the
-same bits on all processors that can run them, and machine code fits all of them. `MAPLAB_NATIVE=1`
-compiles for this processor; NUMBA_CPU_NAME names any other.
+This is the only module that imports numba: before, it fixes the processor that numba compiles for,
+so that kernels give the same bits on all processors that can run them. `MAPLAB_NATIVE=1` compiles for
+this processor; NUMBA_CPU_NAME names any other.
 
-Machine code is found by content: the name of its file is a hash of the sources that decide what is
-in it, the types of the arguments, the versions of numba, numpy and Python, and the processor. Time
-stamps, paths and line numbers do not count. A kernel's sources are its own file and, one after the
-other, those of the compiled functions and the named tuples that its module imports; constants count by
-value. Only functions and constants of modules count: a kernel refers to nothing else. Machine code
-comes from the folder `_kernels` of the package, which a wheel brings, else from the user's cache,
-where it is written when something is compiled.
+Machine code is found by content. Its folder is named by what compiled it, its file by a hash of the
+types of the arguments and of all that decides what numba makes of the function: the instructions of the
+function and of those that it calls, and the values of their constants. Time stamps, paths and line
+numbers do not count. It comes from the package, if the wheel brings it, else from the user's cache.
 
 A module with kernels, or the module that calls them, has a function `compile_kernels`. It calls the
 kernels once with small arguments of the types that commands use. `maplab_py.warmup` calls all of them.
-
-Threads sleep while they wait for others at the end of a parallel loop. By default, GNU OpenMP lets
-them spin for milliseconds; on a busy machine every loop then costs a time slice of the scheduler
-(measured: 60 ms instead of 2 ms). OpenMP reads the variable when numba loads it, at the first parallel
-loop.
 """
 
 from __future__ import annotations
 
 import enum
 import hashlib
-import json
 import os
 import pickle
 import platform
@@ -34,7 +24,7 @@ import sys
 from collections.abc import Callable, Iterator, Set
 from functools import cache
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -65,37 +55,30 @@ def target_processor(machine: str, features: Set[str]) -> str:
     return next(level for level, needed in _X86_LEVELS.items() if needed <= features)
 
 
-def _fix_target() -> None:
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    if os.environ.get("MAPLAB_NATIVE") == "1" or os.environ.get("NUMBA_CPU_NAME"):
-        return
-    features = {name for name, is_there in llvm.get_host_cpu_features().items() if is_there}
-    os.environ["NUMBA_CPU_NAME"] = target_processor(platform.machine(), features)
+# Threads sleep at the end of a parallel loop: on a busy machine, those that spin, GNU OpenMP's default,
+# cost a time slice of the scheduler (measured: 60 ms instead of 2 ms)
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+if not (os.environ.get("MAPLAB_NATIVE") == "1" or os.environ.get("NUMBA_CPU_NAME")):
+    _features = {name for name, is_there in llvm.get_host_cpu_features().items() if is_there}
+    os.environ["NUMBA_CPU_NAME"] = target_processor(platform.machine(), _features)
     os.environ["NUMBA_CPU_FEATURES"] = ""
     # Intel's vector functions, which some distributions install, give other bits than libm
     os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
 
-
-_fix_target()
-
 import numba  # noqa: E402 - it reads the environment when it is imported
 import numba.extending  # noqa: E402 - for the modules that get numba from here
 from numba.core.caching import FunctionCache  # noqa: E402
+from numba.core.dispatcher import Dispatcher  # noqa: E402
 
-__all__ = [
-    "compiled",
-    "is_missing_on_disk",
-    "njit",
-    "numba",
-    "prange",
-    "target_processor",
-    "versions",
-]
+__all__ = ["TARGET", "compiled", "numba", "prange", "target_processor"]
 
-CODE_FOLDER = "code"
-"""Folder of machine code, in the user's cache and in the package."""
-BUILT_WITH = "built_with.json"
-"""File of the package that tells what its machine code was compiled with."""
+prange: Any = numba.prange
+
+TARGET = (
+    f"code-{sys.implementation.cache_tag}-numba-{numba.__version__}"
+    f"-numpy-{'.'.join(np.__version__.split('.')[:2])}-{os.environ.get('NUMBA_CPU_NAME', 'native')}"
+)
+"""Folder of machine code in the package and in the user's cache."""
 
 
 def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -109,63 +92,37 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
     Args:
         settings: Further settings of `numba.njit`, e.g. `parallel=True`.
     """
-    settings = {"error_model": "numpy", "nogil": True, **settings}
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        kernel = numba.njit(**settings)(function)
-        if hasattr(kernel, "py_func"):  # not there where compilation is switched off
-            kernel._cache = _KernelCache(kernel.py_func, settings)
+        kernel = numba.njit(**{"error_model": "numpy", "nogil": True, **settings})(function)
+        if isinstance(kernel, Dispatcher):  # it is not where compilation is switched off
+            kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return kernel  # type: ignore[no-any-return]
 
     return decorate
 
 
-def njit(*, cache: bool = True, **settings: Any) -> Callable[..., Any]:
-    """Return `compiled(**settings)`; generated modules say `njit`."""
-    assert cache
-    return compiled(**settings)
-
-
-def is_missing_on_disk(kernel: Callable[..., Any]) -> bool:
-    """Tell whether the disk could hold the machine code of a compiled function but does not."""
-    kept = getattr(kernel, "_cache", None)
-    return isinstance(kept, _KernelCache) and not kept.has_entry()
-
-
 class _KernelCache(FunctionCache):  # type: ignore[misc]
     """The machine code of one function on disk, a file for each set of argument types."""
 
-    def __init__(self, function: FunctionType, settings: dict[str, Any]) -> None:
-        self._function = function
-        self._settings = settings
-        self._enabled = bool(_source(function.__module__)) and function.__closure__ is None
+    cache_path = ""
 
-    @property
-    def cache_path(self) -> str:
-        return str(cache_folder(CODE_FOLDER))
-
-    def has_entry(self) -> bool:
-        """Tell whether there is machine code of the function for some types."""
-        pattern = self._stem() + "*.nbc"
-        return any(any(folder.glob(pattern)) for folder in self._folders())
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        self._enabled = kernel.py_func.__closure__ is None
 
     def flush(self) -> None:
-        for path in cache_folder(CODE_FOLDER).glob(self._stem() + "*.nbc"):
-            path.unlink(missing_ok=True)
+        """Keep the files: others have the same content."""
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         if not self._enabled:
             return None
         name = self._file_name(sig, target_context.codegen())
-        for folder in self._folders():
-            try:
-                data = (folder / name).read_bytes()
-            except OSError:
-                continue
-            result_type = numba.core.compiler.CompileResult
-            return result_type._rebuild(target_context, *pickle.loads(data))
-        if self._function.__module__.startswith("maplab_py"):
-            _say_why_not_packaged()
+        for folder in (_packaged_folder, cache_folder):
+            path = folder(TARGET) / name
+            if path.exists():
+                parts = pickle.loads(path.read_bytes())
+                return numba.core.compiler.CompileResult._rebuild(target_context, *parts)
         return None
 
     def _save_overload(self, sig: Any, data: Any) -> None:
@@ -173,101 +130,60 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
             return
         parts = list(data._reduce())
         parts[6] = ""  # the annotated source, which nobody reads, with the path of its file
-        path = cache_folder(CODE_FOLDER) / self._file_name(sig, data.codegen)
+        path = cache_folder(TARGET) / self._file_name(sig, data.codegen)
         write_file(path, [numba.core.serialize.dumps(tuple(parts))], durable=False)
 
-    @staticmethod
-    def _folders() -> Iterator[Path]:
-        yield PACKAGED / CODE_FOLDER
-        yield cache_folder(CODE_FOLDER)
-
-    def _stem(self) -> str:
-        module, name = self._function.__module__, self._function.__qualname__
-        settings = sorted((key, _describe(value)) for key, value in self._settings.items())
-        code = self._function.__code__  # differs from the file after a reload
-        function = f"{name} {code.co_code.hex()} {_describe(code.co_consts)} {settings}"
-        stamp = _digest(_source_digest(module), function)
-        return f"{module.rpartition('.')[2]}.{name.replace('<', '').replace('>', '')}-{stamp}-"
-
     def _file_name(self, sig: Any, codegen: Any) -> str:
-        target = _digest(repr(sig), repr(codegen.magic_tuple()), repr(versions()))
-        return f"{self._stem()}{target}.nbc"
+        function = self._kernel.py_func
+        content = [repr(sig), _fields(sig), repr(codegen.magic_tuple()), *_content(self._kernel)]
+        digest = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
+        name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}"
+        return f"{name.replace('<', '').replace('>', '')}-{digest}.nbc"
 
 
 @cache
-def versions() -> dict[str, str]:
-    """Return by name the versions that machine code depends on."""
-    return {
-        "python": f"{sys.implementation.name} {sys.version_info[0]}.{sys.version_info[1]}",
-        "numba": numba.__version__,
-        "numpy": ".".join(np.__version__.split(".")[:2]),
-    }
-
-
-def built_with() -> dict[str, str]:
-    """Return the versions and the processor that machine code is compiled with now."""
-    return {**versions(), "processor": os.environ.get("NUMBA_CPU_NAME", "this one")}
-
-
-@cache
-def _say_why_not_packaged() -> None:
-    """Tell once why the wheel's machine code is not used, if the reason is known."""
-    try:
-        built = json.loads((PACKAGED / BUILT_WITH).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return
-    different = [
-        f"{name} {built.get(name)}, not {value}"
-        for name, value in built_with().items()
-        if value not in built.get(name, "").split(", ")
-    ]
-    if different:
+def _packaged_folder(target: str) -> Path:
+    """Return a folder of the package; tell once if the wheel brings others instead."""
+    others = sorted(path.name for path in PACKAGED.glob("code-*"))
+    if others and target not in others:
         kernel_cache.tell_user(
-            f"the installed kernels were compiled with {'; '.join(different)}: compiling them again, "
+            f"the installed kernels are {', '.join(others)}, not {target}: compiling them again, "
             "once, when they are needed (maplab warmup compiles all)"
         )
+    return PACKAGED / target
+
+
+def _fields(types: Any) -> str:
+    """Return the names of the fields of named tuples, which their types do not tell."""
+    tuples = [each for each in types if isinstance(each, numba.types.BaseTuple)]
+    return repr([(getattr(each, "fields", ()), _fields(each.types)) for each in tuples])
 
 
 @cache
-def _source_digest(module: str) -> str:
-    """Return a hash of the sources that decide what the kernels of a module are compiled to."""
-    names = _modules_of_kernels(module, set())
-    return _digest(*(part for name in sorted(names) for part in (name, _module_digest(name))))
+def _content(kernel: Any) -> list[str]:
+    """Return all that decides what numba makes of a function, but the types of its arguments."""
+    kernels = [kernel]  # and those that they call: it grows in the loop
+    return [part for each in kernels for part in _content_of_one(each, kernels)]
 
 
-def _modules_of_kernels(module: str, seen: set[str]) -> set[str]:
-    """Return the names of a module and of those whose kernels and named tuples it refers to."""
-    seen.add(module)
-    for value in vars(sys.modules[module]).values():
-        if isinstance(value, ModuleType):
-            name = value.__name__ if _is_of_kernels(value) else module
-        elif hasattr(value, "py_func"):
-            name = value.py_func.__module__
-        elif isinstance(value, type) and issubclass(value, tuple) and hasattr(value, "_fields"):
-            name = value.__module__
-        else:
-            continue
-        if name not in seen:
-            _modules_of_kernels(name, seen)
-    return seen
+def _content_of_one(kernel: Any, kernels: list[Any]) -> Iterator[str]:
+    function = kernel.py_func
+    yield f"{function.__module__} {function.__qualname__} {_describe(function.__defaults__)}"
+    yield repr(sorted((key, _describe(value)) for key, value in kernel.targetoptions.items()))
+    codes = [function.__code__]  # and those of functions inside: it grows in the loop
+    for code in codes:
+        codes += [each for each in code.co_consts if isinstance(each, CodeType)]
+        yield f"{code.co_code.hex()} {code.co_varnames} {code.co_names} {_describe(code.co_consts)}"
+        values = _named(code.co_names, function.__globals__)
+        modules = [each for each in values if isinstance(each, ModuleType)]
+        for value in (*values, *(x for each in modules for x in _named(code.co_names, vars(each)))):
+            yield _describe(value)
+            if isinstance(value, Dispatcher) and value not in kernels:
+                kernels.append(value)
 
 
-def _is_of_kernels(module: ModuleType) -> bool:
-    return any(isinstance(getattr(x, "_cache", None), _KernelCache) for x in vars(module).values())
-
-
-@cache
-def _source(module: str) -> str:
-    """Return a hash of a module's file as it is when its first kernel is declared; "" without a file."""
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
-
-
-@cache
-def _module_digest(module: str) -> str:
-    names = {name: _describe(value) for name, value in vars(sys.modules[module]).items()}
-    constants = sorted((k, v) for k, v in names.items() if v and not k.startswith("__"))
-    return _digest(_source(module), repr(constants))
+def _named(names: tuple[str, ...], scope: dict[str, Any]) -> list[Any]:
+    return [scope[name] for name in names if name in scope]
 
 
 def _describe(value: Any) -> str:
@@ -276,19 +192,13 @@ def _describe(value: Any) -> str:
         return repr(sorted(map(_describe, value)))
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
-    if isinstance(value, tuple) and not hasattr(value, "_fields"):
+    if isinstance(value, tuple):
         return repr([_describe(each) for each in value])
     if isinstance(value, bool | int | float | complex | str | enum.Enum | np.generic):
         return repr(value)
-    if isinstance(value, type) and issubclass(value, enum.Enum):
-        return repr(list(value))
+    if isinstance(value, type):
+        members = list(value) if issubclass(value, enum.Enum) else getattr(value, "_fields", "")
+        return f"{value.__qualname__} {members}"
     if isinstance(value, numba.types.ExternalFunction):
         return f"{value.symbol} {value.sig}"
     return ""
-
-
-def _digest(*parts: str) -> str:
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
-
-
-prange: Any = numba.prange

@@ -1,8 +1,4 @@
-"""The folder of compiled kernels. Its code is executed, so only the user may write to it.
-
-If it is not writable, its content is copied to a temporary folder, which this process and its child
-processes use and which is deleted at exit.
-"""
+"""The user's cache folder. Code in it is executed, so only the user may write to it."""
 
 from __future__ import annotations
 
@@ -22,93 +18,73 @@ VARIABLE = "MAPLAB_CACHE_DIR"
 PACKAGED = Path(__file__).resolve().parent / "_kernels"
 """Kernels that the wheel brings; trusted as the package is, and never written at run time."""
 
-_OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
-_logger = logging.getLogger(__name__)
-
-tell_user: Callable[[str], None] = _logger.warning
+tell_user: Callable[[str], None] = logging.getLogger(__name__).warning
 """Prints a line for the user; the console replaces it."""
 
 
 def cache_root() -> Path:
     """Return the folder that MAPLAB_CACHE_DIR names, else one in the user's cache directory."""
-    configured = os.environ.get(VARIABLE, "")
-    base = os.environ.get("XDG_CACHE_HOME", "") or str(Path.home() / ".cache")
-    return Path(configured) if configured else Path(base) / "maplab_py"
+    base = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
+    return Path(os.environ.get(VARIABLE, "") or base / "maplab_py")
 
 
 @cache
 def cache_folder(name: str) -> Path:
-    """Return a folder of the cache that can be written.
+    """Return a folder of the cache that can be written; it is made if needed.
 
-    Args:
-        name: Name of the folder in the cache.
+    If that is not possible, the folder's content is copied to a temporary one, which this process
+    and its child processes use and which is deleted at exit.
 
     Raises:
         UserError: Other users own the cache or may write to it.
     """
-    root = cache_root()
-    folder = root / name
+    root, folder = cache_root(), cache_root() / name
     for existing in (root, folder):
-        check_trusted(existing, VARIABLE)
+        check_trusted(existing)
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
         for each in (root, folder):
             each.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            pass
+            return folder
     except OSError as error:
-        return _temporary(folder, error)
-    return folder
+        tell_user(
+            f"{folder}: the cache of compiled kernels cannot be written ({error.strerror}); kernels "
+            f"compiled now are used in this run only (name another folder by {VARIABLE})"
+        )
+    temporary = Path(tempfile.mkdtemp(prefix="maplab-kernels-"))
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    os.environ[VARIABLE] = str(temporary)
+    try:
+        shutil.copytree(folder, temporary / name)
+    except (OSError, shutil.Error):  # what cannot be copied is compiled again
+        (temporary / name).mkdir(exist_ok=True)
+    return temporary / name
 
 
 def check_trusted(
-    folder: Path,
-    variable: str,
-    content: str = "compiled code",
-    danger: str = "code in it would be run",
+    path: Path, content: str = "compiled code", danger: str = "code in it would be run"
 ) -> None:
-    """Refuse to load code or other content from a place that other users own or may write to.
+    """Refuse to use a file or folder, if it exists, that other users own or may write to.
 
     Args:
-        folder: The folder, or a file; it need not exist.
-        variable: Environment variable that names another folder.
-        content: What is kept there, for the message.
-        danger: What would happen, for the message.
+        path: The file or folder.
+        content: Content of the cache, for the message.
+        danger: Consequence of using it, for the message.
 
     Raises:
-        UserError: Other users own the folder or may write to it.
+        UserError: Other users own it or may write to it.
     """
-    try:
-        status = folder.stat()
-    except OSError:
+    if not (hasattr(os, "geteuid") and path.exists()):
         return
-    if not hasattr(os, "geteuid"):
-        return
+    status = path.stat()
     if status.st_uid not in (os.geteuid(), 0):
         reason = "belongs to another user"
-    elif status.st_mode & _OTHERS_MAY_WRITE:
+    elif status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         reason = "can be written by other users"
     else:
         return
     raise UserError(
-        f"{folder}: the cache of {content} {reason}, and {danger}: "
-        f"remove their write permission (chmod go-w), or name another folder by {variable}"
+        f"{path}: the cache of {content} {reason}, and {danger}: "
+        f"remove their write permission (chmod go-w), or name another folder by {VARIABLE}"
     )
-
-
-def _temporary(folder: Path, error: OSError) -> Path:
-    """Return a copy of a folder that cannot be written; it is deleted at the end of the process."""
-    root = Path(tempfile.mkdtemp(prefix="maplab-kernels-"))
-    atexit.register(shutil.rmtree, root, ignore_errors=True)
-    copy = root / folder.name
-    try:
-        shutil.copytree(folder, copy)
-    except (OSError, shutil.Error):
-        shutil.rmtree(copy, ignore_errors=True)
-        copy.mkdir()
-    os.environ[VARIABLE] = str(root)  # processes that this one starts share it
-    tell_user(
-        f"{folder}: the cache of compiled kernels cannot be written ({error.strerror}); kernels "
-        f"compiled now are used in this run only (name another folder by {VARIABLE})"
-    )
-    return copy

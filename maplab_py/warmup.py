@@ -5,18 +5,14 @@ A job calls kernels that are needed together with small arguments of the types t
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
-import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
 from functools import partial
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 
 import numpy as np
 
@@ -28,10 +24,8 @@ from maplab_py.algorithms.relaxation.graph_files import map_of_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.array_types import F64
-from maplab_py.atomic import write_file
 from maplab_py.cancellation import cleaned_up
-from maplab_py.compilation import BUILT_WITH, CODE_FOLDER, built_with
-from maplab_py.estimation.codegen import modules
+from maplab_py.compilation import TARGET
 from maplab_py.estimation.warmup import optimizer_jobs
 from maplab_py.estimation.window.warmup import window_jobs
 from maplab_py.frontend.initialization import gyro_bias
@@ -94,7 +88,7 @@ def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     workers = min(len(names), os.cpu_count() or 1)
-    folder = cache_folder(CODE_FOLDER)  # a temporary one must be known before processes inherit it
+    folder = cache_folder(TARGET)  # a temporary one must be known before processes inherit it
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_ignore_ctrl_c)
     with cleaned_up(lambda: _end(pool, others)):
         pending = {pool.submit(_compile, name) for name in reversed(names)}
@@ -105,25 +99,6 @@ def compile_kernels(progress: Progress) -> tuple[list[str], float, str]:
                 future.result()
     progress.step(len(names), len(names), "compile kernels")
     return [name.lower() for name in names], time.perf_counter() - start, str(folder.parent)
-
-
-def compile_for_wheel(cache: Path) -> None:
-    """Compile all kernels into the folder of a wheel, and say in it what they were compiled with.
-
-    Args:
-        cache: The folder that MAPLAB_CACHE_DIR names, empty or with kernels for other processors.
-    """
-    compile_kernels(SILENT)
-    generated = modules.cache_folder()
-    shutil.copytree(
-        generated, cache / f"{modules.FOLDER}{modules.source_hash()}", dirs_exist_ok=True
-    )
-    shutil.rmtree(generated)
-    file, tells = cache / BUILT_WITH, built_with()
-    if file.exists():
-        before = json.loads(file.read_text(encoding="utf-8"))
-        tells["processor"] = f"{before['processor']}, {tells['processor']}"
-    write_file(file, [json.dumps(tells, indent=1).encode()], durable=False)
 
 
 def _compile(name: str) -> None:
@@ -211,4 +186,4 @@ def _render_room() -> None:
 
 
 if __name__ == "__main__":
-    compile_for_wheel(Path(sys.argv[1]))
+    compile_kernels(SILENT)

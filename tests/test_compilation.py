@@ -1,146 +1,118 @@
-"""Machine code of kernels is found by content: of all sources that matter, not by times and paths."""
+"""Machine code of kernels is found by content, in the wheel or in the user's cache."""
 
 from __future__ import annotations
 
-import json
+import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from maplab_py.compilation import BUILT_WITH, built_with, target_processor
+from maplab_py.compilation import TARGET, target_processor
+from tests.support.data import REPOSITORY
 
-INNER = """
+SOURCES = {
+    "values.py": """
 from typing import NamedTuple
-from maplab_py.compilation import compiled
-
+OFFSET = 1.0
 class Line(NamedTuple):
     slope: float
     start: float
-
+""",
+    "inner.py": """
+from maplab_py.compilation import compiled
 @compiled()
 def scaled(x):
-    return {factor} * x
-"""
-MIDDLE = """
+    return 2.0 * x
+""",
+    "middle.py": """
 from maplab_py.compilation import compiled
-from inner import scaled
-OFFSET = {offset}
-
+import inner
+from values import OFFSET
 @compiled()
-def shifted(x):
-    return scaled(x) + OFFSET
-"""
-OUTER = """
+def shifted(line):
+    return inner.scaled(line.slope) + line.start + OFFSET
+""",
+    "outer.py": """
 from maplab_py.compilation import compiled
 from middle import shifted
-
-@compiled({settings})
-def squared(x):
-    return shifted(x) ** 2
-"""
+@compiled()
+def squared(line):
+    return shifted(line) ** 2
+""",
+}
 PROGRAM = """
 import outer
-value = outer.squared(3.0)
-print(value, sum(outer.squared.stats.cache_hits.values()))
+from values import Line
+print(outer.squared(Line(3.0, 0.0)), sum(outer.squared.stats.cache_hits.values()))
 """
 
 
-def write(folder: Path, factor: str = "2.0", offset: str = "1.0", settings: str = "") -> None:
+def write(folder: Path, file: str = "", old: str = "", new: str = "") -> None:
     folder.mkdir(exist_ok=True)
-    (folder / "inner.py").write_text(INNER.format(factor=factor))
-    (folder / "middle.py").write_text(MIDDLE.format(offset=offset))
-    (folder / "outer.py").write_text(OUTER.format(settings=settings))
+    for name, text in SOURCES.items():
+        (folder / name).write_text(text.replace(old, new) if name == file else text)
 
 
-def run(folder: Path, cache: Path, program: str = PROGRAM, **extra: str) -> list[str]:
+def run(folder: Path, program: str = PROGRAM, **variables: str) -> list[str]:
     """Return what a new process prints, by default a kernel's value and whether it was on disk."""
     path = os.pathsep.join([str(folder), *filter(None, sys.path)])
-    environment = {**os.environ, "PYTHONPATH": path, "MAPLAB_CACHE_DIR": str(cache), **extra}
-    for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES"):  # imports of other tests set them
-        if name not in extra:
-            environment.pop(name, None)
+    environment = {**os.environ, "PYTHONPATH": path, "MAPLAB_CACHE_DIR": str(folder / "cache")}
+    for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES"):  # the import above sets them
+        environment.pop(name, None)
+    command = [sys.executable, "-c", program]
     done = subprocess.run(
-        [sys.executable, "-c", program],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, env=environment | variables, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
 
-def test_only_content_decides_whether_a_kernel_is_compiled_again(tmp_path: Path) -> None:
-    sources, cache = tmp_path / "sources", tmp_path / "cache"
-    write(sources)
-    assert run(sources, cache) == ["49.0", "0"]
-    os.utime(sources / "inner.py", (1e9, 1e9))
-    shutil.copytree(sources, tmp_path / "elsewhere")
-    assert run(tmp_path / "elsewhere", cache) == ["49.0", "1"]
-    for change, value in (
-        ({"factor": "10.0"}, "961.0"),
-        ({"offset": "2.0"}, "64.0"),
-        ({"settings": "fastmath=True"}, "49.0"),
-    ):
-        write(sources, **change)
-        assert run(sources, cache) == [value, "0"]
-        assert run(sources, cache) == [value, "1"]
-    write(sources)  # what was compiled for the first content is still there
-    assert run(sources, cache) == ["49.0", "1"]
-
-
-def test_constants_and_fields_from_other_modules_count(tmp_path: Path) -> None:
-    def write_pair(offset: str, fields: str) -> None:
-        (tmp_path / "values.py").write_text(
-            f"from typing import NamedTuple\nOFFSET = {offset}\n"
-            f"class Line(NamedTuple):\n    {fields}\n"
-        )
-
-    (tmp_path / "outer.py").write_text(
-        "from maplab_py.compilation import compiled\nfrom values import OFFSET, Line\n\n"
-        "@compiled()\ndef squared(line):\n    return (10.0 * line.slope + line.start + OFFSET)\n"
-    )
-    program = PROGRAM.replace("(3.0)", "(outer.Line(1.0, 2.0))")
-    for offset, fields, value in (
-        ("0.0", "slope: float; start: float", "12.0"),
-        ("5.0", "slope: float; start: float", "17.0"),
-        ("0.0", "start: float; slope: float", "21.0"),
-    ):
-        write_pair(offset, fields)
-        assert run(tmp_path, tmp_path / "cache", program) == [value, "0"]
-        assert run(tmp_path, tmp_path / "cache", program) == [value, "1"]
+@pytest.mark.parametrize(
+    ("file", "old", "new", "value"),
+    [
+        ("inner.py", "2.0", "10.0", "961.0"),
+        ("inner.py", "2.0 * x", "2.0 + x", "36.0"),
+        ("values.py", "1.0", "2.0", "64.0"),
+        ("values.py", "slope: float\n    start: float", "start: float\n    slope: float", "16.0"),
+        ("inner.py", "compiled()", "compiled(fastmath=True)", "49.0"),
+    ],
+)
+def test_only_content_decides_whether_a_kernel_is_compiled_again(
+    tmp_path: Path, file: str, old: str, new: str, value: str
+) -> None:
+    folder = tmp_path / "sources"
+    write(folder)
+    assert run(folder) == ["49.0", "0"]
+    write(folder, file, old, new)
+    assert run(folder) == [value, "0"]
+    write(folder, "outer.py", "@compiled", "\n# a comment in another line\n@compiled")
+    os.utime(folder / "inner.py", (1e9, 1e9))
+    assert run(folder.rename(tmp_path / "elsewhere")) == ["49.0", "1"]
 
 
 def test_a_closure_is_never_kept(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(
-        "from maplab_py.compilation import compiled\nimport sys\n"
+        "from maplab_py.compilation import compiled\n"
         "def make(factor):\n    @compiled()\n    def scaled(x):\n        return factor * x\n"
-        "    return scaled\nfirst, squared = make(2.0), make(5.0)\nfirst(3.0)\n"
+        "    return scaled\n"
     )
-    assert run(tmp_path, tmp_path / "cache") == ["15.0", "0"]
-    assert run(tmp_path, tmp_path / "cache") == ["15.0", "0"]
-
-
-TARGET = "import outer, numba; print(numba.config.CPU_NAME, numba.config.CPU_FEATURES or 'no')"
+    program = "import outer; print(outer.make(2.0)(3.0), outer.make(5.0)(3.0))"
+    assert run(tmp_path, program) == run(tmp_path, program) == ["6.0", "15.0"]
+    assert list((tmp_path / "cache").rglob("*.nbc")) == []
 
 
 def test_the_processor_is_fixed_unless_the_user_says_otherwise(tmp_path: Path) -> None:
     write(tmp_path)
-    cache = tmp_path / "cache"
-    name, features = run(tmp_path, cache, TARGET)
-    assert (name == "generic" or name.startswith("x86-64"), features) == (True, "no")
-    assert run(tmp_path, cache, TARGET, MAPLAB_NATIVE="1")[0] == "None"
-    assert run(tmp_path, cache, TARGET, NUMBA_CPU_NAME="nocona", NUMBA_CPU_FEATURES="") == [
-        "nocona",
-        "no",
-    ]
-    assert run(tmp_path, cache) == ["49.0", "0"]
-    assert run(tmp_path, cache, MAPLAB_NATIVE="1") == ["49.0", "0"]
-    assert run(tmp_path, cache, MAPLAB_NATIVE="1") == ["49.0", "1"]
+    program = PROGRAM + "import numba; print(numba.config.CPU_NAME, numba.config.CPU_FEATURES)"
+    assert run(tmp_path, program) == ["49.0", "0", TARGET.rpartition("-numpy-")[2].split("-", 1)[1]]
+    assert run(tmp_path, program, MAPLAB_NATIVE="1")[:3] == ["49.0", "0", "None"]
+    assert run(tmp_path, MAPLAB_NATIVE="1") == ["49.0", "1"]
+    assert run(tmp_path, program, NUMBA_CPU_NAME="nocona")[:3] == ["49.0", "0", "nocona"]
 
 
 OLD = {"cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"}
@@ -150,11 +122,9 @@ NEW = OLD | {"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "avx512f"}
 @pytest.mark.parametrize(
     ("machine", "features", "target"),
     [
-        ("x86_64", NEW, "x86-64-v3"),
         ("AMD64", NEW, "x86-64-v3"),
         ("x86_64", NEW - {"avx2"}, "x86-64-v2"),
         ("x86_64", NEW - {"ssse3"}, "x86-64"),
-        ("x86_64", set(), "x86-64"),
         ("aarch64", {"neon"}, "generic"),
     ],
 )
@@ -162,42 +132,64 @@ def test_a_processor_gets_what_it_can_run(machine: str, features: set[str], targ
     assert target_processor(machine, features) == target
 
 
-def test_no_writable_cache_means_compiling_again(tmp_path: Path) -> None:
+def test_the_wheels_kernels_come_first_and_one_line_says_why_not(tmp_path: Path) -> None:
     write(tmp_path)
-    (tmp_path / "file").write_text("")
-    assert run(tmp_path, tmp_path / "file" / "cache") == ["49.0", "0"]
-    assert run(tmp_path, tmp_path / "file" / "cache") == ["49.0", "0"]
-
-
-PACKAGED = """
+    packaged, cache = tmp_path / "_kernels", tmp_path / "cache"
+    program = f"""
 from pathlib import Path
 from maplab_py import compilation, kernel_cache
-compilation.PACKAGED = Path({folder!r})
+compilation.PACKAGED = Path({str(packaged)!r})
 kernel_cache.tell_user = print
-import maplab_py_outer
-value = maplab_py_outer.squared(3.0)
-print(value, sum(maplab_py_outer.squared.stats.cache_hits.values()))
-"""
-
-
-def test_kernels_of_the_package_come_first_and_one_line_says_why_they_do_not_fit(
-    tmp_path: Path,
-) -> None:
-    write(tmp_path)
-    (tmp_path / "outer.py").rename(tmp_path / "maplab_py_outer.py")
-    packaged, cache = tmp_path / "_kernels", tmp_path / "cache"
-    program = PACKAGED.format(folder=str(packaged))
-    assert run(tmp_path, packaged, program) == ["49.0", "0"]  # as the build of a wheel compiles
-    described = tmp_path / "_kernels" / BUILT_WITH
-    described.write_text(json.dumps({**built_with(), "processor": "x86-64-v2, x86-64-v3, generic"}))
-    assert run(tmp_path, cache, program) == ["49.0", "1"]
-    assert list((cache / "code").iterdir()) == []
-    shutil.rmtree(packaged / "code")
-    assert run(tmp_path, cache, program)[-2:] == ["49.0", "0"]  # silent, as no reason is known
-    described.write_text(json.dumps({**built_with(), "numba": "0.1", "processor": "x86-64-v9"}))
-    shutil.rmtree(cache)
-    words = " ".join(run(tmp_path, cache, program))
-    assert words.count("the installed kernels were compiled with") == 1
-    assert "numba 0.1, not" in words
-    assert "processor x86-64-v9, not" in words
+{PROGRAM}"""
+    assert run(tmp_path, program) == ["49.0", "0"]
+    cache.rename(packaged)
+    assert run(tmp_path, program) == ["49.0", "1"]
+    assert not cache.exists()
+    (packaged / TARGET).rename(packaged / "code-of-another-numba")
+    words = " ".join(run(tmp_path, program))
     assert words.endswith("49.0 0")
+    assert words.count(f"the installed kernels are code-of-another-numba, not {TARGET}:") == 1
+
+
+@pytest.fixture
+def hook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Return the hook of the build; instead of compiling it writes a file for each processor."""
+    pytest.importorskip("hatchling", reason="needs the build system")
+    spec = importlib.util.spec_from_file_location("hook", REPOSITORY / ".ci" / "kernels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def compile_nothing(command: list[str], env: dict[str, str], check: bool) -> None:
+        assert (command[1:], check) == (["-m", "maplab_py.warmup"], True)
+        Path(env["MAPLAB_CACHE_DIR"], f"{env['NUMBA_CPU_NAME']}.nbc").write_text("")
+        Path(env["MAPLAB_CACHE_DIR"], "left.lock").write_text("")
+
+    monkeypatch.setattr(subprocess, "run", compile_nothing)
+    requirements = ["numba>=0.60", "numpy>=1.26", "casadi>=3.6.5", "rich>=13.7", "numbalike"]
+    metadata: Any = SimpleNamespace(core=SimpleNamespace(dependencies=requirements))
+    return module.KernelHook(str(tmp_path), {}, None, metadata, str(tmp_path), "wheel")
+
+
+@pytest.mark.parametrize(
+    ("version", "processors", "needed"),
+    [("standard", "x86-64-v3,x86-64-v2", 3), ("standard", "none", 0), ("editable", "", 3)],
+)
+def test_a_wheel_brings_the_kernels_for_the_named_processors(
+    hook: Any, monkeypatch: pytest.MonkeyPatch, version: str, processors: str, needed: int
+) -> None:
+    monkeypatch.setenv("MAPLAB_WHEEL_KERNELS", processors)
+    monkeypatch.setenv("MAPLAB_WHEEL_PLATFORM", "manylinux_2_28-x86.64")
+    data: dict[str, Any] = {"force_include": {}}
+    assert hook.dependencies() == ["numba>=0.60", "numpy>=1.26", "casadi>=3.6.5"][:needed]
+    hook.initialize(version, data)
+    if "-" in processors:
+        inside = {f"maplab_py/_kernels/{name}.nbc" for name in processors.split(",")}
+        assert set(data["force_include"].values()) == inside
+        python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
+        assert data["tag"] == f"{python}-none-manylinux_2_28_x86_64"
+    else:
+        assert data == {"force_include": {}}
+    hook.finalize(version, data, "")
+    assert not any(map(os.path.exists, data["force_include"]))

@@ -129,7 +129,7 @@ class MapCache:
         Raises:
             UserError: They do.
         """
-        check_trusted(path, "MAPLAB_CACHE_DIR", "columns of maps", "they would be used unchecked")
+        check_trusted(path, "columns of maps", "they would be used unchecked")
 
     def _entries(self) -> list[tuple[Path, os.stat_result]]:
         """Return all entries, those used longest ago first."""

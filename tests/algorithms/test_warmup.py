@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.testing import assert_array_equal
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
-from maplab_py.compilation import compiled, is_missing_on_disk
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.kernels.connected_parts import connected_parts
 from maplab_py.estimation.linear import selected_inverse, supernodal
@@ -48,16 +46,3 @@ def test_edges_that_cannot_be_written_to_compile_nothing_again():
     measured.flags.writeable = False
     assert_array_equal(RelativePoses(rows, rows, measured, weight).errors(poses), errors)
     assert list(kernel.signatures) == before
-
-
-def test_the_disk_knows_what_was_compiled():
-    jobs()["relaxation"]()
-    assert not is_missing_on_disk(connected_parts)
-
-    @compiled()
-    def never_called(x):  # type: ignore[no-untyped-def]
-        return x
-
-    assert is_missing_on_disk(never_called)
-    assert not is_missing_on_disk(numba.njit(lambda x: x))  # is not to be kept
-    assert not is_missing_on_disk(never_called.py_func)  # NUMBA_DISABLE_JIT

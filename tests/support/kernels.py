@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import time
 
-from maplab_py.compilation import is_missing_on_disk
+from maplab_py.compilation import TARGET
 from maplab_py.estimation.codegen.modules import is_generated
+from maplab_py.kernel_cache import PACKAGED, cache_folder
 from maplab_py.progress import SILENT
-from maplab_py.vision.pose_kernels import search_poses
-from maplab_py.vision.search_kernels import search_cells
 from maplab_py.warmup import compile_kernels
 
 
 def compiled_ahead() -> str:
     """Compile the kernels if some are missing on the disk; say how long it took, else nothing."""
-    written_by_hand = (search_poses, search_cells)
-    has_searches = not any(is_missing_on_disk(kernel) for kernel in written_by_hand)
-    if is_generated("visual") and has_searches:
+    has_searches = any(cache_folder(TARGET).glob("search_kernels.search_cells-*"))
+    if (PACKAGED / TARGET).is_dir() or (is_generated("visual") and has_searches):
         return ""
     began = time.perf_counter()
     compile_kernels(SILENT)

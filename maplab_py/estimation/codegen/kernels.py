@@ -13,10 +13,10 @@ from maplab_py.sensors.camera import DISTORTION_SIZE, MIRROR_NAMES, Distortion, 
 
 _HEADER = (
     '"""Generated; do not edit."""\n\n'
-    "import math\n\nimport numpy as np\nfrom maplab_py.compilation import njit, prange\n\n"
+    "import math\n\nimport numpy as np\nfrom maplab_py.compilation import compiled, prange\n\n"
     "from maplab_py.estimation.kernels.loss import rho_and_weight\n\n"
 )
-_FAST = '@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)\n'
+_FAST = '@compiled(fastmath={"contract", "nsz"}, forceinline=True)\n'
 
 
 def visual_kernels(progress: Progress = SILENT) -> ModuleType:

@@ -21,8 +21,6 @@ from maplab_py import kernel_cache
 from maplab_py.atomic import write_file
 from maplab_py.progress import SILENT, Progress
 
-FOLDER = "kernels-"
-"""What the names of folders of generated modules begin with."""
 _PREFIX = "maplab_py_generated_"
 _PACKAGE = Path(__file__).resolve().parents[1]
 _TEMPLATES = _PACKAGE / "kernels" / "templates"
@@ -45,7 +43,7 @@ def cache_folder() -> Path:
     Raises:
         UserError: Somebody else owns the folder or may write to it.
     """
-    return kernel_cache.cache_folder(f"{FOLDER}{source_hash()}-casadi-{version('casadi')}")
+    return kernel_cache.cache_folder(f"kernels-{source_hash()}-casadi-{version('casadi')}")
 
 
 def generated_module(
@@ -80,8 +78,9 @@ def is_generated(name: str) -> bool:
 
 
 def _path(name: str) -> Path:
-    packaged = kernel_cache.PACKAGED / f"{FOLDER}{source_hash()}" / f"{_PREFIX}{name}.py"
-    return packaged if packaged.exists() else cache_folder() / packaged.name
+    file = f"{_PREFIX}{name}.py"
+    packaged = kernel_cache.PACKAGED.glob(f"kernels-{source_hash()}-*/{file}")
+    return next(packaged, None) or cache_folder() / file
 
 
 def template_source(name: str) -> str:

@@ -8,7 +8,7 @@
 # --- kernels ---
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@compiled(parallel=True)
 def evaluate(arguments, sqrt_information, whitened, jacobian):
     """Evaluate N factors.
 

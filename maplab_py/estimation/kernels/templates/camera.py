@@ -13,7 +13,7 @@ its model, 8 * projection + distortion; the model's parameters follow.
 # ruff: noqa: F821
 # mypy: ignore-errors
 # --- kernels ---
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def rotation(poses, k):
     """Return the entries of the rotation of pose k by rows."""
     x, y, z, w = poses[k, 0], poses[k, 1], poses[k, 2], poses[k, 3]
@@ -27,7 +27,7 @@ def rotation(poses, k):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def camera_axes(extrinsics):
     """Return the axes (C, 12) of poses T_I_C (C, 7)."""
     axes = np.empty((len(extrinsics), 12))
@@ -40,7 +40,7 @@ def camera_axes(extrinsics):
     return axes
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def from_axes(axes, c, x, y, z):
     """Return R_I_C^T (x, y, z)."""
     return (
@@ -50,7 +50,7 @@ def from_axes(axes, c, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def to_axes(axes, c, x, y, z):
     """Return R_I_C (x, y, z)."""
     return (
@@ -60,7 +60,7 @@ def to_axes(axes, c, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def project(parameters, c, x, y, z):
     """Return the pixel u, v of a point in camera c, and the rows d u / d p_C and d v / d p_C."""
     model = np.int64(parameters[c, 0])
@@ -77,7 +77,7 @@ def project(parameters, c, x, y, z):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def project_by_parameters(parameters, c, x, y, z, out, first):
     """Write d (u, v) / d parameters to `out` from `first` on, two entries a column; zero the rest."""
     model = np.int64(parameters[c, 0])
@@ -100,13 +100,13 @@ def project_by_parameters(parameters, c, x, y, z, out, first):
         out[i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def cross(a0, a1, a2, b0, b1, b2):
     """Return a x b."""
     return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def write_row(out, first, a, b, c):
     """Write one row of three columns of two entries to `out` from `first` on."""
     out[first], out[first + 2], out[first + 4] = a, b, c

@@ -11,7 +11,7 @@ they run on one. T is poses (V, 7); edges, weights and system are described in `
 # --- kernels ---
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def linearize(T, edges, whitened, J):
     """Fill in W e (E, 6) and its derivatives (E, 2, 6, 6) by twists of A and of B."""
     e, D = np.empty(6), np.empty((2, 36))
@@ -20,7 +20,7 @@ def linearize(T, edges, whitened, J):
         whiten(edges.sqrt_information[k], e, D, whitened[k], J[k])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@compiled(forceinline=True)
 def whiten(W, e, D, whitened, J):
     """Multiply the residual and both derivatives, D (2, 36) by columns, by W."""
     for i in range(6):
@@ -38,7 +38,7 @@ def whiten(W, e, D, whitened, J):
         whitened[i] = total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def cost(T, edges, weights):
     """Return the sum of rho(|W e|^2) over the active edges."""
     e, total = np.empty(6), 0.0
@@ -58,7 +58,7 @@ def cost(T, edges, weights):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def normal_equations(T, edges, weights, system):
     """Add the normal equations of half the cost to a system; return the cost."""
     e, D = np.empty(6), np.empty((2, 36))
@@ -87,7 +87,7 @@ def normal_equations(T, edges, weights, system):
     return total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@compiled(forceinline=True)
 def add_pose(J, whitened, rows, weight, system, node):
     """Add weight J' J to the lower triangle of a pose's block and weight J' W e to its gradient."""
     block, gradient, diagonal = (
@@ -105,7 +105,7 @@ def add_pose(J, whitened, rows, weight, system, node):
                 block[i, j] += weight * x * J[k, j]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@compiled(forceinline=True)
 def product(A, B, weight, out):
     """Fill in weight A' B."""
     for i in range(6):
@@ -118,7 +118,7 @@ def product(A, B, weight, out):
                 out[i, j] += a * B[k, j]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def add_tilt(T, priors, system, is_wanted):
     """Return the sum of squares of tilts / sigma; add their normal equations if they are wanted."""
     e, D, J = np.empty(2), np.empty(12), np.empty((2, 6))
@@ -135,7 +135,7 @@ def add_tilt(T, priors, system, is_wanted):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def moved(T, vertices, twists):
     """Return poses (V, 7) of which some, vertices (N,), are moved by twists (N, 6)."""
     result = T.copy()
@@ -144,7 +144,7 @@ def moved(T, vertices, twists):
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def add_second_derivatives(T, edges, weights, system):
     """Add what second derivatives of the active edges, which have no loss, contribute."""
     e, g = np.empty(6), np.empty(6)

@@ -51,7 +51,7 @@ This file is a template: it is compiled as one module with `camera` and the came
 # ruff: noqa: F821
 # mypy: ignore-errors
 # --- kernels ---
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def reproject(poses, k, cameras, c, points, landmark, uv, o, out, columns):
     """Write residual, depth and Jacobian of one observation to `out`; the camera's if it has columns."""
     axes, parameters = cameras
@@ -86,7 +86,7 @@ def reproject(poses, k, cameras, c, points, landmark, uv, o, out, columns):
         project_by_parameters(parameters, c, c0, c1, c2, out, INTRINSICS)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def reproject_only(poses, k, cameras, c, points, landmark, uv, o, out):
     """Write residual and depth of one observation to `out`."""
     axes, parameters = cameras
@@ -104,7 +104,7 @@ def reproject_only(poses, k, cameras, c, points, landmark, uv, o, out):
     out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_pose(out, n, k, Y, square, grad, diag):
     """Write W = Q'P of one observation to Y[n]; add P'P to square[k], its diagonal and P'r."""
     for c in range(6):
@@ -117,7 +117,7 @@ def add_pose(out, n, k, Y, square, grad, diag):
             square[k, c, e] += a * out[POSE + 2 * e] + b * out[POSE + 2 * e + 1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def step_landmark(h, f, g, d):
     """Solve H d = -g with the factor f of the damped H; return the decrease that d promises."""
     z0 = g[0] * f[0]
@@ -131,7 +131,7 @@ def step_landmark(h, f, g, d):
     return decrease - 2.0 * (h[1] * d[0] * d[1] + h[3] * d[0] * d[2] + h[4] * d[1] * d[2])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def subtract_product(S, k, Y, b, a):
     """Compute S[k] -= Y[b]' Y[a].
 
@@ -155,7 +155,7 @@ def subtract_product(S, k, Y, b, a):
         S[k, c, 3], S[k, c, 4], S[k, c, 5] = s3, s4, s5
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def eliminate_landmark(first, last, base, pose_of, grad, Y, f, g):
     """Turn W of a landmark's observations into Y = L^-1 W and subtract Y_o' z from grad."""
     z0 = g[0] * f[0]
@@ -171,7 +171,7 @@ def eliminate_landmark(first, last, base, pose_of, grad, Y, f, g):
             grad[k, c] -= y0 * z0 + y1 * z1 + y2 * z2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_part(S, k, i, j, target, numbers, row, col, place):
     """Add the part S[k, 3 i.., 3 j..] (3 x 3) at node row and column of the system."""
     if target.position[row] >= target.position[col]:
@@ -186,7 +186,7 @@ def add_part(S, k, i, j, target, numbers, row, col, place):
                 numbers[at + r * leading + c] += S[k, 3 * i + r, 3 * j + c]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_pose_block(S, k, plan, block, row, target, numbers):
     """Add S[k] (6 x 6), a block of the pose `row`, to the system; a diagonal block's lower triangle."""
     col, each = plan.cols[block], target.nodes_per_vertex
@@ -197,7 +197,7 @@ def add_pose_block(S, k, plan, block, row, target, numbers):
                 add_part(S, k, i, j, target, numbers, each * row + i, each * col + j, place)
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "nsz"})
 def subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers):
     """Subtract Y_b' Y_a of all pairs of a slab, block row by block row.
 
@@ -230,7 +230,7 @@ def subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers)
                 add_pose_block(S, block - begin, plan, block, row, target, numbers)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
     """Add the sums of all chunks into chunk 0, always in the same order, and P'P to the system."""
     chunks = square.shape[0]
@@ -246,7 +246,7 @@ def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
         cost[0] += cost[chunk]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_delay(out, uv_motion, timing, o, c):
     """Shift the residual by the delay of the pixel's row."""
     delay = timing[c, 0]
@@ -256,7 +256,7 @@ def add_delay(out, uv_motion, timing, o, c):
     out[1] += uv_motion[o, 1] * delay
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_delay_columns(out, uv_motion, timing, o):
     """Write the columns of the image delay and of the line delay, zero where it is not estimated."""
     row = uv_motion[o, 2] if timing.shape[1] > 1 else 0.0
@@ -266,7 +266,7 @@ def add_delay_columns(out, uv_motion, timing, o):
         out[DELAY + 4 + i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_camera(out, columns, c, k, s, V, border, square, camera_gradient, camera_diagonal):
     """Add one observation's share to V[s] of its camera c, border, square, gradient, diagonal."""
     for w in range(columns):
@@ -283,7 +283,7 @@ def add_camera(out, columns, c, k, s, V, border, square, camera_gradient, camera
             square[c, c, w, x] += a * out[CAMERA + 2 * x] + b * out[CAMERA + 2 * x + 1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def eliminate_cameras(cameras, count, columns, V, f, g, square, camera_gradient):
     """Turn V of the landmark's cameras into Z = L^-1 V and subtract Z'Z and Z'z."""
     z0 = g[0] * f[0]
@@ -306,7 +306,7 @@ def eliminate_cameras(cameras, count, columns, V, f, g, square, camera_gradient)
                     square[c, d, w, x] -= y0 * V[t, 0, x] + y1 * V[t, 1, x] + y2 * V[t, 2, x]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def subtract_border(first, last, base, pose_of, cameras, count, columns, Y, V, border):
     """Subtract Z'Y of a landmark's observations after `eliminate_cameras` has turned V into Z."""
     for s in range(count):
@@ -319,7 +319,7 @@ def subtract_border(first, last, base, pose_of, cameras, count, columns, Y, V, b
                     border[c, k, w, e] -= y0 * Y[n, 0, e] + y1 * Y[n, 1, e] + y2 * Y[n, 2, e]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def slot_of(camera, cameras, count):
     """Return the place of a camera among those of the landmark, or `count` for a new one."""
     for s in range(count):
@@ -328,7 +328,7 @@ def slot_of(camera, cameras, count):
     return count
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "nsz"})
 def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
     """Form the reduced normal equations of poses and, where cameras have columns, cameras.
 
@@ -399,7 +399,7 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
     add_chunks(plan, square, gradient, diagonal, cost, target, numbers)
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "nsz"})
 def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, sums):
     """Step the landmarks for given steps of poses (P, 6) and cameras (C, W).
 
@@ -464,7 +464,7 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
         sums[0, 1] += sums[chunk, 1]
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@compiled(parallel=True)
 def evaluate(data, at, error_depth):
     """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
     start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px
@@ -479,7 +479,7 @@ def evaluate(data, at, error_depth):
             error_depth[o, 1] = out[2]
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@compiled(parallel=True)
 def pixel_motion(data, at, tangent, motion):
     """Write the velocity (O, 2) [px/s] of every projection for velocities (P, 6) of the poses."""
     start, pose_of, camera_of, uv = data.start, data.vertex, data.camera, data.uv_px

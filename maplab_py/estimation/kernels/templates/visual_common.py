@@ -12,7 +12,7 @@ SMALLEST_DAMPED = 1e-6
 LARGEST_DAMPED = 1e32
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def weighted(out, inverse_sigma, loss_kind, scale2):
     """Whiten residual and Jacobian in `out`, apply the robust weight; return rho and the factor."""
     s = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma * inverse_sigma
@@ -25,13 +25,13 @@ def weighted(out, inverse_sigma, loss_kind, scale2):
     return rho, factor
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def damped(h, damping):
     """Return a diagonal entry of H after Levenberg-Marquardt damping, clamped as Ceres does."""
     return h + damping * min(max(h, SMALLEST_DAMPED), LARGEST_DAMPED)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def factor_3x3(h, damping, f):
     """Cholesky of the damped 3 x 3 matrix h = [00 10 11 20 21 22] into f (inverse diagonal)."""
     a0, a1, a2 = damped(h[0], damping), damped(h[2], damping), damped(h[5], damping)
@@ -43,7 +43,7 @@ def factor_3x3(h, damping, f):
     f[5] = 1.0 / math.sqrt(max(a2 - f[3] * f[3] - f[4] * f[4], 1e-14 * a2))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_landmark_sums(out, h, g):
     """Add Q'Q of one observation to h (6 entries, lower) and Q'r to g."""
     a0, b0 = out[LANDMARK], out[LANDMARK + 1]
@@ -60,7 +60,7 @@ def add_landmark_sums(out, h, g):
     g[2] += a2 * out[0] + b2 * out[1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def begin_landmark(points, prior, landmark, h, g):
     """Set h and g to the landmark's prior [place, weight], zero without one; return its rho."""
     h[:] = 0.0

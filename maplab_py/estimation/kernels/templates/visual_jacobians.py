@@ -11,7 +11,7 @@ that of the exact numbers, so that the optimum is the same (see `kernels.schur_p
 # ruff: noqa: F821
 # mypy: ignore-errors
 # --- kernels ---
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_gradients(out, chunk, k, gradient, g):
     """Add P'r of one observation to the gradient of pose k, and Q'r to g."""
     for c in range(6):
@@ -21,7 +21,7 @@ def add_gradients(out, chunk, k, gradient, g):
         g[c] += out[LANDMARK + 2 * c] * out[0] + out[LANDMARK + 2 * c + 1] * out[1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def keep_rounded(out, o, jacobian):
     """Keep [Q R] of one observation as rows u and v of six, and leave the rounded numbers in out."""
     for c in range(3):
@@ -37,7 +37,7 @@ def keep_rounded(out, o, jacobian):
         out[POSE + 6 + 2 * c + 1] = np.float64(jacobian[o, 9 + c])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_squares(out, chunk, k, square, h):
     """Add P'P of one observation to the square of pose k, and Q'Q to h (6 entries, lower)."""
     for c in range(6):
@@ -52,7 +52,7 @@ def add_squares(out, chunk, k, square, h):
             entry += 1
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "nsz"})
 def keep_jacobians(data, at, prior, loss_kind, chunk_start, kept, sums, cost):
     """Evaluate all observations; the results are `kept` and, by chunk of landmarks, `sums` and cost.
 

@@ -33,7 +33,7 @@ SMALLEST_INVERSE_DEPTH = 1e-6
 MOST_NEWTON_STEPS, CONVERGED = 50, 1e-10
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def anchored_ray(poses, a, k, axes, d, h, n):
     """Return the landmark's ray in the body A of its anchor, in M, and from I in M, times 1 / z."""
     w = h[n, 2]
@@ -48,7 +48,7 @@ def anchored_ray(poses, a, k, axes, d, h, n):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def reproject(poses, rows, cameras, h, n, uv, o, out):
     """Write residual, depth times 1 / z, and Jacobians by frame k, anchor a and h to `out`."""
     (a, d, k, c), (axes, parameters) = (
@@ -88,7 +88,7 @@ def reproject(poses, rows, cameras, h, n, uv, o, out):
         write_row(out, LANDMARK + i, t0, t1, by_w)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def reproject_only(poses, rows, cameras, h, n, uv, o, out):
     """Write residual, and depth times 1 / z, to `out`."""
     (a, d, k, c), (axes, parameters) = (
@@ -105,7 +105,7 @@ def reproject_only(poses, rows, cameras, h, n, uv, o, out):
     out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_frame(out, first, row, landmark, slot, Y, matrix, gradient, diagonal):
     """Add one observation's W, P'P and P'r of the frame whose Jacobian begins at out[first]."""
     r, s = out[0], out[1]
@@ -122,7 +122,7 @@ def add_frame(out, first, row, landmark, slot, Y, matrix, gradient, diagonal):
             matrix[row + c, row + e] += x * out[first + 2 * e] + y * out[first + 2 * e + 1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def add_pair(out, row, column, matrix):
     """Add P'A of one observation to the block of its frame, which is later than the anchor."""
     a0, a1, a2, a3 = out[ANCHOR], out[ANCHOR + 2], out[ANCHOR + 4], out[ANCHOR + 6]
@@ -138,7 +138,7 @@ def add_pair(out, row, column, matrix):
         matrix[k, column + 5] += x * a5 + y * b5
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def subtract_slots(landmark, count, slots, Y, f, g, matrix, reduced_gradient):
     """Turn W of a landmark's frames into Y = L^-1 W; subtract Y'Y and Y'z.
 
@@ -176,7 +176,7 @@ def subtract_slots(landmark, count, slots, Y, f, g, matrix, reduced_gradient):
                 matrix[j, k + 3], matrix[j, k + 4], matrix[j, k + 5] = m3, m4, m5
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def eliminate(data, at, rule, system, kept):
     """Add all landmarks to the system, themselves eliminated; return the sum of rho.
 
@@ -233,7 +233,7 @@ def eliminate(data, at, rule, system, kept):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def substitute(data, at, rule, kept, step, new):
     """Step the landmarks for the steps (n,) of all frames.
 
@@ -282,7 +282,7 @@ def substitute(data, at, rule, kept, step, new):
     return total, promised, norm2
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def evaluate(data, at, error_depth):
     """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
     start, frame, camera, uv, _, _, anchor_frame, anchor_camera, _ = data
@@ -298,7 +298,7 @@ def evaluate(data, at, error_depth):
             error_depth[o, 1] = out[2] / points[n, 2]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def unproject(camera, uv, parameters, xy):
     """Find the places xy (N, 2) on the plane z = 1 of pixels (N, 2) by Newton's method.
 
@@ -320,7 +320,7 @@ def unproject(camera, uv, parameters, xy):
                 break
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def reproject_map(seen, cameras, T_M_I, T_G_M, p_G, residual, jacobian, visible):
     """Project landmarks of a map; the frames' mission M has the pose T_G_M (1, 7) in the map's frame G.
 
