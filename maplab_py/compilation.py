@@ -163,10 +163,10 @@ def _fields(types: Any) -> str:
 def _content(kernel: Any) -> list[str]:
     """Return all that decides what numba makes of a function, but the types of its arguments."""
     kernels = [kernel]  # and those that they call: it grows in the loop
-    return [part for each in kernels for part in _content_of_one(each, kernels)]
+    return [part for each in kernels for part in _content_of_function(each, kernels)]
 
 
-def _content_of_one(kernel: Any, kernels: list[Any]) -> Iterator[str]:
+def _content_of_function(kernel: Any, kernels: list[Any]) -> Iterator[str]:
     function = kernel.py_func
     yield f"{function.__module__} {function.__qualname__} {_describe(function.__defaults__)}"
     yield repr(sorted((key, _describe(value)) for key, value in kernel.targetoptions.items()))
