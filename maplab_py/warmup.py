@@ -16,10 +16,8 @@ from multiprocessing.process import BaseProcess
 
 import numpy as np
 
-from maplab_py.algorithms.dense.distance import triangle_kernels
-from maplab_py.algorithms.dense.fusion import block_kernels, integration_kernels, surface_kernels
-from maplab_py.algorithms.dense.stereo import agreement_kernels
-from maplab_py.algorithms.localization import guided_kernels
+from maplab_py.algorithms.dense import grid_kernels, reconstruction, triangle_tree
+from maplab_py.algorithms.localization import guided
 from maplab_py.algorithms.relaxation.graph_files import map_of_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
@@ -71,7 +69,7 @@ def jobs() -> dict[str, Callable[[], None]]:
         "relaxation": _relax_circle,
         "message scan": _scan_message,
         "dense maps": _compile_dense,
-        "guided matching": guided_kernels.compile_kernels,
+        "guided matching": guided.compile_kernels,
         "COLMAP points": colmap_binary.compile_kernels,
         "image rendering": _render_room,
         "start of the odometry": gyro_bias.compile_kernels,
@@ -132,8 +130,7 @@ def _compile_search() -> None:
 
 def _compile_dense() -> None:
     """Compile the kernels of stereo, fusion and distances."""
-    agreement_kernels.compile_kernels()
-    for module in (block_kernels, integration_kernels, surface_kernels, triangle_kernels):
+    for module in (reconstruction, grid_kernels, triangle_tree):
         module.compile_kernels()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from maplab_py.algorithms.self_calibration.segments.selection import evaluate
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
-from maplab_py.algorithms.self_calibration.uncertainty.information import posterior_covariance
+from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance
 from maplab_py.array_types import F64
 from maplab_py.geometry import so3
 from maplab_py.simulation.scenario import Scenario

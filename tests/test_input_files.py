@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.loop_closure.closure_record import FIELD_NUMBER, read_record
-from maplab_py.algorithms.self_calibration.segments.file import load_database
+from maplab_py.algorithms.self_calibration.segments.database import load_database
 from maplab_py.console.commands.flagfile import read_flagfile
 from maplab_py.console.scripts.aliases import read_aliases
 from maplab_py.console.scripts.batch import read_batch, read_script

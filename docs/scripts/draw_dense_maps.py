@@ -11,9 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from maplab_py.algorithms.dense.distance.fields import load_fields
-from maplab_py.algorithms.dense.fusion.mesh_colours import vertex_colours
-from maplab_py.algorithms.dense.fusion.meshing import map_mesh
+from maplab_py.algorithms.dense.field import load_fields
+from maplab_py.algorithms.dense.meshing import map_mesh, vertex_colours
 from maplab_py.array_types import F64, I32, U8
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3

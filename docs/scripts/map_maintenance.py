@@ -33,8 +33,8 @@ from maplab_py.algorithms.localization.database import database_of_summary
 from maplab_py.algorithms.localization.localization import Reference, describe, localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.loop_closure.features import map_features
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.selection import CoverageProblem
 from maplab_py.algorithms.sparsification.sparsify import choose, coverage_problem
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map, rounded

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.reports import TrackReport
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError

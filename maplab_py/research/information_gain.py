@@ -17,7 +17,7 @@ from maplab_py.algorithms.self_calibration.segments.splitting import (
     extract_submap,
     split_into_segments,
 )
-from maplab_py.algorithms.self_calibration.uncertainty.information import posterior_covariance
+from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import I64
 from maplab_py.errors import UserError

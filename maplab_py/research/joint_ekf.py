@@ -24,8 +24,7 @@ from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
 from maplab_py.algorithms.self_calibration.estimation.parameters import parameters_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
-from maplab_py.algorithms.self_calibration.uncertainty.information import name_directions, spectrum
-from maplab_py.algorithms.self_calibration.uncertainty.model import Uncertainty
+from maplab_py.algorithms.self_calibration.uncertainty import Uncertainty, name_directions, spectrum
 from maplab_py.algorithms.vi_optimization.calibration_states import (
     rig_cameras,
     with_cameras,

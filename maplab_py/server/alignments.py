@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.anchoring.options import AnchoringReport
 from maplab_py.algorithms.anchoring.pairs import USED
-from maplab_py.algorithms.anchoring.reports import AnchoringReport
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
 from maplab_py.errors import Cancelled, MaplabError
 from maplab_py.progress import Progress

@@ -19,9 +19,8 @@ import numpy as np
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.loop_closure.features import PlaceIndex, ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.place_index import PlaceIndex
-from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions

@@ -72,7 +72,7 @@ def prepare(order: SubmapOrder) -> str:
     """
     from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
     from maplab_py.algorithms.landmarks.quality import evaluate_quality
-    from maplab_py.algorithms.pose_graph_manipulation.stationary import tie_stationary
+    from maplab_py.algorithms.pose_graph_manipulation.edges import tie_stationary
     from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
     from maplab_py.algorithms.vi_optimization.optimization import optimize
     from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions

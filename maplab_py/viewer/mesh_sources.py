@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.dense.distance.fields import known_voxels, load_fields
-from maplab_py.algorithms.dense.distance.triangle_tree import TriangleTree
-from maplab_py.algorithms.dense.fusion.mesh_colours import vertex_colours
-from maplab_py.algorithms.dense.fusion.meshing import map_mesh
+from maplab_py.algorithms.dense.field import known_voxels, load_fields
+from maplab_py.algorithms.dense.meshing import map_mesh, vertex_colours
+from maplab_py.algorithms.dense.triangle_tree import TriangleTree
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions
-from maplab_py.algorithms.anchoring.options import AnchoringOptions
-from maplab_py.algorithms.anchoring.reports import AnchoringReport
+from maplab_py.algorithms.anchoring.options import AnchoringOptions, AnchoringReport
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
@@ -70,8 +69,7 @@ def anchor_mission(
         to: Known mission; the alignment with it that is nearest to --T_G_M is used.
         T_G_M: Pose of the mission's frame in the global frame: x y z [m] and yaw [deg], "1 2 0 90".
     """
-    from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-    from maplab_py.algorithms.anchoring.manual import choice_near, place_mission
+    from maplab_py.algorithms.anchoring.anchoring import anchor_missions, choice_near, place_mission
 
     row = context.mission_row(map_mission)
     choice = None

@@ -5,9 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.dense.distance.options import DistanceOptions
-from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT, FusionOptions
-from maplab_py.algorithms.dense.stereo.options import BmOptions, SgbmOptions, StereoOptions
+from maplab_py.algorithms.dense.options import (
+    MESH_MIN_WEIGHT,
+    BmOptions,
+    DistanceOptions,
+    FusionOptions,
+    SgbmOptions,
+    StereoOptions,
+)
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,
@@ -19,10 +24,10 @@ from maplab_py.plugin import (
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.dense.clouds import ConvertedDepthMaps
-    from maplab_py.algorithms.dense.distance.fields import FieldsReport
-    from maplab_py.algorithms.dense.fusion.fusion import FusionReport
-    from maplab_py.algorithms.dense.fusion.meshing import MeshReport
-    from maplab_py.algorithms.dense.stereo.reconstruction import StereoReport
+    from maplab_py.algorithms.dense.field import FieldsReport
+    from maplab_py.algorithms.dense.fusion import FusionReport
+    from maplab_py.algorithms.dense.meshing import MeshReport
+    from maplab_py.algorithms.dense.reconstruction import StereoReport
 
 _STEREO, _SGBM, _BM = StereoOptions(), SgbmOptions(), BmOptions()
 _FUSION = FusionOptions()
@@ -56,7 +61,7 @@ def stereo_dense_reconstruction(
         dense_depth_resource_output_type: 8 = raw depth maps, 17 = clouds with colours.
         overwrite: Replace what frames have of this type.
     """
-    from maplab_py.algorithms.dense.stereo.reconstruction import StereoSettings, reconstruct_stereo
+    from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
 
     vi_map, report = reconstruct_stereo(
         context.vi_map,
@@ -127,7 +132,7 @@ def create_tsdf_from_depth_resource(
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
         overwrite: Replace grids that the missions have, and the file of the mesh.
     """
-    from maplab_py.algorithms.dense.fusion.fusion import fuse_depth, update_grids
+    from maplab_py.algorithms.dense.fusion import fuse_depth, update_grids
     from maplab_py.memory import memory_limited
 
     if dense_result_mesh_output_file is not None:
@@ -157,7 +162,7 @@ def create_tsdf_from_depth_resource(
                 progress=context.progress,
             )
     if dense_result_mesh_output_file is not None:
-        from maplab_py.algorithms.dense.fusion.meshing import write_map_mesh
+        from maplab_py.algorithms.dense.meshing import write_map_mesh
 
         file = dense_result_mesh_output_file
         write_map_mesh(vi_map, folder, file, rows, dense_tsdf_mesh_min_weight, overwrite=overwrite)
@@ -198,7 +203,7 @@ def create_esdf_from_depth_resource(
         dense_max_memory_gb: Memory that the grid and the field may take; 0 = most of what is available.
         overwrite: Replace fields that the missions have, and the file for path planners.
     """
-    from maplab_py.algorithms.dense.distance.fields import create_fields, export_voxels
+    from maplab_py.algorithms.dense.field import create_fields, export_voxels
     from maplab_py.memory import memory_limited
 
     file = options.export_map_for_panning_path
@@ -251,7 +256,7 @@ def create_mesh_from_tsdf_grid(
             images and depth maps.
         overwrite: Replace a file that exists.
     """
-    from maplab_py.algorithms.dense.fusion.meshing import write_map_mesh
+    from maplab_py.algorithms.dense.meshing import write_map_mesh
 
     _check_mesh(dense_result_mesh_output_file, overwrite=overwrite)
     return write_map_mesh(

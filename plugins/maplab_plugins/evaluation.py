@@ -6,10 +6,10 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.evaluation.comparison_reports import MapComparisonReport
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.reports import (
     LocalizationEvaluationReport,
+    MapComparisonReport,
     TrajectoryEvaluationReport,
 )
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command

@@ -7,11 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from maplab_py.algorithms.external_poses.options import (
-    GpsOptions,
-    TrajectoryOptions,
-    WheelOptions,
-)
+from maplab_py.algorithms.external_poses.options import GpsOptions, TrajectoryOptions, WheelOptions
 from maplab_py.interop.device import DeviceOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
@@ -23,11 +19,7 @@ from maplab_py.plugin import (
 )
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.external_poses.reports import (
-        GpsImport,
-        TrajectoryImport,
-        WheelImport,
-    )
+    from maplab_py.algorithms.external_poses.options import GpsImport, TrajectoryImport, WheelImport
     from maplab_py.algorithms.self_calibration.reports import ComparedParameter
     from maplab_py.interop.calibration_import import CalibrationFile
     from maplab_py.interop.trajectories import Trajectory
@@ -150,8 +142,7 @@ def _apply(
     context: CommandContext, calibration: CalibrationFile, chosen: MissionChoice, *, imu_noise: bool
 ) -> tuple[ComparedParameter, ...]:
     from maplab_py.algorithms.self_calibration.comparison import compare
-    from maplab_py.algorithms.self_calibration.device import device_of
-    from maplab_py.algorithms.self_calibration.imported import with_calibration_file
+    from maplab_py.algorithms.self_calibration.device import device_of, with_calibration_file
 
     before = context.vi_map
     missions = chosen.rows(before)
@@ -273,7 +264,7 @@ def import_trajectory(
 def _measurements(
     context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, mission: int
 ) -> TrajectoryImport:
-    from maplab_py.algorithms.external_poses.reports import TrajectoryImport
+    from maplab_py.algorithms.external_poses.options import TrajectoryImport
     from maplab_py.algorithms.external_poses.trajectories import (
         as_absolute_poses,
         as_odometry,
@@ -310,7 +301,7 @@ def _measurements(
 def _new_mission(
     context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, map_key: str
 ) -> TrajectoryImport:
-    from maplab_py.algorithms.external_poses.reports import TrajectoryImport
+    from maplab_py.algorithms.external_poses.options import TrajectoryImport
     from maplab_py.algorithms.external_poses.trajectories import as_mission
     from maplab_py.vimap.ids import to_hex
     from maplab_py.vimap.merge import merge_maps
@@ -353,7 +344,7 @@ def import_gps(
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
-    from maplab_py.algorithms.external_poses.reports import GpsImport, LeftOutFixes
+    from maplab_py.algorithms.external_poses.options import GpsImport, LeftOutFixes
     from maplab_py.interop.gps_bags import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
@@ -397,7 +388,7 @@ def import_wheel_odometry(
             with qx, qy, qz, qw and velocities with wx, wy, wz are of all six directions.
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
-    from maplab_py.algorithms.external_poses.reports import WheelImport
+    from maplab_py.algorithms.external_poses.options import WheelImport
     from maplab_py.algorithms.external_poses.wheels import attach_wheels
     from maplab_py.interop.wheel_odometry import read_wheel_odometry
     from maplab_py.vimap.queries import mission_labels

@@ -9,7 +9,7 @@ from maplab_py.algorithms.image_features.options import ExtractionOptions, Featu
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.image_features.reports import ExtractionReport, FeatureTrackReport
+    from maplab_py.algorithms.image_features.options import ExtractionReport, FeatureTrackReport
 
 _EXTRACTION = ExtractionOptions()
 _TRACKS = FeatureTrackOptions()

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.landmarks.options import (
-    InvalidObservationOptions,
-    LandmarkQualityOptions,
-)
+from maplab_py.algorithms.landmarks.options import InvalidObservationOptions, LandmarkQualityOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.landmarks.reports import (
+    from maplab_py.algorithms.landmarks.options import (
         InvalidObservationReport,
         LandmarkQualityReport,
         LandmarkRemovalReport,

@@ -16,7 +16,7 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserEr
 if TYPE_CHECKING:
     from maplab_py.algorithms.localization.database import LocalizationMap
     from maplab_py.algorithms.localization.localization import Localizations, Reference
-    from maplab_py.algorithms.localization.reports import LocalizationReport
+    from maplab_py.algorithms.localization.options import LocalizationReport
     from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
 
@@ -80,8 +80,11 @@ def localize(
         overwrite: Replace files that exist.
     """
 
-    from maplab_py.algorithms.localization.localization import describe, localize_missions
-    from maplab_py.algorithms.localization.result_file import csv_lines
+    from maplab_py.algorithms.localization.localization import (
+        csv_lines,
+        describe,
+        localize_missions,
+    )
     from maplab_py.output_files import check_writable, write_text
 
     if sequence_length < 1:
@@ -161,15 +164,15 @@ def _reference(
     ground_truth: Path | None,
     truth: Path | None,
 ) -> tuple[Reference, NDArray[np.float64] | None]:
-    from maplab_py.algorithms.localization import reference
+    from maplab_py.algorithms.localization import localization
     from maplab_py.interop.trajectories import read_trajectory
     from maplab_py.simulation.truth import true_poses
 
     if truth is not None:
         return true_poses(query, localizations, database, truth)
     if ground_truth is None:
-        return reference.trajectory_of_queries(query, localizations)
+        return localization.trajectory_of_queries(query, localizations)
     recorded = read_trajectory(ground_truth)
-    return reference.ground_truth(
+    return localization.ground_truth(
         str(ground_truth), recorded.times_ns, recorded.T_R_B, query, localizations, searched
     )

@@ -254,7 +254,7 @@ def lc_report(
 
 def closure_values(session: Session) -> list[tuple[str, str]]:
     """Return the ids of the recorded closures with what was decided on them."""
-    from maplab_py.algorithms.loop_closure.closure_ids import described_ids
+    from maplab_py.algorithms.loop_closure.closure_record import described_ids
 
     return described_ids(session.vi_map)
 
@@ -278,7 +278,7 @@ def remove_loopclosure(
         neighbors_s: Also remove accepted closures both of whose ends are within this time.
     """
     from maplab_py.algorithms.loop_closure.listing import find_closures
-    from maplab_py.algorithms.loop_closure.removal import remove_closures
+    from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 
     ids = find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
     result, report = remove_closures(context.vi_map, ids)
@@ -374,7 +374,7 @@ def _relax(
     merge: bool,
 ) -> RelaxReport:
     from maplab_py.algorithms.loop_closure.workflow import close_loops
-    from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
+    from maplab_py.algorithms.relaxation.relaxation import relax_over_loops
 
     result, search_report, relaxed = relax_over_loops(
         context.vi_map, options, loop_options, missions=missions, progress=context.progress

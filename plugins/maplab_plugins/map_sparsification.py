@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.algorithms.keyframing.reports import KeyframingReport
-from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.reports import SparsificationReport
+from maplab_py.algorithms.keyframing.options import KeyframingOptions, KeyframingReport
+from maplab_py.algorithms.sparsification.options import SparsificationOptions, SparsificationReport
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 _KEYFRAMING = KeyframingOptions()

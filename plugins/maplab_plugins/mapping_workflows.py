@@ -13,7 +13,7 @@ from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.plugin import CommandContext, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.summary.reports import WorkflowReport
+    from maplab_py.algorithms.summary.options import WorkflowReport
 
 _KEYFRAMING = KeyframingOptions()
 _LOOPS = LoopClosureOptions()

@@ -14,7 +14,7 @@ from maplab_py.plugin import (
 )
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.dense.export.writing import MvsExport
+    from maplab_py.algorithms.dense.export import MvsExport
 
 
 @command(
@@ -45,8 +45,11 @@ def export_colmap_mvs(
         only_good_landmarks: Leave out landmarks of bad quality.
         overwrite: Replace files that exist.
     """
-    from maplab_py.algorithms.dense.export.views import UndistortedViews, UndistortionOptions
-    from maplab_py.algorithms.dense.export.writing import write_colmap_workspace
+    from maplab_py.algorithms.dense.export import (
+        UndistortedViews,
+        UndistortionOptions,
+        write_colmap_workspace,
+    )
 
     if colmap_max_image_size < 0 or every_nth < 1:
         raise UserError(
@@ -99,8 +102,11 @@ def export_for_pmvs_reconstruction(
         cmvs_use_only_good_landmarks: Leave out landmarks of bad quality.
         overwrite: Replace files that exist.
     """
-    from maplab_py.algorithms.dense.export.views import UndistortedViews, UndistortionOptions
-    from maplab_py.algorithms.dense.export.writing import write_pmvs_folder
+    from maplab_py.algorithms.dense.export import (
+        UndistortedViews,
+        UndistortionOptions,
+        write_pmvs_folder,
+    )
 
     if not 0.0 <= pmvs_undistortion_alpha <= 1.0 or not 0.05 <= pmvs_undistortion_scale <= 4.0:
         raise UserError(

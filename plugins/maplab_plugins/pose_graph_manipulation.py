@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from maplab_py.algorithms.pose_graph_manipulation.disturbance import (
+from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
+from maplab_py.algorithms.pose_graph_manipulation.layout import (
     DisturbanceOptions,
     DisturbanceReport,
 )
-from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, Message, MissionChoice, command
 from maplab_py.report import counted
 
@@ -101,7 +101,7 @@ def artificially_disturb_vertices(
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> DisturbanceReport:
     """Disturb all vertices by a random walk, to test what corrects it."""
-    from maplab_py.algorithms.pose_graph_manipulation.disturbance import disturb_vertices
+    from maplab_py.algorithms.pose_graph_manipulation.layout import disturb_vertices
 
     missions = chosen.rows(context.vi_map)
     result, report = disturb_vertices(context.vi_map, options, missions=missions)

@@ -93,7 +93,7 @@ def self_calibrate(
         return filtered.report()
 
     from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
-    from maplab_py.algorithms.self_calibration.segments.file import save_database
+    from maplab_py.algorithms.self_calibration.segments.database import save_database
     from maplab_py.research.information_gain import select_by_gain
 
     sensors, collected, report = calibrate_with_checks(
@@ -133,7 +133,7 @@ def collect_segments(
     Args:
         database: Segment database.
     """
-    from maplab_py.algorithms.self_calibration.segments.file import save_database
+    from maplab_py.algorithms.self_calibration.segments.database import save_database
     from maplab_py.algorithms.self_calibration.segments.selection import collect
 
     collected, report = collect(
@@ -164,7 +164,7 @@ def segment_database_stats(
     Args:
         database: Segment database.
     """
-    from maplab_py.algorithms.self_calibration.segments.file import load_database
+    from maplab_py.algorithms.self_calibration.segments.database import load_database
     from maplab_py.algorithms.self_calibration.segments.selection import describe_database
 
     return describe_database(load_database(database, size.max_bytes), database)
@@ -202,7 +202,7 @@ def prune_segments(
         probability: Of accepting a segment if the calibration is right.
     """
     from maplab_py.algorithms.self_calibration.pruning import prune
-    from maplab_py.algorithms.self_calibration.segments.file import (
+    from maplab_py.algorithms.self_calibration.segments.database import (
         load_database,
         read_calibration,
         save_database,
@@ -248,7 +248,7 @@ def export_segments(
         map_folder: Destination folder.
         overwrite: Replace a map that is there.
     """
-    from maplab_py.algorithms.self_calibration.segments.file import load_database
+    from maplab_py.algorithms.self_calibration.segments.database import load_database
     from maplab_py.storage.native import save_map
 
     segments = load_database(database, size.max_bytes)
@@ -324,7 +324,7 @@ def apply_calibration(
     """
     from maplab_py.algorithms.self_calibration.comparison import compare
     from maplab_py.algorithms.self_calibration.device import device_of, transfer_calibration
-    from maplab_py.algorithms.self_calibration.segments.file import read_calibration
+    from maplab_py.algorithms.self_calibration.segments.database import read_calibration
 
     missions = chosen.rows(context.vi_map)
     before = context.vi_map
@@ -390,7 +390,7 @@ def compare_calibrations(
     """
     from maplab_py.algorithms.self_calibration.comparison import compare
     from maplab_py.algorithms.self_calibration.device import device_of
-    from maplab_py.algorithms.self_calibration.segments.file import read_calibration
+    from maplab_py.algorithms.self_calibration.segments.database import read_calibration
     from maplab_py.sensors.calibration_transfer import corresponding_device
 
     sensors, other = context.vi_map.sensors, read_calibration(calibration, size.max_bytes)
@@ -399,7 +399,7 @@ def compare_calibrations(
 
 
 def _existing(path: Path | None, size: SizeOptions) -> SegmentDatabase | None:
-    from maplab_py.algorithms.self_calibration.segments.file import load_database
+    from maplab_py.algorithms.self_calibration.segments.database import load_database
 
     if path is None or not path.exists():
         return None

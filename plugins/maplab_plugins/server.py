@@ -365,7 +365,7 @@ def tie_stationary_missions(
 
     `optvi --ba_include_loop_closure_edges` uses the edges, so that such a mission does not drift.
     """
-    from maplab_py.algorithms.pose_graph_manipulation.stationary import tie_stationary
+    from maplab_py.algorithms.pose_graph_manipulation.edges import tie_stationary
 
     result, missions = tie_stationary(context.vi_map, options)
     context.commit(result)

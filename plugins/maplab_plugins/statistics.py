@@ -8,8 +8,7 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.plugin import CommandContext, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.statistics.distributions import MapDistributions
-    from maplab_py.algorithms.statistics.size import MapSize
+    from maplab_py.algorithms.statistics.statistics import MapDistributions, MapSize
 
 _KEYFRAMING = KeyframingOptions()
 
@@ -17,7 +16,7 @@ _KEYFRAMING = KeyframingOptions()
 @command("statistics", "stat", example="statistics", see_also=("map_stats", "map_size"))
 def statistics(context: CommandContext) -> MapDistributions:
     """Show how tracks, landmarks, distances and samples of the selected map are distributed."""
-    from maplab_py.algorithms.statistics.distributions import map_distributions
+    from maplab_py.algorithms.statistics.statistics import map_distributions
 
     return map_distributions(context.vi_map)
 
@@ -29,7 +28,7 @@ def statistics(context: CommandContext) -> MapDistributions:
 )
 def map_size(context: CommandContext, *, keyframing: KeyframingOptions = _KEYFRAMING) -> MapSize:
     """Show the size of each part of the map and what each maintenance command would save."""
-    from maplab_py.algorithms.statistics.size import map_size as measure
+    from maplab_py.algorithms.statistics.statistics import map_size as measure
 
     return measure(
         context.vi_map,

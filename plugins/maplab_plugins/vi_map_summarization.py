@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
-from maplab_py.algorithms.summary.options import SummaryMapOptions
-from maplab_py.algorithms.summary.reports import SummaryMapContent, SummaryMapReport
+from maplab_py.algorithms.summary.options import (
+    SummaryMapContent,
+    SummaryMapOptions,
+    SummaryMapReport,
+)
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
 
@@ -82,7 +85,7 @@ def print_summary_map(
     Args:
         summary_map: The file, or the folder that holds it.
     """
-    from maplab_py.algorithms.summary.description import describe
+    from maplab_py.algorithms.summary.summary import describe
     from maplab_py.storage.summary_map import read_summary_map, summary_map_file
 
     summary = read_summary_map(summary_map, max_size_megabytes=size.proto_max_size_megabytes)

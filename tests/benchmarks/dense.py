@@ -21,14 +21,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maplab_py.algorithms.dense.clouds import CloudMaker
-from maplab_py.algorithms.dense.fusion.depth_views import DepthViews
-from maplab_py.algorithms.dense.fusion.fusion import fuse_depth
-from maplab_py.algorithms.dense.fusion.grid import GridSettings, TsdfGrid
-from maplab_py.algorithms.dense.fusion.meshing import map_mesh
-from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT, FusionOptions
+from maplab_py.algorithms.dense.depth_inputs import DepthViews
+from maplab_py.algorithms.dense.fusion import fuse_depth
+from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.meshing import map_mesh
+from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT, FusionOptions, StereoOptions
+from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
 from maplab_py.algorithms.dense.resources import FrameResources
-from maplab_py.algorithms.dense.stereo.options import StereoOptions
-from maplab_py.algorithms.dense.stereo.reconstruction import StereoSettings, reconstruct_stereo
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64

@@ -12,9 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.sparsification import greedy
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem
-from maplab_py.algorithms.sparsification.integer_programme import solve_relaxed
+from maplab_py.algorithms.sparsification import selection
+from maplab_py.algorithms.sparsification.selection import CoverageProblem, solve_relaxed
 from maplab_py.algorithms.sparsification.sparsify import solve_by_parts
 from tests.algorithms.sparsification.instances import corridor
 from tests.support.machine import slowness
@@ -65,9 +64,9 @@ def choices(landmarks: int) -> dict[str, Callable[[CoverageProblem], tuple[Mask,
     return {
         "relaxed": relaxed,
         "by parts": by_parts,
-        "greedy": plain(greedy.choose_greedily),
-        "most observed": plain(greedy.choose_most_observed),
-        "random": plain(lambda problem: greedy.choose_random(problem, 0)),
+        "greedy": plain(selection.choose_greedily),
+        "most observed": plain(selection.choose_most_observed),
+        "random": plain(lambda problem: selection.choose_random(problem, 0)),
     }
 
 

@@ -72,8 +72,10 @@ def _file(write: Callable[[Path, int], object], name: str) -> Scenario:
 
 
 def _database(path: Path, version: int) -> None:
-    from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
-    from maplab_py.algorithms.self_calibration.segments.file import save_database
+    from maplab_py.algorithms.self_calibration.segments.database import (
+        SegmentDatabase,
+        save_database,
+    )
 
     vi_map = walk_map(**_SIZE, seed=version)
     tables = {"imu": ("imu",)}

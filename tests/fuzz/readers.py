@@ -22,8 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
-from maplab_py.algorithms.self_calibration.segments.file import load_database, save_database
+from maplab_py.algorithms.self_calibration.segments.database import (
+    SegmentDatabase,
+    load_database,
+    save_database,
+)
 from maplab_py.errors import MaplabError
 from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.calibration_import import import_calibration

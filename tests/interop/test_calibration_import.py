@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.algorithms.self_calibration.imported import with_calibration_file
+from maplab_py.algorithms.self_calibration.device import device_of, with_calibration_file
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.interop.calibration_export import exported
 from maplab_py.interop.calibration_import import CalibrationFile, import_calibration

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from maplab_py.algorithms.cloud_registration import libraries
+from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
@@ -77,11 +77,11 @@ def test_wrong_values_are_refused(session: Session, monkeypatch: pytest.MonkeyPa
         session.run("lc_lidar", lidar_lc_global=True, lidar_lc_from_closures=True)
     with pytest.raises(MapError, match="--lidar_lc_voxel_size_m"):
         session.run("lc_lidar", lidar_lc_voxel_size_m=5.0)
-    libraries.small_gicp.cache_clear()
+    registration.small_gicp.cache_clear()
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(UserError, match=r"maplab-py\[lidar\]"):
         session.run("lc_lidar")
-    libraries.small_gicp.cache_clear()
+    registration.small_gicp.cache_clear()
     session.run("remove_resources", resource_type="21")
     with pytest.raises(UserError, match="import_point_clouds"):
         session.run("lc_lidar")

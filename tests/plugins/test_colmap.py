@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.evaluation.comparison_reports import MapComparisonReport
+from maplab_py.algorithms.evaluation.reports import MapComparisonReport
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError

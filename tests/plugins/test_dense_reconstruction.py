@@ -144,7 +144,7 @@ def test_distances_for_a_planner(session: Session, room: StereoRoom, tmp_path: P
     reloaded = tmp_path / "reloaded.ply"
     program = (
         "import sys; from pathlib import Path\n"
-        "from maplab_py.algorithms.dense.distance.fields import export_voxels\n"
+        "from maplab_py.algorithms.dense.field import export_voxels\n"
         "from maplab_py.storage.native import load_map\n"
         "folder, file = map(Path, sys.argv[1:]); export_voxels(load_map(folder)[0], folder, file)"
     )

@@ -15,7 +15,7 @@ import pytest
 
 from maplab_py.algorithms.self_calibration import checks
 from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.algorithms.self_calibration.segments import file as database_file
+from maplab_py.algorithms.self_calibration.segments import database as database_file
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from maplab_py.algorithms.landmarks.explanation import LandmarkExplanation
+from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.algorithms.loop_closure.explanation import (
     ClosureExplanation,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from maplab_py.algorithms.anchoring.reports import AnchoringReport, MissionAlignment
+from maplab_py.algorithms.anchoring.options import AnchoringReport, MissionAlignment
 from maplab_py.server.alignments import OpenAlignments
 
 A, B, C, D = (letter * 32 for letter in "abcd")

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.dense.distance.field import DistanceField, encode_field
-from maplab_py.algorithms.dense.distance.fields import FIELD_TYPE
+from maplab_py.algorithms.dense.field import FIELD_TYPE, DistanceField, encode_field
 from maplab_py.errors import UserError
 from maplab_py.storage.new_resources import NewResources
 from maplab_py.viewer import colours

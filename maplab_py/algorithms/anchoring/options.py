@@ -1,4 +1,4 @@
-"""Options of anchoring."""
+"""Options and reports of anchoring."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 from typing import ClassVar
 
 from maplab_py.options import option
+from maplab_py.report import Report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,3 +38,58 @@ class AnchoringOptions:
         "its evidence; 0 = none",
         flag="anchor_hypothesis",
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionAlignment:
+    """Result of the alignment of two missions."""
+
+    missions: str  # "short id - short id"
+    closures: int  # verified closures between the two missions
+    agreeing: int
+    rms_m: float  # of the agreeing closures' positions
+    verdict: str  # "used" or the reason why not
+
+
+@dataclasses.dataclass(frozen=True)
+class AlignmentHypothesis:
+    """One of several alignments of two missions that closures support."""
+
+    number: int  # for --anchor_hypothesis
+    missions: str  # "short id - short id"
+    closures: int
+    stretches: tuple[int, int]  # of the two trajectories, about a metre each, that it explains
+    only_this: tuple[int, int]  # of these, not explained by the best of the others
+    position_m: tuple[float, float, float]  # of the first mission's frame in the second's
+    yaw_deg: float
+    outcome: str  # wins, runner-up, loses, undecided
+
+
+@dataclasses.dataclass(frozen=True)
+class AnchoringReport(Report):
+    """Anchored missions."""
+
+    already_known: tuple[str, ...]
+    anchored: tuple[str, ...]
+    not_anchored: dict[str, str]  # mission: reason
+    alignments: tuple[MissionAlignment, ...]
+    by_absolute_poses: tuple[str, ...] = ()  # of the anchored ones
+    hypotheses: tuple[AlignmentHypothesis, ...] = ()  # where there are several, or doubts
+    notes: tuple[str, ...] = ()
+    reason: str = ""  # why no mission could be anchored
+
+    @property
+    def advice(self) -> str:
+        """Name the command that explains a mission that was not anchored."""
+        return f"see `why {next(iter(self.not_anchored))}`" if self.not_anchored else ""
+
+    @property
+    def failure(self) -> str:
+        """Say which missions stay unknown."""
+        if self.reason:
+            return self.reason
+        if not self.not_anchored:
+            return ""
+        return "not anchored: " + "; ".join(
+            f"{mission} ({why})" for mission, why in self.not_anchored.items()
+        )

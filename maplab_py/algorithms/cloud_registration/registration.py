@@ -7,14 +7,45 @@ Perturbations of poses are on the right, [dp, dtheta], both in the frame of the 
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.cloud_registration.libraries import small_gicp
 from maplab_py.array_types import F64, Mask
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
+
+_REMEDY = "pip install 'maplab-py[lidar]'"
+
+
+@cache
+def small_gicp() -> Any:
+    """Return the library that registers clouds from initial poses.
+
+    Raises:
+        UserError: It is not installed.
+    """
+    try:
+        import small_gicp as library
+    except ImportError:
+        raise UserError(f"registration of clouds needs the library small_gicp: {_REMEDY}") from None
+    return library
+
+
+@cache
+def kiss_matcher() -> Any:
+    """Return the library that registers clouds without initial poses.
+
+    Raises:
+        UserError: It is not installed.
+    """
+    try:
+        import kiss_matcher as library
+    except ImportError:
+        raise UserError(f"--lidar_lc_global needs the library kiss_matcher: {_REMEDY}") from None
+    return library
+
 
 _MIN_POINTS = 100
 """Points that a thinned cloud needs."""

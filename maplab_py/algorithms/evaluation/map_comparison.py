@@ -7,11 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.evaluation.comparison_reports import (
-    Difference,
-    MapComparisonReport,
-    RowCounts,
-)
+from maplab_py.algorithms.evaluation.reports import Difference, MapComparisonReport, RowCounts
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig

@@ -16,12 +16,13 @@ from maplab_py.algorithms.external_poses.alignment import (
     with_aligned_base_frame,
 )
 from maplab_py.algorithms.external_poses.options import GpsOptions
-from maplab_py.algorithms.external_poses.sensors import (
+from maplab_py.algorithms.external_poses.trajectories import (
     UNKNOWN_SIGMA_RAD,
     content_words,
+    nearest,
     with_sensor,
+    without_absolute_poses,
 )
-from maplab_py.algorithms.external_poses.trajectories import nearest, without_absolute_poses
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3

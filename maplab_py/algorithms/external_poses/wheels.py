@@ -7,8 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from maplab_py.algorithms.external_poses.options import WheelOptions
-from maplab_py.algorithms.external_poses.sensors import content_words, with_sensor
-from maplab_py.algorithms.external_poses.trajectories import without_edges
+from maplab_py.algorithms.external_poses.trajectories import (
+    content_words,
+    with_sensor,
+    without_edges,
+)
 from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3

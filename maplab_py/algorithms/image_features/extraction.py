@@ -18,8 +18,7 @@ from maplab_py.algorithms.image_features.keypoint_edits import (
     with_features,
     without_kind,
 )
-from maplab_py.algorithms.image_features.options import PLUGIN, ExtractionOptions
-from maplab_py.algorithms.image_features.reports import ExtractionReport
+from maplab_py.algorithms.image_features.options import PLUGIN, ExtractionOptions, ExtractionReport
 from maplab_py.array_types import I64, U8, Mask
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.memory import require_memory

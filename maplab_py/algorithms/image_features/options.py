@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.report import Report
 from maplab_py.vimap.descriptors import type_of_name
 from maplab_py.vision.features.extension import plugin_extractor
 from maplab_py.vision.features.extractors import KINDS
@@ -117,3 +118,33 @@ class FeatureTrackOptions:
             return type_of_name(self.feature_type), ()
         except FlagError as error:
             raise FlagError(f"--feature_type: {error}") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class ExtractionReport(Report):
+    """Features that images gave."""
+
+    feature_type: str
+    descriptor_bytes: int
+    images: int
+    keypoints: int
+    median_per_image: float
+    frames_that_had_some: int = dataclasses.field(
+        default=0, metadata={"title": "frames with such features before"}
+    )
+    frames_without_image: int = 0
+    keypoints_removed: int = 0
+    landmarks_removed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureTrackReport(Report):
+    """Links of keypoints between frames."""
+
+    feature_type: str
+    frame_pairs: int
+    matches: int
+    median_matches_per_pair: float
+    tracks: int
+    mean_track_length: float
+    contradictions: int  # matches that would put two keypoints of a frame into one track

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.image_features.keypoint_edits import keypoints_of
-from maplab_py.algorithms.image_features.options import FeatureTrackOptions
-from maplab_py.algorithms.image_features.reports import FeatureTrackReport
+from maplab_py.algorithms.image_features.options import FeatureTrackOptions, FeatureTrackReport
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.features import most_frequent_kind
 from maplab_py.array_types import F64, I64, Mask

@@ -7,8 +7,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.algorithms.keyframing.reports import KeyframingReport
+from maplab_py.algorithms.keyframing.options import KeyframingOptions, KeyframingReport
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress

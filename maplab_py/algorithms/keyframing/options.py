@@ -1,4 +1,4 @@
-"""Options of heuristic keyframing; maplab's names and defaults."""
+"""Options and report of keyframing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.report import Report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,3 +34,27 @@ class KeyframingOptions:
         for name in ("distance_threshold_m", "rotation_threshold_deg", "min_shared_landmarks_obs"):
             if getattr(self, name) < 0:
                 raise FlagError(f"--kf_{name} must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyframingReport(Report):
+    """Keyframes by the first reason that applied, and data removed with other vertices."""
+
+    vertices_before: int
+    vertices_after: int
+    # keyframes by reason
+    mission_ends: int
+    every_nth: int
+    few_shared_landmarks: int
+    absolute_pose: int
+    loop_closure: int
+    distance: int
+    rotation: int
+    # data removed with vertices
+    observations_removed: int
+    landmarks_moved: int
+    landmarks_undetermined: int  # left with fewer than two observations
+    imu_edges_dropped: int
+    transformation_edges_dropped: int
+    resources_removed: int
+    note: str = ""

@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.gate import Gate
-from maplab_py.algorithms.landmarks.covariance import landmark_covariance, largest_sigma
-from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.reports import LandmarkQualityReport
+from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance, largest_sigma
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, LandmarkQualityReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import Report
 from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import landmark_mask
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
@@ -281,3 +282,51 @@ def evaluate_unknown_quality(
 def _counts(verdict: Verdict) -> dict[str, int]:
     """Return the number of landmarks that fail each criterion."""
     return {f.name: int(getattr(verdict, f.name).sum()) for f in dataclasses.fields(verdict)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Criterion:
+    """One criterion for a landmark."""
+
+    criterion: str
+    value: str
+    wanted: str
+    result: str  # passed, failed or not checked
+    flag: str
+
+
+@dataclasses.dataclass(frozen=True)
+class LandmarkExplanation(Report):
+    """The criteria of a landmark's quality."""
+
+    landmark: str
+    mission: str
+    quality: str  # as stored in the map
+    observations: int
+    criteria: tuple[Criterion, ...]
+    summary: str = dataclasses.field(metadata={"is_prose": True})
+
+
+def explain_landmark(
+    vi_map: VIMap, landmark: int, options: LandmarkQualityOptions
+) -> LandmarkExplanation:
+    """Return the criteria for a landmark (row) with the thresholds of the options.
+
+    Raises:
+        MapError: A mission's camera rig or IMU is not in sensors.yaml.
+    """
+    lines = tuple(
+        Criterion(gate.name, *gate.describe(0), gate.flag)
+        for gate in criteria(vi_map, np.array([landmark]), options)
+        if gate.applies[0]
+    )
+    failed = [line.criterion for line in lines if line.result == "failed"]
+    verdict = "bad: it fails " + ", ".join(failed) if failed else "good"
+    return LandmarkExplanation(
+        to_hex(vi_map.landmarks.id[landmark]),
+        to_hex(vi_map.missions.id[vi_map.vertices.mission[vi_map.landmarks.vertex[landmark]]])[:8],
+        LandmarkQuality(int(vi_map.landmarks.quality[landmark])).name.lower(),
+        int(np.diff(vi_map.observation_start)[landmark]),
+        lines,
+        f"With these thresholds the landmark is {verdict}.",
+    )

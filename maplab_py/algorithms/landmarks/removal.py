@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.landmarks.options import InvalidObservationOptions
-from maplab_py.algorithms.landmarks.reports import InvalidObservationReport, LandmarkRemovalReport
+from maplab_py.algorithms.landmarks.options import (
+    InvalidObservationOptions,
+    InvalidObservationReport,
+    LandmarkRemovalReport,
+)
 from maplab_py.algorithms.landmarks.sightings import Residuals, is_lidar, residuals
 from maplab_py.algorithms.landmarks.tracks import add_tracks, group_tracks
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints

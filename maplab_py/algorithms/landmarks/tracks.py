@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.reports import TrackReport
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
 from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangulate_keypoints
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, RetriangulationReport
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
-from maplab_py.algorithms.landmarks.reports import RetriangulationReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import triangulation

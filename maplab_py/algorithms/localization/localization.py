@@ -10,15 +10,21 @@ import numpy as np
 
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome, Query
-from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.localization.reports import Distribution, LocalizationReport
+from maplab_py.algorithms.localization.options import (
+    Distribution,
+    LocalizationOptions,
+    LocalizationReport,
+)
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.array_types import F64, I64, Mask
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
+from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import sizes_of_type
+from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.projection import DescriptorProjection
 
@@ -232,3 +238,100 @@ def queries(source: QueryVertices, sequence_length: int = 1) -> Iterator[Query]:
             rad_per_px=features.rad_per_px[rows],
             q_M_I=vi_map.vertices.T_M_I[vertex, :4],
         )
+
+
+_MIN_PAIRS = 10
+
+
+def trajectory_of_queries(
+    vi_map: VIMap, localizations: Localizations
+) -> tuple[Reference, F64 | None]:
+    """Use the poses of the query map; return T_R_G too, None when too few queries were localised.
+
+    If the base frames of the queries' missions are known, both maps are assumed to share G. Else
+    the trajectory is first aligned with the localised poses by yaw and position.
+    """
+    T_G_I = vi_map.T_G_I[localizations.vertex]
+    known = np.ones(len(localizations.vertex), dtype=np.bool_)
+    missions = np.unique(vi_map.vertices.mission[localizations.vertex])
+    if vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]].all():
+        return Reference("the query's poses in G", T_G_I, known), se3.identity()
+    reference = Reference("the query's trajectory, aligned with the localised poses", T_G_I, known)
+    return reference, _from_answers(reference, localizations, level=True)
+
+
+def ground_truth(
+    name: str,
+    times_ns: I64,
+    T_R_I: F64,
+    query: VIMap,
+    localizations: Localizations,
+    searched: VIMap | None,
+) -> tuple[Reference, F64 | None]:
+    """Use a ground-truth trajectory; also return T_R_G, None if it cannot be determined.
+
+    A full map is aligned with the ground truth by its vertices, so that errors of the map count.
+    A summary map has no times: the localised poses are aligned with the truth robustly.
+
+    Args:
+        name: Name of the reference.
+        times_ns: Times (N,) of the truth.
+        T_R_I: Poses (N, 7) of the truth.
+        query: The map of the queries.
+        localizations: The localised poses.
+        searched: The map that was searched, None for a summary map.
+
+    Raises:
+        UserError: No query lies in the truth's time span.
+    """
+    poses, known = interpolate_poses(
+        times_ns, T_R_I, query.vertices.timestamp_ns[localizations.vertex]
+    )
+    if not known.any():
+        raise UserError(f"{name}: none of the queries lies in its time span")
+    reference = Reference(name, poses, known)
+    if searched is not None:
+        where, inside = interpolate_poses(times_ns, T_R_I, searched.vertices.timestamp_ns)
+        if inside.sum() >= _MIN_PAIRS:
+            T_R_G, _ = umeyama(where[inside, 4:], searched.T_G_I[inside, 4:])
+            return reference, T_R_G
+    return reference, _from_answers(reference, localizations, level=False)
+
+
+def _from_answers(reference: Reference, localizations: Localizations, *, level: bool) -> F64 | None:
+    both = reference.is_known & localizations.is_localized
+    if both.sum() < _MIN_PAIRS:
+        return None
+    return align_robustly(reference.T_R_I[both, 4:], localizations.T_G_I[both, 4:], level=level)
+
+
+_HEADER = (
+    "vertex,timestamp_ns,outcome,keypoints,matches,inliers,"
+    "q_x,q_y,q_z,q_w,p_x,p_y,p_z,position_error_m,orientation_error_deg,matching_ms,ransac_ms\n"
+)
+
+
+def csv_lines(
+    query: VIMap, localizations: Localizations, reference: Reference, T_R_G: F64 | None
+) -> list[str]:
+    """Return a header and one line per query; errors are empty where T_R_G (7,) is not known."""
+    nan = np.full(len(localizations.vertex), np.nan)
+    position, orientation = (
+        (nan, nan) if T_R_G is None else pose_errors(localizations, reference, T_R_G)
+    )
+    lines = [_HEADER]
+    names = to_hex_list(query.vertices.id[localizations.vertex])
+    times = query.vertices.timestamp_ns[localizations.vertex].tolist()
+    for row, answer in enumerate(localizations.answers):
+        pose = (
+            ",".join(f"{value:.9g}" for value in answer.T_G_I)
+            if localizations.is_localized[row]
+            else ",,,,,,"
+        )
+        errors = f"{position[row]:.6g},{orientation[row]:.6g}" if position[row] >= 0.0 else ","
+        spent = f"{1e3 * answer.matching_s:.3f},{1e3 * answer.ransac_s:.3f}"
+        counts = f"{answer.keypoints},{answer.matches},{answer.inliers}"
+        lines.append(
+            f"{names[row]},{times[row]},{answer.outcome.value},{counts},{pose},{errors},{spent}\n"
+        )
+    return lines

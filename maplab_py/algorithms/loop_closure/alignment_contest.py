@@ -22,8 +22,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.expected_views import is_refuted, unmatched_share
-from maplab_py.algorithms.loop_closure.mission_alignment import MissionPair
+from maplab_py.algorithms.loop_closure.mission_alignment import (
+    MissionPair,
+    is_refuted,
+    unmatched_share,
+)
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.geometry import yaw

@@ -10,12 +10,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import weakref
 import zlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.errors import MapError
 from maplab_py.storage.extension_fields import (
     LOOP_RECORD,
@@ -25,7 +27,7 @@ from maplab_py.storage.extension_fields import (
     with_extension,
 )
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap.ids import IdIndex, to_hex_list
 from maplab_py.vimap.table import Table, column
 
 FIELD_NUMBER = LOOP_RECORD
@@ -204,3 +206,24 @@ def _decode(content: bytes) -> LoopRecord:
             "the record of loop closures does not fit into memory; "
             "delete_loopclosure_record drops it"
         ) from None
+
+
+_DESCRIBED: weakref.WeakKeyDictionary[VIMap, list[tuple[str, str]]] = weakref.WeakKeyDictionary()
+"""Descriptions of the closures of maps, which do not change as maps are values."""
+
+
+def described_ids(vi_map: VIMap) -> list[tuple[str, str]]:
+    """Return the beginnings of the ids of all recorded closures, with inliers and verdict."""
+    if vi_map not in _DESCRIBED:
+        c = read_record(vi_map).closures
+        _DESCRIBED[vi_map] = [
+            (id_[:8], f"{inliers} of {matches} matches, {VERDICTS[verdict].value}")
+            for id_, inliers, matches, verdict in zip(
+                to_hex_list(c.id),
+                c.inliers.tolist(),
+                c.matches.tolist(),
+                c.verdict.tolist(),
+                strict=True,
+            )
+        ]
+    return _DESCRIBED[vi_map]

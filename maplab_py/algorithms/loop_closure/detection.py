@@ -16,13 +16,16 @@ from maplab_py.algorithms.loop_closure.candidates import (
     Matches,
     find_candidates,
 )
-from maplab_py.algorithms.loop_closure.closure_table import Closures
-from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features, points_in_mission
+from maplab_py.algorithms.loop_closure.closure_table import Closures, closure_ids
+from maplab_py.algorithms.loop_closure.features import (
+    MapFeatures,
+    SearchScope,
+    map_features,
+    points_in_mission,
+)
 from maplab_py.algorithms.loop_closure.gates import judge
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record_updates import closure_ids
-from maplab_py.algorithms.loop_closure.search_scope import SearchScope
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3

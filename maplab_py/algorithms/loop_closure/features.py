@@ -8,8 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.reports import TrainingReport
-from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory
-from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.array_types import F64, I32, I64, U8, Mask
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
@@ -25,7 +24,8 @@ from maplab_py.vimap.descriptors import (
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
-from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection
+from maplab_py.vision.kmeans import kmeans, nearest_centre
+from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_projection
 
 _BYTES_PER_KEYPOINT = 300
 """Memory per keypoint [bytes] without its descriptor, which is stored twice."""
@@ -258,3 +258,146 @@ def points_in_mission(vi_map: VIMap, landmarks: I64, mission: I64) -> F64:
     Landmarks stored in another mission come over the base frames.
     """
     return se3.transform(se3.inverse(vi_map.T_G_M)[mission], vi_map.p_G[landmarks])
+
+
+# Index of visited stretches by their visual words: which parts of a map look like a new part.
+#
+# Descriptors are projected to few dimensions and quantised to words; a stretch is the vector of its
+# word frequencies, weighted by how rare the words are (Sivic and Zisserman, ICCV 2003). Adding a stretch
+# and asking for similar ones takes a time that hardly depends on the size of the map, unlike the search
+# of single descriptors, which then only runs over the parts that were retrieved.
+
+
+_WORDS = 1024
+_FEATURES_PER_WORD = 4
+_MIN_FEATURES = 400
+_TRAINING_FEATURES = 20_000
+
+
+class PlaceIndex:
+    """Stretches in the order in which they were added."""
+
+    def __init__(self) -> None:
+        """Start empty; projection and words are learned from the first stretch that suffices."""
+        self._projection: DescriptorProjection | None = None
+        self._centres = np.zeros((0, 0), dtype=np.float32)
+        self._frequencies: list[F64] = []
+
+    def __len__(self) -> int:
+        return len(self._frequencies)
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the words have been learned."""
+        return self._projection is not None
+
+    def train(self, vi_map: VIMap) -> bool:
+        """Learn projection and words from the tracks of a map; False where it has too few features.
+
+        Raises:
+            EstimationError: There are too few tracks.
+        """
+        size, keypoints = _features(vi_map, None)
+        if len(keypoints) < _MIN_FEATURES:
+            return False
+        raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoints, :size])
+        landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
+        self._projection = learn_projection(raw, landmark)
+        step = max(1, len(raw) // _TRAINING_FEATURES)
+        words = min(_WORDS, len(raw) // _FEATURES_PER_WORD)
+        self._centres = kmeans(self._projection.project(raw[::step]), words)
+        return True
+
+    def frequencies(self, vi_map: VIMap, vertices: I64 | None = None) -> F64:
+        """Return the word frequencies (W,) of vertices (rows, None = all); zeros without features."""
+        if self._projection is None:
+            return np.zeros(1)
+        size, keypoints = _features(vi_map, vertices)
+        if size != self._projection.descriptor_size or not len(keypoints):
+            return np.zeros(len(self._centres))
+        raw = np.ascontiguousarray(vi_map.keypoints.descriptor[keypoints, :size])
+        words = nearest_centre(self._projection.project(raw), self._centres)
+        return np.bincount(words, minlength=len(self._centres)) / len(words)
+
+    def add(self, frequencies: F64) -> None:
+        """Add a stretch with its word frequencies (W,)."""
+        self._frequencies.append(frequencies)
+
+    def similar(self, frequencies: F64, count: int) -> I64:
+        """Return up to `count` stretches that are most similar to some frequencies, the best first.
+
+        Similarity is the cosine of the weighted vectors.
+        """
+        if not self._frequencies or not frequencies.any():
+            return np.zeros(0, dtype=np.int64)
+        known = np.zeros((len(self._frequencies), len(frequencies)))
+        for row, column in enumerate(self._frequencies):
+            known[row, : len(column)] = column  # those from before the training have no words
+        weight = np.log((1.0 + len(known)) / (1.0 + np.count_nonzero(known, axis=0))) + 1e-3
+        a, b = known * weight, frequencies * weight
+        norm = np.linalg.norm(a, axis=1) * np.linalg.norm(b)
+        score = np.divide(a @ b, norm, out=np.zeros(len(a)), where=norm > 0.0)
+        order = np.argsort(-score, kind="stable")[:count]
+        return np.asarray(order[score[order] > 0.0], dtype=np.int64)
+
+
+def _features(vi_map: VIMap, vertices: I64 | None) -> tuple[int, I64]:
+    """Return the usual length of binary descriptors and the keypoints of vertices that have it."""
+    sizes = vi_map.binary_descriptor_size
+    by_size = np.bincount(sizes, minlength=1)
+    by_size[0] = 0
+    size = int(np.argmax(by_size))
+    if vertices is None:
+        return size, np.flatnonzero((sizes == size) & (size > 0))
+    is_in = np.zeros(len(vi_map.vertices), dtype=np.bool_)
+    is_in[vertices] = True
+    return size, np.flatnonzero((sizes == size) & (size > 0) & is_in[vi_map.keypoint_vertex])
+
+
+_GROWTH = 2
+"""The projection is learned again where there are so many times as many tracked descriptors."""
+
+
+class ProjectionMemory:
+    """The descriptor projection of a growing map.
+
+    A projection is good for descriptors that it was not learned from, and learning it takes longer than
+    a search for the places of a few vertices. So it is learned again only for other descriptors, or when
+    there is twice as much to learn from as the last time.
+    """
+
+    def __init__(self) -> None:
+        """Start without a projection."""
+        self._projection: DescriptorProjection | None = None
+        self._descriptors = 0
+
+    def learned(
+        self, descriptors: U8, track: I64, kind: DescriptorKind, dimensions: int
+    ) -> DescriptorProjection:
+        """Return the kept projection, or learn one; see `learn_projection`.
+
+        Raises:
+            EstimationError: Too few tracks.
+        """
+        count = int(np.count_nonzero(track >= 0))
+        kept = self._projection
+        if kept is not None and kept.kind == kind and count <= _GROWTH * self._descriptors:
+            wanted = min(dimensions, kind.dimensions)
+            if len(kept.matrix) == wanted:
+                return kept
+        learned = learn_projection(descriptors, track, kind=kind, dimensions=dimensions)
+        self._projection, self._descriptors = learned, count
+        return learned
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchScope:
+    """Limits of a search.
+
+    Attributes:
+        queries: Vertices (V,) whose places are looked for, in the whole map; None = all.
+        projections: Keeps the projection from one search to the next; None = it is learned.
+    """
+
+    queries: Mask | None = None
+    projections: ProjectionMemory | None = None

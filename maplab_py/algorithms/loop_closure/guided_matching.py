@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.landmarks.covariance import landmark_covariance
-from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
+from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays, landmark_covariance
 from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.features import (
     findable_landmarks,

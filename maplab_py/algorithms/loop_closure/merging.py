@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.landmarks.covariance import landmark_covariance
+from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.landmarks.quality import predicted_sigma
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
 from maplab_py.algorithms.loop_closure.closure_table import Closures
@@ -21,11 +21,7 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import merge_landmarks, with_p_G
 from maplab_py.vimap.queries import observer_counts
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-from maplab_py.vision.point_covariance import (
-    ClosurePoses,
-    LandmarkPairs,
-    squared_sigmas,
-)
+from maplab_py.vision.point_covariance import ClosurePoses, LandmarkPairs, squared_sigmas
 from maplab_py.vision.track_union import unite_tracks
 
 FEW_OBSERVATIONS = "too few verified observations agree"

@@ -15,7 +15,6 @@ from maplab_py.algorithms.gate import YES_NO, Gate, any_failed
 from maplab_py.algorithms.loop_closure.alignment_contest import Contest
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.expected_views import is_refuted
 from maplab_py.algorithms.loop_closure.gates import (
     MeasuredClosures,
     consensus,
@@ -25,6 +24,7 @@ from maplab_py.algorithms.loop_closure.gates import (
     pose_gates,
     shares_of_rivals,
 )
+from maplab_py.algorithms.loop_closure.mission_alignment import is_refuted
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, Mask

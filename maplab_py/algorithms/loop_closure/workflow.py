@@ -8,13 +8,12 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure import merging
-from maplab_py.algorithms.loop_closure.closure_table import Closures
+from maplab_py.algorithms.loop_closure.closure_table import Closures, closure_edges
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
-from maplab_py.algorithms.loop_closure.edges import closure_edges
+from maplab_py.algorithms.loop_closure.features import SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
-from maplab_py.algorithms.loop_closure.search_scope import SearchScope
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress

@@ -7,8 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from maplab_py.array_types import I64
 from maplab_py.errors import FlagError
+from maplab_py.geometry import se3, so3
 from maplab_py.options import option
+from maplab_py.report import Report
 from maplab_py.vimap import VIMap
 
 
@@ -49,3 +52,80 @@ def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, i
         place[:, options.dimension] = options.meters * (number + 1)
     T_G_M[rows, 4:] = place
     return vi_map.replace(baseframes=frames.replace(T_G_M=T_G_M)), len(rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class DisturbanceOptions:
+    """Magnitude of the disturbance; maplab's names and defaults."""
+
+    flag_prefix: ClassVar[str] = "disturb_"
+
+    max_translational_disturbance_norm_m: float = option(
+        0.05, help="Largest shift of a vertex.", unit="m"
+    )
+    max_yaw_angle_rad: float = option(0.05, help="Largest turn of a vertex.", unit="rad")
+    translation_random_walk_sigma_m: float = option(
+        0.005, help="Standard deviation by which the shift changes per vertex and axis.", unit="m"
+    )
+    yaw_angle_stddev_rad: float = option(
+        0.0005, help="Standard deviation by which the turn changes per vertex.", unit="rad"
+    )
+    random_generator_seed: int = option(0, help="Seed of the disturbance.")
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for field in dataclasses.fields(self):
+            if getattr(self, field.name) < 0:
+                raise FlagError(f"--disturb_{field.name} must not be negative")
+
+
+@dataclasses.dataclass(frozen=True)
+class DisturbanceReport(Report):
+    """Magnitude of the applied disturbance."""
+
+    vertices: int
+    largest_shift_m: float
+    mean_shift_m: float
+    largest_turn_rad: float
+
+
+def disturb_vertices(
+    vi_map: VIMap, options: DisturbanceOptions, *, missions: I64 | None = None
+) -> tuple[VIMap, DisturbanceReport]:
+    """Disturb the position and yaw of vertices by random walks that start at each first vertex.
+
+    Landmarks move with the vertices that store them; velocities rotate with their vertex.
+
+    Args:
+        vi_map: The map.
+        options: Magnitude of the random walks.
+        missions: Mission rows; None = all.
+    """
+    v = vi_map.vertices
+    T_M_I, v_M = v.T_M_I.copy(), v.v_M.copy()
+    rows = np.arange(len(vi_map.missions)) if missions is None else missions
+    shift, turn = np.zeros((len(v), 3)), np.zeros(len(v))
+    for mission in rows.tolist():
+        rng = np.random.default_rng([options.random_generator_seed, mission])
+        mine = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
+        walk = np.cumsum(rng.normal(size=(len(mine), 4)), axis=0)
+        walk -= walk[:1]
+        moved = walk[:, :3] * options.translation_random_walk_sigma_m
+        length = np.linalg.norm(moved, axis=1, keepdims=True)
+        limit = options.max_translational_disturbance_norm_m
+        shift[mine] = moved * np.minimum(1.0, limit / np.maximum(length, 1e-300))
+        most = options.max_yaw_angle_rad
+        turn[mine] = np.clip(walk[:, 3] * options.yaw_angle_stddev_rad, -most, most)
+    axis = np.zeros((len(v), 3))
+    axis[:, 2] = turn
+    q = so3.exp(axis)
+    T_M_I = se3.make(so3.multiply(q, T_M_I[:, :4]), T_M_I[:, 4:] + shift)
+    result = vi_map.replace(vertices=v.replace(T_M_I=T_M_I, v_M=so3.rotate(q, v_M)))
+    size = np.linalg.norm(shift, axis=1)
+    report = DisturbanceReport(
+        vertices=int(np.isin(v.mission, rows).sum()),
+        largest_shift_m=float(size.max(initial=0.0)),
+        mean_shift_m=float(size.mean()) if len(size) else 0.0,
+        largest_turn_rad=float(np.abs(turn).max(initial=0.0)),
+    )
+    return result, report

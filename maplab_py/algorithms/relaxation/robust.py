@@ -16,11 +16,7 @@ from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
-from maplab_py.estimation.problem.solver import (
-    SLOW_CONVERGENCE,
-    SolverOptions,
-    optimize_states,
-)
+from maplab_py.estimation.problem.solver import SLOW_CONVERGENCE, SolverOptions, optimize_states
 from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import symmetric

@@ -20,7 +20,7 @@ from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
-from maplab_py.algorithms.self_calibration.uncertainty.model import Verdict
+from maplab_py.algorithms.self_calibration.uncertainty import Verdict
 from maplab_py.array_types import I64
 from maplab_py.errors import UserError
 from maplab_py.estimation.terms.cameras import EXTRINSICS

@@ -21,14 +21,13 @@ from maplab_py.algorithms.self_calibration.estimation.solution import (
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import PrunedSegment, PruneReport
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
-from maplab_py.algorithms.self_calibration.uncertainty.cluster_robust import (
+from maplab_py.algorithms.self_calibration.uncertainty import (
+    MAX_PRIOR_SHARE,
+    Uncertainty,
     cluster_robust_covariance,
-)
-from maplab_py.algorithms.self_calibration.uncertainty.information import (
     posterior_covariance,
     spectrum,
 )
-from maplab_py.algorithms.self_calibration.uncertainty.model import MAX_PRIOR_SHARE, Uncertainty
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress

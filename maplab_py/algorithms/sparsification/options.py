@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
+from maplab_py.report import Report
 
 METHODS = ("ilp", "greedy", "most_observed", "random")
 
@@ -62,3 +63,46 @@ class SparsificationOptions:
                 raise FlagError(f"--sparsification_{name} must not be negative")
         if self.landmarks_per_part < 100:
             raise FlagError("--sparsification_landmarks_per_part must be at least 100")
+
+
+@dataclasses.dataclass(frozen=True)
+class CoverageOfMission:
+    """Good landmarks per keyframe of one mission."""
+
+    mission: str  # beginning of its id
+    keyframes: int
+    min_before: int
+    median_before: float
+    min_after: int
+    median_after: float
+    below_wanted: int  # keyframes that could have had the wanted number and see fewer
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyframeCoverage:
+    """Good landmarks that one keyframe sees."""
+
+    vertex: str
+    before: int
+    after: int
+
+
+@dataclasses.dataclass(frozen=True)
+class SparsificationReport(Report):
+    """Remaining landmarks and coverage of the keyframes."""
+
+    landmarks_before: int
+    good_landmarks: int
+    landmarks_after: int
+    observations_before: int
+    observations_after: int
+    keyframes: int
+    wanted_per_keyframe: int
+    below_wanted: int  # keyframes that could have had the wanted number and see fewer
+    method: str
+    parts: int
+    objective: float  # score and coverage value of the selection
+    bound: float  # upper bound on the objective; NaN if unknown
+    missions: tuple[CoverageOfMission, ...]
+    worst_keyframes: tuple[KeyframeCoverage, ...]
+    note: str = ""

@@ -7,15 +7,19 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.sparsification import greedy, integer_programme
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem, level_values
-from maplab_py.algorithms.sparsification.greedy import choose_greedily
-from maplab_py.algorithms.sparsification.integer_programme import Solution, solve_relaxed
-from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.reports import (
+from maplab_py.algorithms.sparsification import selection
+from maplab_py.algorithms.sparsification.options import (
     CoverageOfMission,
     KeyframeCoverage,
+    SparsificationOptions,
     SparsificationReport,
+)
+from maplab_py.algorithms.sparsification.selection import (
+    CoverageProblem,
+    Solution,
+    choose_greedily,
+    level_values,
+    solve_relaxed,
 )
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
@@ -76,7 +80,7 @@ def sparsify(
     if keep >= len(good):
         everything = np.ones(len(good), dtype=np.bool_)
         value = problem.objective(everything)
-        solution, parts = integer_programme.Solution(everything, value, value), 0
+        solution, parts = selection.Solution(everything, value, value), 0
         notes = (*notes, f"all {len(good)} good landmarks stay: no more than {keep}")
     else:
         solution, parts = choose(problem, options, progress)
@@ -149,22 +153,22 @@ def _coverage(
 
 def choose(
     problem: CoverageProblem, options: SparsificationOptions, progress: Progress = SILENT
-) -> tuple[integer_programme.Solution, int]:
+) -> tuple[selection.Solution, int]:
     """Select landmarks with the given method; also return the number of parts."""
     if options.method == "ilp":
         if problem.landmarks <= options.exact_up_to:
-            return integer_programme.solve_exactly(problem), 1
+            return selection.solve_exactly(problem), 1
         if problem.landmarks <= options.landmarks_per_part:
-            return integer_programme.solve_relaxed(problem), 1
+            return selection.solve_relaxed(problem), 1
         return solve_by_parts(problem, options.landmarks_per_part, progress=progress)
     if options.method == "greedy":
-        chosen = greedy.choose_greedily(problem)
+        chosen = selection.choose_greedily(problem)
     elif options.method == "most_observed":
-        chosen = greedy.choose_most_observed(problem)
+        chosen = selection.choose_most_observed(problem)
     else:
-        chosen = greedy.choose_random(problem, options.seed)
+        chosen = selection.choose_random(problem, options.seed)
     value = problem.objective(chosen)
-    return integer_programme.Solution(chosen, value, float("nan")), 1
+    return selection.Solution(chosen, value, float("nan")), 1
 
 
 def _by_mission(vi_map: VIMap, coverage: Coverage) -> tuple[CoverageOfMission, ...]:

@@ -23,7 +23,7 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
-from maplab_py.algorithms.summary.reports import WorkflowReport, WorkflowStep
+from maplab_py.algorithms.summary.options import WorkflowReport, WorkflowStep
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import EstimationError

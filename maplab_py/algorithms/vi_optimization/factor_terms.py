@@ -35,11 +35,7 @@ from maplab_py.estimation.terms.pose import (
 )
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm
-from maplab_py.estimation.terms.wheel import (
-    WHEEL_SCALE,
-    ScaledRelativePoseTerm,
-    wheel_scale_block,
-)
+from maplab_py.estimation.terms.wheel import WHEEL_SCALE, ScaledRelativePoseTerm, wheel_scale_block
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import Progress
 from maplab_py.sensors import Imu

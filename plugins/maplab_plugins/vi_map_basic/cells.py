@@ -9,7 +9,7 @@ from maplab_py.algorithms.cells.options import CellOptions
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.cells.join import JoinReport
+    from maplab_py.algorithms.cells.cells import JoinReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ def split_map(context: CommandContext, *, options: CellOptions = _CELLS) -> Spli
     The cells are named after the map: office_cell_0, office_cell_1, ... The map itself stays and is
     still selected. A vertex in the overlap has the same id in all its cells.
     """
-    from maplab_py.algorithms.cells.split import split_by_position
+    from maplab_py.algorithms.cells.cells import split_by_position
 
     key = context.map_key
     cells = split_by_position(context.vi_map, options, progress=context.progress)
@@ -79,7 +79,7 @@ def join_submaps(
             target, as split_map names them (city_cell_0, city_cell_1, ...).
         keep_submaps: Keep the cells in memory.
     """
-    from maplab_py.algorithms.cells.join import join_cells
+    from maplab_py.algorithms.cells.cells import join_cells
 
     keys = [key.strip() for key in map_keys.split(",") if key.strip()]
     if not map_keys:

@@ -10,7 +10,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.plugin import CommandContext, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.landmarks.explanation import LandmarkExplanation
+    from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
     from maplab_py.algorithms.loop_closure.explanation import (
         ClosureExplanation,
         MissionExplanation,
@@ -27,7 +27,7 @@ _QUALITY = LandmarkQualityOptions()
 
 def subjects(session: Session) -> list[tuple[str, str]]:
     """Return what can be asked about: the missions, then the recorded closures."""
-    from maplab_py.algorithms.loop_closure.closure_ids import described_ids
+    from maplab_py.algorithms.loop_closure.closure_record import described_ids
     from maplab_py.vimap.queries import mission_labels
 
     missions = [(label, "mission") for label in mission_labels(session.vi_map)]
@@ -58,7 +58,7 @@ def why(
         subject: Beginning of the id of a closure or landmark, or a mission by name or id.
         other: Second mission: explain which gates the closures between the two missions fail.
     """
-    from maplab_py.algorithms.landmarks.explanation import explain_landmark
+    from maplab_py.algorithms.landmarks.quality import explain_landmark
     from maplab_py.algorithms.loop_closure import explanation
 
     vi_map = context.vi_map

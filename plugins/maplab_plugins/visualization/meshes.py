@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
-from maplab_py.algorithms.dense.fusion.options import MESH_MIN_WEIGHT
+from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 from maplab_py.viewer.options import MeshColouring, VisualizationOptions
 

@@ -5,9 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.anchoring.alignment import Sightings, fit_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
-from maplab_py.algorithms.anchoring.pairs import USED, align_pairs, consistent, strongest_pairs
+from maplab_py.algorithms.anchoring.pairs import (
+    USED,
+    Sightings,
+    align_pairs,
+    consistent,
+    fit_missions,
+    strongest_pairs,
+)
 from maplab_py.geometry import yaw
 
 OPTIONS = AnchoringOptions()

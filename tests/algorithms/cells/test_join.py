@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.cells.join import join_cells
+from maplab_py.algorithms.cells.cells import join_cells, split_by_position
 from maplab_py.algorithms.cells.options import CellOptions
-from maplab_py.algorithms.cells.split import split_by_position
 from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session

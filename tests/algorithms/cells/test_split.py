@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.cells.cells import split_by_position
 from maplab_py.algorithms.cells.options import CellOptions
-from maplab_py.algorithms.cells.split import split_by_position
 from maplab_py.errors import FlagError, UserError
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.ids import to_hex_list

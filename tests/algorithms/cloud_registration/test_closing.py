@@ -12,7 +12,7 @@ from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
 from maplab_py.algorithms.cloud_registration.workflow import close_cloud_loops
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.algorithms.loop_closure.listing import find_closures, list_closures
-from maplab_py.algorithms.loop_closure.removal import remove_closures
+from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.errors import UserError

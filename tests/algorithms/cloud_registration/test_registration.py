@@ -13,16 +13,10 @@ from maplab_py.algorithms.cloud_registration.registration import (
     prepare_cloud,
     register_clouds,
 )
-from maplab_py.algorithms.cloud_registration.search import compare_clouds, register_globally
+from maplab_py.algorithms.cloud_registration.workflow import compare_clouds, register_globally
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from tests.algorithms.cloud_registration.clouds import (
-    LONG_CORRIDOR,
-    ROOM,
-    Pair,
-    errors,
-    pairs,
-)
+from tests.algorithms.cloud_registration.clouds import LONG_CORRIDOR, ROOM, Pair, errors, pairs
 
 OPTIONS = CloudClosureOptions()
 

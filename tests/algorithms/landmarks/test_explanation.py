@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.explanation import explain_landmark
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.quality import judge
+from maplab_py.algorithms.landmarks.quality import explain_landmark, judge
 from tests.vimap.builders import walk_map
 
 

@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.options import (
-    InvalidObservationOptions,
-    LandmarkQualityOptions,
-)
+from maplab_py.algorithms.landmarks.options import InvalidObservationOptions, LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality, reset_quality
 from maplab_py.algorithms.landmarks.removal import remove_bad, remove_invalid_observations
 from maplab_py.algorithms.landmarks.tracks import init_tracks

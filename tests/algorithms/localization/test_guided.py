@@ -12,9 +12,9 @@ from maplab_py.algorithms.localization.database import (
     database_of_map,
     database_of_summary,
 )
-from maplab_py.algorithms.localization.guided import guided_matches
-from maplab_py.algorithms.localization.guided_kernels import (
+from maplab_py.algorithms.localization.guided import (
     compile_kernels,
+    guided_matches,
     landmarks_in_view,
     least_distances,
     near_pairs,

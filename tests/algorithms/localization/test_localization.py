@@ -15,16 +15,17 @@ from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.localization import (
     Reference,
     align_robustly,
+    csv_lines,
     describe,
+    ground_truth,
     localize_missions,
     pose_errors,
     queries,
     query_vertices,
+    trajectory_of_queries,
 )
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.localization.reference import ground_truth, trajectory_of_queries
-from maplab_py.algorithms.localization.result_file import csv_lines
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.errors import EstimationError, FlagError, UserError

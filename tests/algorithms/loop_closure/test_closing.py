@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import (
-    close_loops,
-    find_loop_closures,
-    insert_edges,
-)
+from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures, insert_edges
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import LandmarkQuality, LoopClosureEdges

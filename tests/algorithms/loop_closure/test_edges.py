@@ -7,8 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.closure_table import Closures
-from maplab_py.algorithms.loop_closure.edges import closure_edges
+from maplab_py.algorithms.loop_closure.closure_table import Closures, closure_edges
 from maplab_py.algorithms.loop_closure.merging import Votes, count_pairs
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import search_loops

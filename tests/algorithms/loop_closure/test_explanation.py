@@ -18,11 +18,7 @@ from maplab_py.algorithms.loop_closure.explanation import (
 )
 from maplab_py.algorithms.loop_closure.listing import accepted_by_mission, list_closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.recorded_gates import (
-    acceptance,
-    recorded_gates,
-    shortfalls,
-)
+from maplab_py.algorithms.loop_closure.recorded_gates import acceptance, recorded_gates, shortfalls
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.errors import UserError

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.covariance import landmark_covariance
+from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.loop_closure import merging
 from maplab_py.algorithms.loop_closure.merging import compare_landmarks
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure.place_index import PlaceIndex
+from maplab_py.algorithms.loop_closure.features import PlaceIndex
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import cut_by_time

@@ -9,10 +9,10 @@ import pytest
 from maplab_py.algorithms.loop_closure.closure_record import FIELD_NUMBER, drop_record, read_record
 from maplab_py.algorithms.loop_closure.listing import find_closures, list_closures, write_closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.removal import remove_closures
+from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
-from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax_over_loops
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.extension_fields import with_extension
 from maplab_py.storage.native import load_map, save_map

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.loop_closure.features import map_features
+from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope, map_features
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.search_scope import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.errors import EstimationError
 from maplab_py.vimap import VIMap

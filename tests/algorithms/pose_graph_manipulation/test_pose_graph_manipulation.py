@@ -3,16 +3,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.pose_graph_manipulation.disturbance import (
-    DisturbanceOptions,
-    disturb_vertices,
-)
 from maplab_py.algorithms.pose_graph_manipulation.edges import (
     EdgeType,
     assign_covariance,
     assign_switch_variables,
 )
-from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
+from maplab_py.algorithms.pose_graph_manipulation.layout import (
+    DisturbanceOptions,
+    LayoutOptions,
+    distribute_missions,
+    disturb_vertices,
+)
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.edits import remove_loop_closure_edges

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.pose_graph_manipulation.stationary import tie_stationary
+from maplab_py.algorithms.pose_graph_manipulation.edges import tie_stationary
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap

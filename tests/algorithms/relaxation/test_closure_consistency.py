@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from maplab_py.algorithms.relaxation.robust import (
-    independent_errors,
-    variance_factor,
-    with_tail,
-)
+from maplab_py.algorithms.relaxation.robust import independent_errors, variance_factor, with_tail
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from maplab_py.algorithms.self_calibration.segments.splitting import (
     extract_submap,
     split_into_segments,
 )
-from maplab_py.algorithms.self_calibration.uncertainty.model import Verdict
+from maplab_py.algorithms.self_calibration.uncertainty import Verdict
 from maplab_py.errors import EstimationError
 from maplab_py.sensors import Distortion
 from maplab_py.vimap.edits import with_new_ids

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.sparsification.coverage import CoverageProblem, level_values
+from maplab_py.algorithms.sparsification.selection import CoverageProblem, level_values
 
 
 def corridor(

@@ -7,14 +7,15 @@ import itertools
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.sparsification.coverage import level_values
-from maplab_py.algorithms.sparsification.greedy import (
+from maplab_py.algorithms.sparsification.selection import (
     choose_greedily,
     choose_most_observed,
     choose_random,
     exchange,
+    level_values,
+    solve_exactly,
+    solve_relaxed,
 )
-from maplab_py.algorithms.sparsification.integer_programme import solve_exactly, solve_relaxed
 from maplab_py.algorithms.sparsification.sparsify import solve_by_parts, split
 from tests.algorithms.sparsification.instances import corridor
 

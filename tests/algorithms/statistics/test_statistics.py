@@ -7,8 +7,7 @@ import pytest
 
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.algorithms.statistics.distributions import map_distributions
-from maplab_py.algorithms.statistics.size import bytes_by_kind, map_size
+from maplab_py.algorithms.statistics.statistics import bytes_by_kind, map_distributions, map_size
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.vimap.builders import SAMPLES, walk_map

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.covariance import landmark_covariance, largest_sigma
+from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance, largest_sigma
 from maplab_py.algorithms.vi_optimization.data_selection import select
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import DataOptions, VIOptimizationOptions

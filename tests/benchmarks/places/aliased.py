@@ -18,8 +18,8 @@ from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax_over_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64

@@ -14,8 +14,8 @@ import numpy as np
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.algorithms.relaxation.loop_relaxation import relax_over_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.relaxation import relax_over_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.simulation.scenario_file import load_scenario

@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
-from maplab_py.algorithms.anchoring.reports import AnchoringReport
-from maplab_py.algorithms.landmarks.reports import LandmarkQualityReport
+from maplab_py.algorithms.anchoring.options import AnchoringReport
+from maplab_py.algorithms.landmarks.options import LandmarkQualityReport
 from maplab_py.algorithms.loop_closure.reports import LoopClosureReport, Verdict
 from maplab_py.console.commands.registry import Plugin
 from maplab_py.console.scripts.runner import Runner

@@ -52,14 +52,14 @@ LOOP_CLOSURE = (
     ),
     Fault(
         "edges_without_smallest_deviation",
-        "maplab_py/algorithms/loop_closure/edges.py",
+        "maplab_py/algorithms/loop_closure/closure_table.py",
         "    covariance += np.diag(_FLOOR_STD**2)\n",
         "",
         _EDGES,
     ),
     Fault(
         "edges_twice",
-        "maplab_py/algorithms/loop_closure/edges.py",
+        "maplab_py/algorithms/loop_closure/closure_table.py",
         "    rows = rows[np.sort(first)]",
         "    rows = rows[: len(first) + len(rows)]",
         _EDGES,
@@ -87,7 +87,7 @@ LOOP_CLOSURE = (
     ),
     Fault(
         "edge_covariance_without_lever_arm",
-        "maplab_py/algorithms/loop_closure/edges.py",
+        "maplab_py/algorithms/loop_closure/closure_table.py",
         "    J[:, :3, 3:] = so3.skew(T_A_B[:, 4:])\n",
         "",
         _EDGES,

@@ -48,7 +48,7 @@ SELF_CALIBRATION = (
     ),
     Fault(
         "gaps_between_missions_are_bridged",
-        "maplab_py/algorithms/self_calibration/estimation/partitions.py",
+        "maplab_py/algorithms/self_calibration/estimation/problem.py",
         "(run[1:] != run[:-1]) & (mission[1:] == mission[:-1])",
         "run[1:] != run[:-1]",
         _SINGLE,
@@ -76,21 +76,21 @@ SELF_CALIBRATION = (
     ),
     Fault(
         "noise_biased_by_the_cut",
-        "maplab_py/algorithms/self_calibration/estimation/outliers.py",
+        "maplab_py/algorithms/self_calibration/estimation/solution.py",
         "freedom[kept] + 2.0",
         "freedom[kept]",
         _OUTLIERS,
     ),
     Fault(
         "remainders_of_tracks_are_trusted",
-        "maplab_py/algorithms/self_calibration/estimation/outliers.py",
+        "maplab_py/algorithms/self_calibration/estimation/solution.py",
         "    whole = alive[left[alive] >= _MIN_SHARE_LEFT * np.diff(data.start)[alive]]\n",
         "    whole = alive\n",
         _OUTLIERS,
     ),
     Fault(
         "short_path_alone_is_lost_scale",
-        "maplab_py/algorithms/self_calibration/estimation/scale.py",
+        "maplab_py/algorithms/self_calibration/calibration.py",
         "    has_shrunk = np.all(after_m < _MIN_RATIO * before_m, axis=0)\n",
         "    has_shrunk = np.any(after_m < _MIN_RATIO * before_m, axis=0)\n",
         _SCALE,

@@ -32,11 +32,7 @@ from maplab_py.algorithms.self_calibration.segments.splitting import (
     extract_submap,
     split_into_segments,
 )
-from maplab_py.algorithms.self_calibration.uncertainty.information import (
-    posterior_covariance,
-    score,
-    spectrum,
-)
+from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance, score, spectrum
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress

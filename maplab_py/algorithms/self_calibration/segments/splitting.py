@@ -10,12 +10,7 @@ from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import no_blocks
 from maplab_py.vimap.selection import keep_rows, renumbering
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    LoopClosureEdges,
-    Resources,
-    TransformationEdges,
-)
+from maplab_py.vimap.tables import AbsolutePoses, LoopClosureEdges, Resources, TransformationEdges
 from maplab_py.vimap.vertex_removal import move_landmarks, stores_for
 
 

@@ -7,9 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.self_calibration.estimation.outliers import reject_tracks_chi2
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
-from maplab_py.algorithms.self_calibration.estimation.solution import solve
+from maplab_py.algorithms.self_calibration.estimation.solution import reject_tracks_chi2, solve
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.self_calibration import calibration as module
-from maplab_py.algorithms.self_calibration.calibration import calibrate
-from maplab_py.algorithms.self_calibration.estimation.partitions import parallax_rad
+from maplab_py.algorithms.self_calibration.calibration import (
+    calibrate,
+    describe_partitions,
+    partitions_without_scale,
+)
 from maplab_py.algorithms.self_calibration.estimation.problem import (
     SegmentProblem,
     build_segment_problem,
-)
-from maplab_py.algorithms.self_calibration.estimation.scale import (
-    describe_partitions,
-    partitions_without_scale,
+    parallax_rad,
 )
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap

@@ -14,8 +14,11 @@ import pytest
 from maplab_py.algorithms.self_calibration import pruning
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.pruning import SegmentTest
-from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
-from maplab_py.algorithms.self_calibration.segments.file import load_database, save_database
+from maplab_py.algorithms.self_calibration.segments.database import (
+    SegmentDatabase,
+    load_database,
+    save_database,
+)
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT

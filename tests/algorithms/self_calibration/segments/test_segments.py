@@ -7,19 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.self_calibration.estimation.partitions import (
+from maplab_py.algorithms.self_calibration.estimation.problem import (
     bias_gaps,
+    build_segment_problem,
     partitions,
     runs_of,
     split_landmarks,
 )
-from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.segments.selection import collect, evaluate
 from maplab_py.algorithms.self_calibration.segments.splitting import (
     extract_submap,
     split_into_segments,
 )
-from maplab_py.algorithms.self_calibration.uncertainty.information import (
+from maplab_py.algorithms.self_calibration.uncertainty import (
     name_directions,
     posterior_covariance,
     score,

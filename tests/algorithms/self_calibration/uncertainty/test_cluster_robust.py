@@ -9,7 +9,7 @@ import pytest
 
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
-from maplab_py.algorithms.self_calibration.uncertainty.model import larger_covariance
+from maplab_py.algorithms.self_calibration.uncertainty import larger_covariance
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map, uncalibrated
 

@@ -12,11 +12,8 @@ from scipy.stats import chi2, kstest
 
 from maplab_py.algorithms.self_calibration import pruning
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameter, Parameters
-from maplab_py.algorithms.self_calibration.estimation.partitions import bias_gaps, runs_of
-from maplab_py.algorithms.self_calibration.pruning import (
-    SegmentTest,
-    squared_distance,
-)
+from maplab_py.algorithms.self_calibration.estimation.problem import bias_gaps, runs_of
+from maplab_py.algorithms.self_calibration.pruning import SegmentTest, squared_distance
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.selection import collect, evaluate
 from maplab_py.errors import EstimationError

@@ -1,0 +1,152 @@
+"""Inputs of fusion: the depth of missions in a common frame, in one grid each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from maplab_py.algorithms.dense.clouds import depth_of_cloud
+from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.options import FusionOptions
+from maplab_py.algorithms.dense.pinhole import ImageMap, Pinhole, undistorted
+from maplab_py.algorithms.dense.resources import CLOUDS, DEPTH_MAPS, FrameResources
+from maplab_py.array_types import F32, F64, I64
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.ply import parse_ply
+from maplab_py.progress import Progress
+from maplab_py.report import counted
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.resource_queries import resources_of
+
+_INPUT_TYPES = (9, 8, 17, 16, 21)
+"""Resource types of depth, the preferred first: optimised, raw, clouds."""
+
+
+def grid_settings(options: FusionOptions) -> GridSettings:
+    """Return the settings of a grid that options describe."""
+    return GridSettings(
+        options.voxel_size_m,
+        options.truncation_m,
+        options.min_ray_length_m,
+        options.max_ray_length_m,
+        options.weight_depth_power,
+        options.max_weight,
+    )
+
+
+def fuse_views(
+    depth: DepthViews,
+    resources: I64,
+    poses: F64,
+    settings: GridSettings,
+    progress: Progress,
+    *,
+    with_free_space: bool = False,
+) -> TsdfGrid:
+    """Fuse depth into a grid.
+
+    Args:
+        depth: Depth of frames.
+        resources: Rows (K,) of the resources.
+        poses: Poses (K, 7) of their cameras in the frame of the grid.
+        settings: Of the grid.
+        progress: Is told about every depth map.
+        with_free_space: The grid also has the space between cameras and surfaces.
+
+    Raises:
+        MapError: A file is missing, damaged, or of another size than the camera's images.
+        EstimationError: There is no depth in the range of the settings.
+        NotEnoughMemory: The grid exceeds the allowed memory.
+    """
+    grid, count = TsdfGrid(settings), len(resources)
+    matrices = se3.to_matrix(poses)
+    for done, row in enumerate(resources.tolist()):
+        progress.step(done, 2 * count, "making the blocks of the grid")
+        grid.allocate(*depth.view(row), matrices[done], with_free_space=with_free_space)
+    if not grid.count:
+        raise EstimationError(
+            f"{counted(count, 'depth map')} without any depth from {settings.min_depth_m:g} m to "
+            f"{settings.max_depth_m:g} m: choose another --dense_tsdf_min_ray_length_m or "
+            "--dense_tsdf_max_ray_length_m"
+        )
+    for done, row in enumerate(resources.tolist()):
+        progress.step(count + done, 2 * count, "fusing depth")
+        grid.integrate(*depth.view(row), matrices[done])
+    return grid
+
+
+def depth_type(vi_map: VIMap, missions: I64, given: int | None) -> int:
+    """Return the resource type of depth to fuse.
+
+    Raises:
+        UserError: There is none, or the given type is no depth.
+    """
+    if given is not None and given not in (*DEPTH_MAPS, *CLOUDS):
+        known = ", ".join(str(kind) for kind in (*DEPTH_MAPS, *CLOUDS))
+        raise UserError(f"--dense_depth_resource_input_type={given}: wants one of {known}")
+    wanted = _INPUT_TYPES if given is None else (given,)
+    for kind in wanted:
+        if resources_of(vi_map, (kind,), missions).any():
+            return kind
+    what = "depth" if given is None else resource_type(given).name
+    raise UserError(f"the missions have no {what}: stereo_dense_reconstruction makes depth maps")
+
+
+def mission_groups(vi_map: VIMap, missions: I64) -> tuple[list[list[int]], list[str]]:
+    """Group missions in a common frame: those with known base frames; each other one is alone."""
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]]
+    together = missions[known].tolist()
+    alone = [[row] for row in missions[~known].tolist()]
+    notes = []
+    if len(missions) > 1 and alone:
+        names = ", ".join(short_id(vi_map, group[0]) for group in alone)
+        notes.append(f"missions with unknown base frames have grids of their own: {names}")
+    return ([together] if together else []) + alone, notes
+
+
+def short_id(vi_map: VIMap, mission: int) -> str:
+    """Return the beginning of a mission's id."""
+    return to_hex(vi_map.missions.id[mission])[:8]
+
+
+class DepthViews:
+    """Depth of frames as depth maps of perspective cameras."""
+
+    def __init__(self, vi_map: VIMap, map_folder: Path, kind: int) -> None:
+        """Serve the depth resources of a type (number)."""
+        self.kind = kind
+        self._resources = FrameResources(vi_map, map_folder)
+        self._cameras: dict[str, tuple[Pinhole, ImageMap]] = {}
+
+    def of_missions(self, missions: list[int]) -> I64:
+        """Return the rows of the depth resources of missions, by mission and time of the frame."""
+        vi_map = self._resources.vi_map
+        rows = np.flatnonzero(resources_of(vi_map, (self.kind,), np.array(missions)))
+        if (vi_map.resources.owner_kind[rows] != ResourceOwner.FRAME).any():
+            raise UserError(
+                f"resources of type {resource_type(self.kind).name} belong to sensors: only depth of "
+                "cameras can be fused; choose another --dense_depth_resource_input_type"
+            )
+        return rows[np.argsort(vi_map.resources.owner[rows], kind="stable")]
+
+    def poses(self, rows: I64, T_M_G: F64) -> F64:
+        """Return the poses T_M_C (N, 7) of depth resources."""
+        owners = self._resources.vi_map.resources.owner[rows].tolist()
+        return se3.compose(T_M_G, np.stack([self._resources.T_G_C(frame) for frame in owners]))
+
+    def view(self, row: int) -> tuple[F32, Pinhole]:
+        """Return a depth map (H, W) [m] of a perspective camera, and the camera."""
+        camera = self._resources.camera(int(self._resources.vi_map.resources.owner[row]))
+        if camera.id not in self._cameras:
+            self._cameras[camera.id] = undistorted(camera)
+        pinhole, image_map = self._cameras[camera.id]
+        if self.kind in DEPTH_MAPS:
+            depth = self._resources.depth(row)
+        else:
+            name = f"cloud {to_hex(self._resources.vi_map.resources.id[row])}"
+            depth = depth_of_cloud(camera, parse_ply(self._resources.content(row), name).p)
+        return image_map.depth(depth), pinhole

@@ -1,1 +1,0 @@
-"""Exact distances of points from triangle meshes, and distance fields of grids."""

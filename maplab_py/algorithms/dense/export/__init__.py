@@ -1,1 +1,0 @@
-"""Export of images, poses and landmarks for programs of multi-view stereo."""

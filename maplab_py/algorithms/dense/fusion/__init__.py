@@ -1,1 +1,0 @@
-"""Fusion of depth maps into truncated signed distances, and the surface between them."""

@@ -1,0 +1,477 @@
+"""Depth of the stereo images along the vertices of missions, as new resources of the map."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.algorithms.dense.clouds import CloudMaker
+from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions, check_matcher
+from maplab_py.algorithms.dense.rectification import StereoPair, pinhole_pose, stereo_pairs
+from maplab_py.algorithms.dense.resources import (
+    COLOUR_CLOUDS,
+    RAW_DEPTH_MAPS,
+    FrameImages,
+    FrameResources,
+    chosen_missions,
+    mission_rig,
+)
+from maplab_py.array_types import F32, F64, I64, U8, Mask
+from maplab_py.compilation import compiled, prange
+from maplab_py.errors import UserError
+from maplab_py.interop.ply import encode_ply
+from maplab_py.interop.resources.depth_maps import encoded_depth
+from maplab_py.progress import SILENT, Progress
+from maplab_py.report import Report
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resource_types import resource_type
+from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.resource_queries import resources_of, without_resources
+
+OUTPUT_TYPES = (RAW_DEPTH_MAPS, COLOUR_CLOUDS)
+_NEIGHBOURS_EACH_WAY = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class PairReport:
+    """Depth of one stereo pair of a mission."""
+
+    mission: str
+    left_camera: int
+    right_camera: int
+    vertices: int
+    without_images: int
+    matched_share: float  # of the rectified pixels, before neighbouring vertices are asked
+    kept_share: float  # after that, without edges
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoReport(Report):
+    """Depth of stereo images; the files are written when the map is saved."""
+
+    resource_type: str
+    resources: int
+    pairs: tuple[PairReport, ...]
+    notes: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoSettings:
+    """All options of the reconstruction."""
+
+    stereo: StereoOptions = dataclasses.field(default_factory=StereoOptions)
+    sgbm: SgbmOptions = dataclasses.field(default_factory=SgbmOptions)
+    bm: BmOptions = dataclasses.field(default_factory=BmOptions)
+
+
+def reconstruct_stereo(
+    vi_map: VIMap,
+    map_folder: Path,
+    missions: I64 | None = None,
+    settings: StereoSettings | None = None,
+    *,
+    output_type: int = RAW_DEPTH_MAPS,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, StereoReport]:
+    """Compute depth for every vertex that has images of a stereo pair.
+
+    Args:
+        vi_map: Map.
+        map_folder: Its folder.
+        missions: Rows of missions; None = all.
+        settings: Options.
+        output_type: Number of the resource type of the results, one of OUTPUT_TYPES.
+        overwrite: Replace resources of this type that the frames have.
+        progress: Is told about every vertex.
+
+    Raises:
+        UserError: There are no images or no stereo pair, or a frame has depth already.
+        MapError: An image is missing, damaged, or of another size than the camera's images.
+    """
+    settings = settings or StereoSettings()
+    if output_type not in OUTPUT_TYPES:
+        names = " or ".join(str(kind) for kind in OUTPUT_TYPES)
+        raise UserError(f"--dense_depth_resource_output_type={output_type}: wants {names}")
+    rows = chosen_missions(vi_map, missions)
+    writer = _Writer(FrameResources(vi_map, map_folder), output_type)
+    images = FrameImages(vi_map, map_folder)
+    reports, notes = [], list[str]()
+    for mission in rows:
+        for pair in _pairs(vi_map, mission, settings.stereo, notes):
+            sequence = _Sequence(vi_map, mission, pair, images, settings.stereo)
+            if not len(sequence.vertices):
+                continue
+            writer.check_free(sequence.left_frames, overwrite=overwrite)
+            reports.append(_reconstruct(sequence, writer, settings, progress))
+    if not reports:
+        reason = notes[0] if notes else "import_images attaches some"
+        raise UserError(f"no vertex has images of a stereo pair: {reason}")
+    name = resource_type(output_type).name
+    report = StereoReport(name, len(writer.owners), tuple(reports), tuple(notes))
+    return writer.attached(overwrite=overwrite), report
+
+
+def _pairs(
+    vi_map: VIMap, mission: int, options: StereoOptions, notes: list[str]
+) -> list[StereoPair]:
+    rig = mission_rig(vi_map, mission)
+    prefix = f"mission {to_hex(vi_map.missions.id[mission])[:8]}: "
+    if rig is None or len(rig.cameras) < 2:
+        notes.append(f"{prefix}it has {0 if rig is None else 1} camera, stereo needs two")
+        return []
+    pairs, reasons = stereo_pairs(
+        rig,
+        min_baseline_m=options.min_baseline,
+        max_angle_rad=options.max_angle_between_opt_axes,
+        scale=options.downscaling_factor,
+    )
+    notes += [prefix + reason for reason in reasons]
+    return pairs
+
+
+class _Sequence:
+    """The vertices of a mission that have images of both cameras of a pair."""
+
+    def __init__(
+        self,
+        vi_map: VIMap,
+        mission: int,
+        pair: StereoPair,
+        images: FrameImages,
+        options: StereoOptions,
+    ) -> None:
+        self.vi_map, self.mission, self.pair, self.images = vi_map, mission, pair, images
+        first, end = vi_map.vertex_start[mission : mission + 2].tolist()
+        part = options.debug_reconstruction_start_fraction_of_trajectory
+        start = first + math.floor(part * (end - first))
+        part = options.debug_reconstruction_end_fraction_of_trajectory
+        stop = first + math.ceil(part * (end - first))
+        chosen, frames = [], []
+        for vertex in range(start, stop):
+            rows = range(*vi_map.frame_start[vertex : vertex + 2].tolist())
+            of_camera = {int(vi_map.frames.camera_index[row]): row for row in rows}
+            both = [of_camera.get(pair.left, -1), of_camera.get(pair.right, -1)]
+            if all(frame in images for frame in both):
+                chosen.append(vertex)
+                frames.append(both)
+        self.without_images = stop - start - len(chosen)
+        self.vertices = np.array(chosen, dtype=np.int64)
+        self.frames = np.array(frames, dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def left_frames(self) -> I64:
+        return self.frames[:, 0]
+
+    def neighbour_offsets(self, interval_s: float) -> list[int]:
+        """Return the steps to the neighbours that are asked, nearest first."""
+        times_ns = self.vi_map.vertices.timestamp_ns[self.vertices]
+        typical_s = 1e-9 * float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1.0
+        step = max(1, round(interval_s / max(typical_s, 1e-6)))
+        return [sign * step * k for k in range(1, 1 + _NEIGHBOURS_EACH_WAY) for sign in (-1, 1)]
+
+
+def _reconstruct(
+    sequence: _Sequence, writer: _Writer, settings: StereoSettings, progress: Progress
+) -> PairReport:
+    vi_map, pair = sequence.vi_map, sequence.pair
+    what = f"depth of cameras {pair.left} and {pair.right}"
+    matched, kept = 0.0, 0.0
+    count = len(sequence.vertices)
+    depths = _raw_depths(sequence, writer.resources, settings)
+    if settings.stereo.multi_view:
+        poses = np.stack(
+            [pinhole_pose(pair, writer.resources.T_G_C(f)) for f in sequence.left_frames.tolist()]
+        )
+        offsets = sequence.neighbour_offsets(settings.stereo.multi_view_interval_s)
+        checked = _confirm(depths, poses, offsets, pair, settings.stereo)
+    else:
+        checked = ((depth, depth) for depth in depths)
+    for index, (raw, confirmed) in enumerate(checked):
+        progress.step(index, count, what)
+        depth = without_edges(confirmed, settings.stereo.edge_margin)
+        matched += float(np.mean(raw > 0.0)) / count
+        kept += float(np.mean(depth > 0.0)) / count
+        frame = int(sequence.left_frames[index])
+        writer.add(frame, pair.depth_of_left(depth), sequence.images)
+    mission_id = to_hex(vi_map.missions.id[sequence.mission])
+    return PairReport(
+        mission_id, pair.left, pair.right, count, sequence.without_images, matched, kept
+    )
+
+
+def _raw_depths(
+    sequence: _Sequence, resources: FrameResources, settings: StereoSettings
+) -> Iterator[F32]:
+    """Yield the rectified depths (H, W) of the vertices in order."""
+    matcher = DepthMatcher(sequence.pair, settings.stereo, settings.sgbm, settings.bm)
+    for frames in sequence.frames.tolist():
+        left, right = (sequence.images.grey(f, resources.camera(f)) for f in frames)
+        yield matcher.depth(left, right)
+
+
+def _confirm(
+    depths: Iterator[F32],
+    T_G_P: F64,
+    offsets: list[int],
+    pair: StereoPair,
+    options: StereoOptions,
+) -> Iterator[tuple[F32, F32]]:
+    """Yield each depth map as it is, and with the pixels only that enough neighbours confirm.
+
+    Where there are fewer neighbours than must agree, all of them must.
+
+    Args:
+        depths: Rectified depths (H, W) [m] of consecutive vertices.
+        T_G_P: Poses (N, 4, 4) of the rectified cameras.
+        offsets: Steps to the neighbours.
+        pair: The stereo pair.
+        options: How many must agree, and how well.
+    """
+    pinhole = pair.pinhole
+    camera = np.array([pinhole.focal_px, *pinhole.centre_px, pinhole.focal_px * pair.baseline_m])
+    reach, count = max(offsets), len(T_G_P)
+    window: OrderedDict[int, F32] = OrderedDict()
+    for index in range(count):
+        while len(window) == 0 or (next(reversed(window)) < min(index + reach, count - 1)):
+            window[next(reversed(window)) + 1 if window else 0] = next(depths)
+        depth = window[index]
+        votes = np.zeros(depth.shape, dtype=np.uint8)
+        neighbours = [index + offset for offset in offsets if 0 <= index + offset < count]
+        for other in neighbours:
+            T_other_P = np.linalg.inv(T_G_P[other]) @ T_G_P[index]
+            difference_px = options.multi_view_max_difference
+            count_agreeing(depth, window[other], camera, T_other_P, difference_px, votes)
+        needed = min(options.multi_view_min_agreeing, len(neighbours))
+        yield depth, np.where(votes >= needed, depth, np.float32(0.0))
+        if index >= reach:
+            del window[index - reach]
+
+
+class _Writer:
+    """Collects the results as new resources."""
+
+    def __init__(self, resources: FrameResources, output_type: int) -> None:
+        self.resources = resources
+        self.owners: list[int] = []
+        self._type = output_type
+        self._new = NewResources(seed=b"stereo")
+        self._makers: dict[str, CloudMaker] = {}
+
+    def check_free(self, frames: I64, *, overwrite: bool) -> None:
+        """Refuse frames that have a resource of the type.
+
+        Raises:
+            UserError: One has, and `overwrite` is not set.
+        """
+        occupied = int(np.count_nonzero(self._former(frames)))
+        if occupied and not overwrite:
+            name = resource_type(self._type).name
+            raise UserError(
+                f"{occupied} frames have {name} already: give --overwrite to replace them"
+            )
+
+    def add(self, frame: int, depth: F32, images: FrameImages) -> None:
+        """Add the depth map (H, W) [m] of a frame's distorted image."""
+        if self._type == RAW_DEPTH_MAPS:
+            self._new.add(self._type, encoded_depth(depth))
+        else:
+            camera = self.resources.camera(frame)
+            maker = self._makers.setdefault(camera.id, CloudMaker(camera))
+            cloud = maker.cloud(depth, images.image(frame))
+            self._new.add(self._type, b"".join(encode_ply(cloud)))
+        self.owners.append(frame)
+
+    def attached(self, *, overwrite: bool) -> VIMap:
+        """Return the map with the new resources, on request in place of former ones."""
+        vi_map = self.resources.vi_map
+        if overwrite:
+            vi_map = without_resources(vi_map, self._former(np.array(self.owners)))
+        return self._new.attached(vi_map, np.arange(len(self._new)), self.owners)
+
+    def _former(self, frames: I64) -> Mask:
+        vi_map = self.resources.vi_map
+        owned = vi_map.resources.owner_kind == ResourceOwner.FRAME
+        of_type = resources_of(vi_map, (self._type,))
+        return np.asarray(of_type & owned & np.isin(vi_map.resources.owner, frames))
+
+
+_SUBPIXELS = 16.0
+"""OpenCV's disparities are multiples of a sixteenth of a pixel."""
+_MIN_DISPARITY_PX = 0.5
+_NO_CHECK = -1
+_SURFACE_SIGMA_PX, _APART_PX = 1.0, -100.0
+"""Disparities that differ by much more are of other surfaces; a value that differs from all."""
+_STEP_M, _STEP_SHARE = 0.05, 0.1
+"""A difference of depths in a window that is a step: this much, and this part of the depth."""
+
+
+class DepthMatcher:
+    """Computes the depth of rectified images of one pair of cameras."""
+
+    def __init__(
+        self, pair: StereoPair, stereo: StereoOptions, sgbm: SgbmOptions, bm: BmOptions
+    ) -> None:
+        """Prepare the matcher.
+
+        Raises:
+            UserError: An option is out of range.
+        """
+        self.pair = pair
+        self._median_window = stereo.median_window
+        self._bilateral_window = stereo.bilateral_window
+        matcher: SgbmOptions | BmOptions = sgbm if stereo.use_sgbm else bm
+        if stereo.adapt_params_to_image_size:
+            # maplab: an eighth of the width, rounded to a multiple of 16
+            count = max(16, (pair.pinhole.width_px // 8 + 15) & -16)
+            matcher = dataclasses.replace(matcher, num_disparities=count)
+        if not stereo.depth_check:
+            matcher = dataclasses.replace(matcher, disp12_max_diff=_NO_CHECK)
+        try:
+            check_matcher(matcher)
+        except ValueError as error:
+            raise UserError(str(error)) from None
+        self._padding = matcher.min_disparity + matcher.num_disparities
+        self._matcher = _opencv_matcher(matcher)
+
+    def depth(self, left: U8, right: U8) -> F32:
+        """Return the depths (H, W) [m] of the rectified left image; 0 = unknown.
+
+        Args:
+            left: Recorded image (H, W) of the left camera.
+            right: Recorded image of the right camera.
+        """
+        import cv2
+
+        pair = self.pair
+        images = [pair.to_left.image(left), pair.to_right.image(right)]
+        # OpenCV leaves out as many columns on the left as there are disparities
+        padded = [
+            cv2.copyMakeBorder(image, 0, 0, self._padding, 0, cv2.BORDER_REPLICATE)
+            for image in images
+        ]
+        disparity = self._matcher.compute(*padded)[:, self._padding :].astype(np.float32)
+        disparity /= np.float32(_SUBPIXELS)
+        disparity = self._smooth(disparity)
+        columns = np.arange(disparity.shape[1], dtype=np.float32)
+        known = (disparity > _MIN_DISPARITY_PX) & (columns >= disparity) & pair.valid
+        focal_baseline = np.float32(pair.pinhole.focal_px * pair.baseline_m)
+        depth = focal_baseline / np.maximum(disparity, np.float32(_MIN_DISPARITY_PX))
+        return np.where(known, depth, np.float32(0.0))
+
+    def _smooth(self, disparity: F32) -> F32:
+        """Filter the disparities (H, W) on surfaces; those that are not known stay below zero."""
+        import cv2
+
+        known = disparity > 0.0
+        if self._median_window:
+            median = cv2.medianBlur(np.maximum(disparity, 0.0), self._median_window)
+            disparity = np.where(known, median, disparity)
+        if self._bilateral_window:
+            apart = np.where(known, disparity, np.float32(_APART_PX))
+            smooth = cv2.bilateralFilter(
+                apart, self._bilateral_window, _SURFACE_SIGMA_PX, 0.45 * self._bilateral_window
+            )
+            disparity = np.where(known, smooth, disparity)
+        return np.asarray(disparity, dtype=np.float32)
+
+
+def without_edges(depth: F32, margin_px: int) -> F32:
+    """Remove the depths (H, W) [m] within some pixels of a step: matched blocks lie on both sides."""
+    import cv2
+
+    if margin_px == 0:
+        return depth
+    window = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
+    farthest = cv2.dilate(depth, window)
+    nearest = cv2.erode(np.where(depth > 0.0, depth, np.float32(np.inf)), window)
+    is_step = farthest - nearest > _STEP_M + _STEP_SHARE * depth
+    return np.where(is_step, np.float32(0.0), depth)
+
+
+def _opencv_matcher(options: SgbmOptions | BmOptions) -> Any:
+    import cv2
+
+    if isinstance(options, SgbmOptions):
+        return cv2.StereoSGBM.create(
+            options.min_disparity,
+            options.num_disparities,
+            options.sad_window_size,
+            options.p1,
+            options.p2,
+            options.disp12_max_diff,
+            options.pre_filter_cap,
+            options.uniqueness_ratio,
+            options.speckle_window_size,
+            options.speckle_range,
+            options.mode,
+        )
+    matcher = cv2.StereoBM.create(options.num_disparities, options.sad_window_size)
+    matcher.setMinDisparity(options.min_disparity)
+    matcher.setDisp12MaxDiff(options.disp12_max_diff)
+    matcher.setPreFilterCap(options.pre_filter_cap)
+    matcher.setPreFilterSize(options.pre_filter_size)
+    is_sobel = options.prefilter_type == "xsobel"
+    matcher.setPreFilterType(
+        cv2.StereoBM_PREFILTER_XSOBEL if is_sobel else cv2.StereoBM_PREFILTER_NORMALIZED_RESPONSE
+    )
+    matcher.setTextureThreshold(options.texture_threshold)
+    matcher.setUniquenessRatio(options.uniqueness_ratio)
+    matcher.setSpeckleWindowSize(options.speckle_window_size)
+    matcher.setSpeckleRange(options.speckle_range)
+    return matcher
+
+
+_NEAREST_M = 0.1
+"""Points nearer to the other camera are not compared [m]."""
+
+
+@compiled(parallel=True)
+def count_agreeing(
+    depth: F32, other: F32, camera: F64, T_other_P: F64, max_difference_px: float, votes: U8
+) -> None:
+    """Add a vote to each pixel whose point another view sees at the same disparity.
+
+    Args:
+        depth: Depths (H, W) [m], 0 = unknown.
+        other: Depths (H, W) of the other view, of the same perspective camera.
+        camera: Focal length [px], centre u, centre v [px], focal length times baseline [px m].
+        T_other_P: Transformation (4, 4) of points to the other view.
+        max_difference_px: Largest difference of disparities that counts as the same.
+        votes: Counts (H, W) to add to.
+    """
+    height, width = depth.shape
+    focal, centre_u, centre_v, focal_baseline = camera
+    for v in prange(height):
+        y = (v - centre_v) / focal
+        for u in range(width):
+            z = np.float64(depth[v, u])
+            if z <= 0.0:
+                continue
+            x = (u - centre_u) / focal
+            p0 = (T_other_P[0, 0] * x + T_other_P[0, 1] * y + T_other_P[0, 2]) * z + T_other_P[0, 3]
+            p1 = (T_other_P[1, 0] * x + T_other_P[1, 1] * y + T_other_P[1, 2]) * z + T_other_P[1, 3]
+            p2 = (T_other_P[2, 0] * x + T_other_P[2, 1] * y + T_other_P[2, 2]) * z + T_other_P[2, 3]
+            if p2 < _NEAREST_M:
+                continue
+            column = np.floor(focal * p0 / p2 + centre_u + 0.5)
+            row = np.floor(focal * p1 / p2 + centre_v + 0.5)
+            if column < 0 or row < 0 or column >= width or row >= height:
+                continue
+            seen = np.float64(other[int(row), int(column)])
+            if seen > 0.0 and abs(focal_baseline / seen - focal_baseline / p2) < max_difference_px:
+                votes[v, u] += 1
+
+
+def compile_kernels() -> None:
+    """Compile the kernel of this module."""
+    depth = np.ones((2, 2), dtype=np.float32)
+    votes = np.zeros((2, 2), dtype=np.uint8)
+    count_agreeing(depth, depth, np.ones(4), np.eye(4), 1.0, votes)

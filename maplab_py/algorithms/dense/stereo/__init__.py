@@ -1,1 +1,0 @@
-"""Depth of the stereo pairs of a rig, and its check by neighbouring vertices."""

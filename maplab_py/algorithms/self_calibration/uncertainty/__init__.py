@@ -1,1 +1,0 @@
-"""Uncertainty of a calibration, and the contribution of a segment to it."""

@@ -1,0 +1,167 @@
+"""Depth of rendered stereo images against the truth; bad input changes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.dense.clouds import convert_depth_maps, depth_of_cloud
+from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions
+from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
+from maplab_py.algorithms.dense.resources import FrameResources
+from maplab_py.array_types import F64
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.ply import parse_ply
+from maplab_py.interop.resources.images import ImageImportOptions, import_images
+from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources import ResourceStore
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.resource_queries import resources_of, without_resources
+from tests.support.stereo_room import StereoRoom
+
+# the regions that count as speckles are areas in pixels: a quarter of the default's
+SGBM = SgbmOptions(speckle_window_size=125)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> StereoRoom:
+    return StereoRoom.simulated(tmp_path_factory.mktemp("stereo"))
+
+
+@pytest.fixture(scope="module")
+def with_images(room: StereoRoom) -> VIMap:
+    return import_images(room.true_map, 0, room.recording)[0]
+
+
+def settings(**changes: Any) -> StereoSettings:
+    return StereoSettings(StereoOptions(**changes), SGBM)
+
+
+def errors(room: StereoRoom, vi_map: VIMap) -> tuple[F64, F64]:
+    """Return the relative errors and the errors of disparity [px] of all pixels with depth."""
+    resources = FrameResources(vi_map, Path())
+    relative, disparity = [], []
+    for row in np.flatnonzero(resources_of(vi_map, (8,))).tolist():
+        depth = resources.depth(row)
+        stamp = vi_map.frames.timestamp_ns[vi_map.resources.owner[row]]
+        truth = cv2.imread(str(room.depth() / f"{stamp}.png"), cv2.IMREAD_UNCHANGED) * 1e-3
+        known = (depth > 0) & (truth > 0)
+        relative.append(np.abs(depth / np.maximum(truth, 1e-3) - 1.0)[known])
+        focal_baseline = 168.0 * 0.11
+        difference = focal_baseline / depth[known] - focal_baseline / truth[known]
+        disparity.append(np.abs(difference))
+    return np.concatenate(relative), np.concatenate(disparity)
+
+
+def test_depth_is_right_and_neighbours_remove_errors(room: StereoRoom, with_images: VIMap) -> None:
+    raw, raw_report = reconstruct_stereo(with_images, Path(), None, settings(multi_view=False))
+    checked, report = reconstruct_stereo(with_images, Path(), None, settings())
+    assert report.resources == len(with_images.vertices)
+    assert raw_report.pairs[0].matched_share > 0.9
+    assert 0.6 < report.pairs[0].kept_share < report.pairs[0].matched_share
+    raw_relative, raw_disparity = errors(room, raw)
+    relative, disparity = errors(room, checked)
+    assert np.median(raw_relative) < 0.03
+    assert np.median(relative) < 0.03
+    assert np.mean(raw_disparity > 3.0) < 0.02
+    assert np.mean(disparity > 3.0) < 0.5 * np.mean(raw_disparity > 3.0)
+
+
+def test_threads_do_not_matter(with_images: VIMap) -> None:
+    results = []
+    before = numba.get_num_threads()
+    for threads in (1, before):
+        numba.set_num_threads(threads)
+        results.append(reconstruct_stereo(with_images, Path(), None, part_settings())[0])
+    numba.set_num_threads(before)
+    new = [resources_of(vi_map, (8,)) for vi_map in results]
+    ids = [vi_map.resources.id[rows] for vi_map, rows in zip(results, new, strict=True)]
+    np.testing.assert_array_equal(*ids)
+
+
+def part_settings(**changes: Any) -> StereoSettings:
+    """Return settings for the first vertices only."""
+    return settings(debug_reconstruction_end_fraction_of_trajectory=0.25, **changes)
+
+
+def test_block_matching_works_and_the_check_removes_pixels(with_images: VIMap) -> None:
+    shares = []
+    for check in (False, True):
+        options = part_settings(use_sgbm=False, depth_check=check, multi_view=False).stereo
+        bm = BmOptions(speckle_window_size=125)
+        report = reconstruct_stereo(with_images, Path(), None, StereoSettings(options, SGBM, bm))[1]
+        shares.append(report.pairs[0].matched_share)
+    assert 0.2 < shares[1] < shares[0]
+
+
+def test_depth_exists_again_only_on_request(with_images: VIMap) -> None:
+    once, _ = reconstruct_stereo(with_images, Path(), None, part_settings())
+    with pytest.raises(UserError, match="--overwrite"):
+        reconstruct_stereo(once, Path(), None, part_settings())
+    again, _ = reconstruct_stereo(once, Path(), None, part_settings(), overwrite=True)
+    np.testing.assert_array_equal(again.resources.id, once.resources.id)
+
+
+def test_clouds_are_the_depth_maps_in_space(with_images: VIMap) -> None:
+    options = part_settings(multi_view=False)
+    depth_map, _ = reconstruct_stereo(with_images, Path(), None, options)
+    clouds, report = reconstruct_stereo(with_images, Path(), None, options, output_type=17)
+    assert report.resource_type == "color_point_cloud"
+    converted, counts = convert_depth_maps(depth_map, Path())
+    assert counts.clouds_with_colours == counts.depth_maps == report.resources
+    row = int(np.flatnonzero(resources_of(depth_map, (8,)))[0])
+    resources = FrameResources(depth_map, Path())
+    depth = resources.depth(row)
+    for vi_map, tolerance in ((clouds, 6e-4), (converted, 1e-5)):
+        cloud_row = int(np.flatnonzero(resources_of(vi_map, (17,)))[0])
+        cloud = parse_ply(ResourceStore(vi_map, Path()).load(cloud_row), "cloud")
+        camera = resources.camera(int(depth_map.resources.owner[row]))
+        again = depth_of_cloud(camera, cloud.p)
+        np.testing.assert_allclose(again, depth, atol=tolerance)
+        assert cloud.colours is not None
+    once_more, counts = convert_depth_maps(converted, Path())
+    assert once_more is converted
+    assert counts.frames_with_cloud == counts.depth_maps
+
+
+def test_bad_input_is_refused_in_one_line(room: StereoRoom, with_images: VIMap) -> None:
+    with pytest.raises(UserError, match="import_images"):
+        reconstruct_stereo(room.true_map, Path())
+    with pytest.raises(UserError, match="wants 8 or 17"):
+        reconstruct_stereo(with_images, Path(), output_type=9)
+    with pytest.raises(UserError, match="no depth maps"):
+        convert_depth_maps(with_images, Path())
+    far = StereoSettings(StereoOptions(min_baseline=1.0), SGBM)
+    with pytest.raises(UserError, match="--dense_stereo_min_baseline"):
+        reconstruct_stereo(with_images, Path(), None, far)
+    for sgbm, message in (
+        (SgbmOptions(num_disparities=100), "multiple of 16"),
+        (SgbmOptions(sad_window_size=4), "must be odd"),
+        (SgbmOptions(p1=300), "p1 < --dense_stereo_sgbm_p2"),
+    ):
+        options = StereoOptions(adapt_params_to_image_size=False)
+        with pytest.raises(UserError, match=message):
+            reconstruct_stereo(with_images, Path(), None, StereoSettings(options, sgbm))
+
+
+def test_images_of_another_size_are_refused(room: StereoRoom) -> None:
+    vi_map = room.true_map
+    new = NewResources()
+    rows = [new.add_image(np.zeros((24, 32), dtype=np.uint8)) for _ in range(2)]
+    with pytest.raises(MapError, match=r"32 x 24 pixels, the images of its camera 376 x 240"):
+        reconstruct_stereo(new.attached(vi_map, rows, [0, 1]), Path())
+
+
+def test_images_of_one_camera_are_no_stereo(room: StereoRoom, with_images: VIMap) -> None:
+    right = with_images.frames.camera_index[with_images.resources.owner] == 1
+    with pytest.raises(UserError, match="no vertex has images of a stereo pair"):
+        reconstruct_stereo(without_resources(with_images, right), Path())
+    some, report = import_images(room.true_map, 0, room.recording, ImageImportOptions(every_nth=4))
+    _, stereo = reconstruct_stereo(some, Path(), None, settings())
+    assert stereo.pairs[0].vertices == report.attached // 2
+    assert stereo.pairs[0].without_images == len(some.vertices) - report.attached // 2
