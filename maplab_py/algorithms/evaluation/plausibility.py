@@ -163,9 +163,10 @@ def _lag(a: F64, b: F64, step_ns: int) -> int | None:
     if not enough.any():
         return None
     norm = np.sqrt(np.where(enough, energy_a * energy_b, 1.0))
-    score = np.where(enough, correlate(b, a, method="fft") / norm, -np.inf)
     # of equal scores the one with more in common
-    return int(np.argmax(score * np.sqrt(np.clip(overlap, 0.0, None)))) - (len(a) - 1)
+    weight = np.sqrt(np.where(enough, overlap, 0.0)) / norm
+    score = np.where(enough, correlate(b, a, method="fft") * weight, -np.inf)
+    return int(np.argmax(score)) - (len(a) - 1)
 
 
 def _minimum(error_at: Callable[[int], float], low: int, high: int) -> tuple[float, int]:

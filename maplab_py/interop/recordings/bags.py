@@ -30,7 +30,9 @@ from maplab_py.interop.recordings.bag_files import (
 from maplab_py.interop.recordings.clocks import (
     ClockFilter,
     ClockRestart,
+    check_common_time,
     check_dropped,
+    common_part_count,
     dropped_note,
     first_stamp_ns,
     follows,
@@ -73,6 +75,16 @@ class _Stream:
     first_ns: int = 0  # time of the first message
     delay_ns: int = 0  # from its time to its arrival
     arrivals_ns: tuple[int, int] | None = None  # of the part that is read
+
+    def of_run(self, run: _Run) -> _Stream:
+        """Return the stream that ends with a run of its clock."""
+        return dataclasses.replace(
+            self,
+            count=run.count,
+            first_ns=run.first_ns,
+            delay_ns=run.first_arrival_ns - run.first_ns,
+            arrivals_ns=(run.first_arrival_ns, run.last_arrival_ns),
+        )
 
 
 class BagRecording:
@@ -124,6 +136,7 @@ class BagRecording:
             raise UserError(f"--imu_topic={','.join(imu_topics)}: the calibration has no IMU")
         with opened_bag(self._path) as reader:
             self.kind = f"ROS {2 if reader.is2 else 1} bag"
+            self._arrivals_ns = reader.start_time, reader.end_time
             self._streams = [self._examined(reader, stream) for stream in streams]
         if len({stream.topic for stream in self._streams}) < len(self._streams):
             raise UserError(f"{path}: two sensors have the same topic: give --camera_topics")
@@ -363,35 +376,56 @@ class BagRecording:
             MapError: The sensors have different numbers of parts.
         """
         runs = self._runs()
-        counts = [len(of_stream) for of_stream in runs]
-        if part > max(counts):
+        counts = {s.camera: len(run) for s, run in zip(self._streams, runs, strict=True)}
+        count = max(counts.values())
+        if part > count:
             raise UserError(
-                f"{self.name}: --recording_part={part}: the recording has {max(counts)} parts"
+                f"{self.name}: --recording_part={part}: the recording has {count} parts"
             )
-        if len(set(counts)) > 1:
-            listed = ", ".join(
-                f"{s.topic} {count}" for s, count in zip(self._streams, counts, strict=True)
-            )
-            raise MapError(
-                f"{self.name}: the clocks of the sensors do not start again together (parts: {listed}): "
-                "record each run into a bag of its own"
-            )
-        self._streams = [
-            dataclasses.replace(
-                stream,
-                count=of_stream[part - 1].count,
-                first_ns=of_stream[part - 1].first_ns,
-                delay_ns=of_stream[part - 1].first_arrival_ns - of_stream[part - 1].first_ns,
-                arrivals_ns=(
-                    of_stream[part - 1].first_arrival_ns,
-                    of_stream[part - 1].last_arrival_ns,
-                ),
-            )
-            for stream, of_stream in zip(self._streams, runs, strict=True)
-        ]
+        sensors = [counts[s.camera] for s in self._streams if s.camera < 0]
+        cameras = [counts[s.camera] for s in self._streams if s.camera >= 0]
+        common_part_count(self.name, max(sensors, default=None), cameras)
+        divided = [of_stream for of_stream in runs if len(of_stream) == count]
+        if part > 1:
+            before_ns = max(of_stream[part - 2].last_arrival_ns for of_stream in divided)
+            self._arrivals_ns = before_ns + 1, self._arrivals_ns[1]
+        if part < count:
+            after_ns = min(of_stream[part].first_arrival_ns for of_stream in divided)
+            self._arrivals_ns = self._arrivals_ns[0], after_ns - 1
+        with opened_bag(self._path) as reader:
+            self._streams = [
+                stream.of_run(of_stream[part - 1])
+                if len(of_stream) == count
+                else self._examined(reader, stream, self._arrivals_ns)
+                for stream, of_stream in zip(self._streams, runs, strict=True)
+            ]
 
-    def _examined(self, reader: BagReader, stream: _Stream) -> _Stream:
-        """Return the stream with the bag's name of its topic and the times of its first message."""
+    def check_common_time(self) -> None:
+        """Check that IMU and images have some time in common, as far as first stamps tell.
+
+        Raises:
+            MapError: They have none.
+        """
+        spans_ns: tuple[list[tuple[int, int]], ...] = [], []  # of the IMU, of cameras
+        for stream in self._streams:
+            last_ns = (stream.arrivals_ns or self._arrivals_ns)[1] - stream.delay_ns
+            spans_ns[stream.camera >= 0].append((stream.first_ns, last_ns))
+        if all(spans_ns):
+            imu, images = ((min(s)[0], max(end for _, end in s)) for s in spans_ns)
+            delay_ns = self._streams[-1].delay_ns - self._streams[0].delay_ns
+            shift_ns = self.device.cameras[-1].time_offset_ns + delay_ns
+            check_common_time(self.name, imu, images, f"{shift_ns} by the times of arrival")
+
+    def _examined(
+        self, reader: BagReader, stream: _Stream, within_ns: tuple[int, int] | None = None
+    ) -> _Stream:
+        """Return the stream with the bag's name of its topic and the times of its first message.
+
+        Args:
+            reader: Open bag.
+            stream: Topic as it was given.
+            within_ns: First and last arrival of messages that count; None = all.
+        """
         sensor = f"camera {stream.camera}" if stream.camera >= 0 else "IMU"
         flag = "--camera_topics" if stream.camera >= 0 else "--imu_topic"
         types = topic_types(reader)
@@ -418,7 +452,9 @@ class BagRecording:
         connections = [c for c in reader.connections if c.topic == topic]
         arrivals_ns: list[int] = []
         stamps_ns: list[int] = []
-        for _, at_ns, data in itertools.islice(reader.messages(connections), _EXAMINED):
+        begin_ns, end_ns = (None, None) if within_ns is None else (within_ns[0], within_ns[1] + 1)
+        messages = reader.messages(connections, begin_ns, end_ns)
+        for _, at_ns, data in itertools.islice(messages, _EXAMINED):
             if stream.camera >= 0 and not stamps_ns:
                 with contextlib.suppress(MapError), damage_named(self._path):
                     image = self._image(
@@ -445,6 +481,7 @@ class BagRecording:
             count=sum(connection.msgcount for connection in connections),
             first_ns=first_ns,
             delay_ns=arrival_ns - first_ns,
+            arrivals_ns=within_ns,
         )
 
     def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> ImuBatch:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -147,6 +147,52 @@ def restart_error(name: str, restart: Dropped) -> ClockRestart:
         f"{name}: the clock starts again: {restart.stamp_ns} comes after {restart.before_ns}: recording_info "
         "lists the parts, --recording_part=N reads one of them"
     )
+
+
+def check_common_time(
+    name: str, imu_ns: tuple[int, int], images_ns: tuple[int, int], proposal: str
+) -> None:
+    """Check that the spans (first, last) of IMU and images have some time in common.
+
+    Args:
+        name: Recording.
+        imu_ns: Times of the IMU.
+        images_ns: Times of the images in the clock of the IMU.
+        proposal: Shift of the images that would help, and why.
+
+    Raises:
+        MapError: They have none.
+    """
+    if imu_ns[0] <= images_ns[1] and images_ns[0] <= imu_ns[1]:
+        return
+    raise MapError(
+        f"{name}: IMU and images have no time in common: the IMU is from {imu_ns[0]} to {imu_ns[1]} ns, the "
+        f"images from {images_ns[0]} to {images_ns[1]} ns: if only a clock is shifted, give "
+        f"--imu_to_camera_time_offset_ns ({proposal})"
+    )
+
+
+def common_part_count(name: str, imu: int | None, cameras: Sequence[int]) -> int:
+    """Return into how many parts a recording falls whose IMU or cameras have restarting clocks.
+
+    A clock that never starts again beside others that do is divided where they start again.
+
+    Raises:
+        MapError: The sensors have different numbers of parts.
+    """
+    counts: set[int] = {*cameras, *(() if imu is None else (imu,))}
+    if len(set(cameras)) > 1:
+        listed = ", ".join(f"camera {row} {count}" for row, count in enumerate(cameras))
+        raise MapError(
+            f"{name}: the clocks of the cameras do not start again together (parts: {listed}): read "
+            "cameras of one clock with --rovio_active_camera_indices"
+        )
+    if len(counts - {1}) > 1:
+        raise MapError(
+            f"{name}: the clocks of the sensors do not start again together (parts: IMU {imu}, cameras "
+            f"{cameras[0]}): without --recording_part the first part is read, --vio_rosbag_end_s ends it"
+        )
+    return max(counts)
 
 
 def listed_rows(numbers: I64) -> Iterator[str]:

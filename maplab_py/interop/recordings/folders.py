@@ -22,7 +22,9 @@ from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.recordings.clocks import (
     Dropped,
+    check_common_time,
     check_dropped,
+    common_part_count,
     dropped_note,
     listed_rows,
     parts_of,
@@ -134,25 +136,43 @@ class FolderRecording:
 
     @cached_property
     def _part(self) -> int:
-        """Row of the part that is read.
+        """Row of the part that is read; tables are divided for it.
 
         Raises:
             MapError: The sensors have different numbers of parts.
             UserError: There is no such part.
         """
-        counts = {table.name: len(table.parts) for table in self._tables}
         part = self._reading.recording_part
-        if part > max(counts.values()):
+        count = max(len(table.parts) for table in self._tables)
+        if part > count:
             raise UserError(
-                f"{self.name}: --recording_part={part}: the recording has {max(counts.values())} parts"
+                f"{self.name}: --recording_part={part}: the recording has {count} parts"
             )
-        if part and len(set(counts.values())) > 1:
-            listed = ", ".join(f"{name} {count}" for name, count in counts.items())
-            raise MapError(
-                f"{self.name}: the clocks of the sensors do not start again together (parts: {listed}): "
-                "divide the tables by hand"
-            )
+        if part:
+            imu = None if self._imu is None else len(self._imu.parts)
+            common_part_count(self.name, imu, [len(camera.parts) for camera in self._cameras])
+            restarting = next(table for table in self._tables if len(table.parts) == count)
+            for table in self._tables:
+                if len(table.parts) < count:
+                    table.divide_like(restarting)
         return max(part - 1, 0)
+
+    def check_common_time(self) -> None:
+        """Check that IMU and images have some time in common.
+
+        Raises:
+            MapError: They have none.
+            UserError: There is no such part.
+        """
+        part = self._part
+        if self._imu is not None:
+            cameras = [camera.times(part) for camera in self._cameras]
+            images_ns = min(int(t[0]) for t in cameras), max(int(t[-1]) for t in cameras)
+            imu_ns = self._imu.times(part)
+            span_ns = int(imu_ns[0]), int(imu_ns[-1])
+            shift_ns = self.device.cameras[0].time_offset_ns + span_ns[0] - images_ns[0]
+            proposal = f"{shift_ns} lets both begin together"
+            check_common_time(self.name, span_ns, images_ns, proposal)
 
     def parts(self) -> tuple[PartSpan, ...]:
         """Return the parts into which restarts of the clock divide the recording."""
@@ -253,6 +273,28 @@ class _Table:
         first = 0 if start_ns is None else int(np.searchsorted(times_ns, start_ns))
         end = len(rows) if end_ns is None else int(np.searchsorted(times_ns, end_ns))
         return rows[first : max(first, end)]
+
+    def divide_like(self, other: _Table) -> None:
+        """Divide the only part where the clock of another sensor, once the same, starts again.
+
+        How long the other clock stood still is not known: a part begins once as much time has passed as
+        the parts before it have, and only the first one also ends.
+
+        Raises:
+            MapError: There are no stamps of a part.
+        """
+        runs = [other.stamps_ns[rows] for rows in other.parts]
+        lasting_ns = np.cumsum([0] + [int(run[-1] - run[0]) for run in runs[:-1]])
+        (rows,) = self.parts
+        places = np.searchsorted(
+            self.stamps_ns[rows], int(runs[0][0]) + lasting_ns[1:], side="right"
+        )
+        self.parts = [rows[: places[0]], *(rows[place:] for place in places)]
+        if not all(map(len, self.parts)):
+            raise MapError(
+                f"{self._path}: has no stamps beside a part of {other._path}, whose clock starts again: "
+                "without --recording_part the first part is read, --vio_rosbag_end_s ends it"
+            )
 
     def check(
         self, part: int, start_ns: int | None, end_ns: int | None, max_late_share: float

@@ -35,7 +35,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             raise UserError(f"{path} is a folder: --use_arrival_time applies to bags only")
         active = options.active_cameras
         device = _chosen(_calibration(options) or import_calibration(root), options)
-        return _with_sizes_checked(FolderRecording(root, device, active, options.reading))
+        return _checked(FolderRecording(root, device, active, options.reading))
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
     if not is_bag(path):
@@ -43,7 +43,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             f"{path} is no recording: wants a folder with mav0/cam0, a ROS 1 bag (.bag) or a ROS 2 "
             "bag (a folder, or a file .db3 or .mcap)"
         )
-    return _with_sizes_checked(
+    return _checked(
         BagRecording(
             path,
             given_device(options, f"{path}: a bag"),
@@ -54,12 +54,14 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
     )
 
 
-def _with_sizes_checked(recording: BagRecording | FolderRecording) -> Recording:
-    """Return the recording if the first image of each camera has the size that was calibrated.
+def _checked(recording: BagRecording | FolderRecording) -> Recording:
+    """Return the recording if its sensors have time in common and images the size that was calibrated.
 
     Raises:
-        MapError: It has another size.
+        MapError: They have not.
+        UserError: There is no such part.
     """
+    recording.check_common_time()
     for row, size_px in recording.first_sizes_px.items():
         check_size(f"{recording.name}: camera {row}", recording.device.cameras[row], *size_px)
     return recording

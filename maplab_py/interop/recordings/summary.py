@@ -170,8 +170,12 @@ def _notes(
     if statistics.dropped_before_imu:
         yield f"{statistics.dropped_before_imu} frame sets before the first IMU sample"
     images = [times for times in statistics.images if times.count]
-    if imu.count and images:
-        yield from _span_notes(imu, images, zero_ns)
+    last_ns = max((times.last_ns for times in images), default=imu.last_ns)
+    if imu.count and imu.last_ns < last_ns - _SPAN_NS:
+        yield (
+            f"the IMU ends at {(imu.last_ns - zero_ns) * 1e-9:.2f} s, the images at "
+            f"{(last_ns - zero_ns) * 1e-9:.2f} s"
+        )
     for row, times in enumerate(statistics.images):
         hole_ns, begin_ns = times.largest_hole_ns
         if times.count > 2 and hole_ns > max(_HOLE_STEPS * _usual_step_ns(times), _HOLE_NS):
@@ -180,23 +184,6 @@ def _notes(
                 " on"
             )
     yield from _pair_notes(statistics, options)
-
-
-def _span_notes(imu: Times, images: list[Times], zero_ns: int) -> Iterator[str]:
-    """Yield how the times of IMU and images differ, where the IMU does not cover the images."""
-    first_ns = min(times.first_ns for times in images)
-    last_ns = max(times.last_ns for times in images)
-    if imu.last_ns < first_ns or imu.first_ns > last_ns:
-        yield (
-            f"IMU and images have no time in common: IMU from {imu.first_ns} to {imu.last_ns} ns, images "
-            f"from {first_ns} to {last_ns} ns: check the clocks and units (--time_unit, "
-            "--imu_to_camera_time_offset_ns)"
-        )
-    elif imu.last_ns < last_ns - _SPAN_NS:
-        yield (
-            f"the IMU ends at {(imu.last_ns - zero_ns) * 1e-9:.2f} s, the images at "
-            f"{(last_ns - zero_ns) * 1e-9:.2f} s"
-        )
 
 
 def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterator[str]:

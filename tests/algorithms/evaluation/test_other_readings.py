@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
-from maplab_py.algorithms.evaluation.plausibility import motion_hint, orientation_hint
+from maplab_py.algorithms.evaluation.plausibility import (
+    clock_offset_ns,
+    motion_hint,
+    orientation_hint,
+)
 from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
@@ -116,3 +120,21 @@ def test_positions_alone_have_errors_of_position() -> None:
     assert (report.ape_deg, report.rpe_deg, report.body_rotation_deg) == (None, None, None)
     assert "positions only" in report.display().summary
     assert [line.error for line in report.display().errors] == ["APE [m]", "APE, Sim(3) [m]"]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_offsets_without_overlap_are_never_the_best(seed: int) -> None:
+    """Correlations by FFT leave overlaps of 0 within rounding, positive or negative."""
+    rng = np.random.default_rng(seed)
+    truth = make_truth(1200 + 7 * seed)
+    T = se3.make(truth.T_R_B[:, :4], truth.T_R_B[:, 4:] + rng.normal(size=(len(truth), 3)) * 1e-3)
+    shift_ns = 250_000_000
+    found = clock_offset_ns(
+        truth.times_ns - shift_ns,
+        T,
+        truth.times_ns,
+        truth.T_R_B,
+        lambda ns: abs(ns - shift_ns) * 1e-9,
+    )
+    assert found is not None
+    assert abs(found[0] - shift_ns) < 1_000_000

@@ -39,18 +39,20 @@ def shifted(content: Content, shift_ns: int) -> Content:
 
 
 def bag_messages(*contents: Content, step_ns: int = 10 * SECOND) -> list[tuple[int, str, Any]]:
-    """Messages (arrival, topic, message) of recordings one after the other."""
+    """Messages (arrival, topic, message) of recordings one after the other, each clock on its own."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
     messages: list[tuple[int, str, Any]] = []
     for number, content in enumerate(contents):
-        delay_ns = START_NS + number * step_ns - int(content.imu_ns[0])
+        start_ns = START_NS + number * step_ns
+        delay_ns = start_ns - int(content.imu_ns[0])
         for t, v in zip(content.imu_ns.tolist(), content.accel_gyro, strict=True):
             messages.append((t + delay_ns, "/imu0", imu_message(store, t, v, 1)))
         for camera, (stamps, images) in enumerate(
             zip(content.stamps_ns, content.images, strict=True)
         ):
+            delay_ns = start_ns + 20_000_000 - int(content.stamps_ns[0][0])
             for t, image in zip(stamps.tolist(), images, strict=True):
                 message = image_message(store, t, image, "mono8", 1)
                 messages.append((t + delay_ns, f"/cam{camera}/image_raw", message))
@@ -320,7 +322,3 @@ def test_what_is_odd_is_noted(tmp_path: Path) -> None:
         "30 of 30 images of camera 1 have no partner in camera 0",
     ):
         assert words in notes
-    late = dataclasses.replace(content, imu_ns=content.imu_ns + 3600 * SECOND)
-    folder = write_folder(late, tmp_path / "late")
-    notes = " | ".join(summarise(open_recording(folder)).notes)
-    assert "IMU and images have no time in common" in notes
