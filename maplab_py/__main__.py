@@ -1,7 +1,25 @@
-"""Run the console as `python -m maplab_py`."""
+"""Entry of the program `maplab`, also as `python -m maplab_py`."""
+
+from __future__ import annotations
 
 import sys
 
-from maplab_py.console.main import main
 
-sys.exit(main())
+def main() -> int:
+    """Run the console; where only the version is asked for, print it without loading the console."""
+    if sys.argv[1:] == ["--version"] and sys.stdout is not None:
+        from importlib.metadata import version
+
+        try:
+            sys.stdout.write(f"maplab-py {version('maplab-py')}\n")
+            sys.stdout.flush()
+            return 0
+        except OSError:
+            pass  # the console knows how to tell of a full disk or a closed pipe
+    from maplab_py.console.main import main as run_console
+
+    return run_console()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -68,12 +68,15 @@ class Registry:
         Raises:
             UserError: There is none; the message suggests similar names.
         """
-        command = self._commands.get(name) or self._commands.get(name.replace("-", "_"))
-        if command is not None:
-            return command
+        if self.knows(name):
+            return self._commands.get(name) or self._commands[name.replace("-", "_")]
         broken = [plugin.name for plugin in self.plugins if plugin.error]
         hint = f"plugins not available: {', '.join(broken)} (see: plugins)" if broken else ""
         raise unknown("command", name, self._commands, hint or "see: help")
+
+    def knows(self, name: str) -> bool:
+        """Tell whether a command has this name or alias."""
+        return name in self._commands or name.replace("-", "_") in self._commands
 
     def owner(self, command: Command) -> str:
         """Return the name of the plugin that brought a command."""

@@ -33,6 +33,7 @@ from maplab_py.console.commands.flags import looks_like_flag, resolve_name
 from maplab_py.console.commands.lines import Word, scan
 from maplab_py.console.commands.registry import Registry
 from maplab_py.console.prompt.completion import complete
+from maplab_py.console.prompt.greeting import greeting
 from maplab_py.console.scripts.checking import LEAVE
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.maps import MapEntry
@@ -183,13 +184,17 @@ def run_prompt(runner: Runner, first_line: str = "") -> Status:
         refresh_interval=0 if plain else 1.0,
     )
     runner.terminal.is_prompt = True
-    session.uses.update(recent_commands(state_folder() / "history"))
+    lines = recent_lines(state_folder() / "history")
+    session.uses.update(line.split(maxsplit=1)[0] for line in lines)
     session.jobs.on_finish = runner.tell_of_job
     for problem in session.registry.problems:
         runner.terminal.warning(problem)
     try:
         if first_line:
             _run_line(runner, first_line)
+        else:
+            for text in greeting(lines):
+                runner.terminal.note(text)
         return _read_lines(runner, prompt)
     finally:
         session.watchers.close()
@@ -362,15 +367,15 @@ def open_history(path: Path) -> tuple[History, str]:
     return KeptHistory(str(path)), ""
 
 
-def recent_commands(path: Path) -> list[str]:
-    """Return the first words of the lines at the end of a history file; none if it is unreadable."""
+def recent_lines(path: Path) -> list[str]:
+    """Return the lines at the end of a history file; none if it is unreadable."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _RECENT_BYTES))
             lines = file.read().decode(errors="replace").splitlines()[1:]
     except OSError:
         return []
-    return [line[1:].split(maxsplit=1)[0] for line in lines if line[:1] == "+" and line[1:].strip()]
+    return [line[1:] for line in lines if line[:1] == "+" and line[1:].strip()]
 
 
 def _append(path: Path, data: bytes) -> None:

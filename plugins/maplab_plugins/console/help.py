@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 
+from maplab_py.console.commands.command import Command
+from maplab_py.console.commands.flags import Flag
 from maplab_py.plugin import CommandContext, Report, UserError, command
+
+_MAX_FOUND = 12
+_MAX_FLAGS = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,10 +24,49 @@ class CommandLine:
 
 
 @dataclasses.dataclass(frozen=True)
-class CommandIndex(Report):
-    """Commands by plugin."""
+class TaskLine:
+    """A task of a user with the commands for it."""
 
+    task: str
+    commands: str
+
+
+TASKS = (
+    TaskLine("check a recording, make a map of it", "recording_info, rovioli"),
+    TaskLine("open maps, join sessions", "load, load_merge_all_maps, anchor_all_missions"),
+    TaskLine("make it accurate", "optvi, relax, lc"),
+    TaskLine("see it", "visualize, map_stats, plot_trajectory, why"),
+    TaskLine("compare it with ground truth", "evaluate_trajectory"),
+    TaskLine("make it small", "kfh, landmark_sparsify, split_map"),
+    TaskLine("localise in it", "create_localization_summary_map, localize"),
+    TaskLine("calibrate the sensors", "self_calibrate, import_calibration"),
+    TaskLine("depth and surfaces", "stereo_dense_reconstruction, tsdf, create_mesh_from_tsdf_grid"),
+    TaskLine("save it, hand it on", "save, export_trajectory_to_csv, export_bag, export_colmap"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandIndex(Report):
+    """Common tasks, and commands by plugin."""
+
+    tasks: tuple[TaskLine, ...]
     commands: Mapping[str, tuple[CommandLine, ...]]
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundLine:
+    """A command that has something to do with the words of a search."""
+
+    command: str
+    flags: str
+    help: str
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundCommands(Report):
+    """Commands found by words of their names, flags and help; the best first."""
+
+    found: tuple[FoundLine, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,25 +121,28 @@ class PluginList(Report):
     names_claimed_twice: tuple[str, ...]
 
 
-@command("help", "h", "?", example="help optvi", needs_map=False)
+@command("help", "h", "?", "apropos", example="help optvi", needs_map=False)
 def show_help(
     context: CommandContext,
     command_name: str = "",
-    *,
+    *words: str,
     plugin: str = "",
     all_: bool = False,
     command_filter: str = "",
-) -> CommandIndex | CommandPage | CommandPages:
-    """List the commands, or explain one.
+) -> CommandIndex | CommandPage | CommandPages | FoundCommands:
+    """List common tasks and the commands, explain one command, or search for words.
+
+    Words that are no command are searched in names, flags and help of all commands.
 
     Args:
-        command_name: Command or alias to explain; empty lists the commands.
+        command_name: Command or alias to explain, or a word to search for; empty lists the commands.
+        words: Further words to search for.
         plugin: List only the commands of this plugin.
         all_: Explain every command that is listed.
         command_filter: List only commands whose name, alias or help contains this text.
     """
     if command_name:
-        return _page(context, command_name)
+        return _explain(context, (command_name, *words))
     registry = context.session.registry
     plugins = {p.name: p for p in registry.plugins}
     if plugin and plugin not in plugins:
@@ -115,7 +163,54 @@ def show_help(
     if all_:
         pages = [_page(context, line.command) for lines in groups.values() for line in lines]
         return CommandPages(tuple(pages))
-    return CommandIndex(groups)
+    return CommandIndex(() if plugin or wanted else TASKS, groups)
+
+
+def _explain(context: CommandContext, words: tuple[str, ...]) -> CommandPage | FoundCommands:
+    """Return the page of a command, or the commands that have to do with the words."""
+    registry = context.session.registry
+    if len(words) == 1 and registry.knows(words[0]):
+        return _page(context, words[0])
+    wanted = " ".join(words).lower().split()
+    scores = {c.name: sum(_match(c, w) for w in wanted) for c in registry.commands}
+    found = [c for c in registry.commands if scores[c.name] and all(_match(c, w) for w in wanted)]
+    if not found:
+        if len(words) == 1:
+            registry.find(words[0])  # it names similar commands, or where to look
+        raise UserError(f"help: no command has to do with '{' '.join(words)}' (see: help)")
+    best = sorted(found, key=lambda c: (-scores[c.name], c.name))[:_MAX_FOUND]
+    return FoundCommands(tuple(_found_line(c, wanted) for c in best))
+
+
+def _match(described: Command, word: str) -> int:
+    """Return how much a command has to do with a word: 8 by its name, down to 1 by its flags' help."""
+    places = (
+        (8, word in (name.lower() for name in described.names)),
+        (5, any(_has(name, word) for name in described.names)),
+        (4, _has(described.summary, word)),
+        (2, _has(described.description, word) or any(_has(n, word) for n in described.flags)),
+        (1, any(_has(_help_of(flag), word) for flag in described.flags.values())),
+    )
+    return max(weight for weight, is_there in (*places, (0, True)) if is_there)
+
+
+def _has(text: str, word: str) -> bool:
+    """Tell whether a word of the text begins with this one; `_` and `-` part words, too."""
+    return re.search(rf"(?<![^\W_]){re.escape(word)}", text.lower()) is not None
+
+
+def _help_of(flag: Flag) -> str:
+    return f"{flag.name} {flag.help} {flag.type.text}"
+
+
+def _found_line(described: Command, wanted: list[str]) -> FoundLine:
+    flags = [
+        f"--{flag.name}"
+        for flag in described.flags.values()
+        if any(_has(_help_of(flag), word) for word in wanted)
+    ]
+    more = [f"and {len(flags) - _MAX_FLAGS} more"] if len(flags) > _MAX_FLAGS else []
+    return FoundLine(described.name, ", ".join(flags[:_MAX_FLAGS] + more), described.summary)
 
 
 def _page(context: CommandContext, name: str) -> CommandPage:
