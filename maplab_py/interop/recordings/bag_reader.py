@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rosbags.interfaces import (
     Connection,
@@ -24,6 +24,7 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.metadata import ReaderMetadata, parse_qos
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -275,6 +276,14 @@ class _Schemas(dict[int, Any]):
     def __setitem__(self, key: int, schema: Any) -> None:
         known = schema.encoding in _FORMATS
         super().__setitem__(key, schema if known else schema._replace(encoding="", data=""))
+
+
+def _read_text(bio: BinaryIO) -> str:
+    """Return a text of an MCAP file; definitions in languages that are not ROS' may be binary."""
+    return bytes(storage_mcap.read_bytes(bio)).decode(errors="replace")
+
+
+storage_mcap.read_string = _read_text  # the library decodes all definitions as it reads the index
 
 
 class _McapFile(McapReader):

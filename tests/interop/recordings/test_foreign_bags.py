@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,7 @@ from tests.interop.recordings.written import (
 pytest.importorskip("rosbags")
 
 CONTENT = make_content(frames=4)
+MCAP, DATA_END = b"\x89MCAP0\r\n", 0x0F
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +74,30 @@ def test_topics_that_nobody_asked_for(
         data.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (99, 5, 'text')")
     assert_reads(path, calibrated)
     assert "/odd" in [topic.topic for topic in bag_info(path).topics]
+
+
+def test_binary_definitions_of_topics_that_nobody_asked_for(
+    tmp_path: Path, calibrated: SourceOptions
+) -> None:
+    file = bag(tmp_path, "mcap") / "room.mcap"
+    data, place = file.read_bytes(), len(MCAP)
+    while data[place] != DATA_END:
+        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+    text = [
+        struct.pack("<I", len(word)) + word
+        for word in (b"odd.Odd", b"protobuf", b"\n\xff\xc3\0", b"/odd")
+    ]
+    records = [
+        (0x03, struct.pack("<H", 99) + b"".join(text[:3])),
+        (0x04, struct.pack("<HH", 99, 99) + text[3] + text[1] + bytes(4)),
+        (0x05, struct.pack("<HIQQ", 99, 0, 1 << 62, 1 << 62) + b"\xff\xfe"),
+        *((DATA_END, bytes(4)), (0x02, bytes(20))),
+    ]
+    more = b"".join(struct.pack("<BQ", code, len(body)) + body for code, body in records)
+    file.write_bytes(data[:place] + more + MCAP)
+    assert_reads(file, calibrated)
+    kinds = {topic.topic: topic.type for topic in bag_info(file).topics}
+    assert kinds["/odd"] == "odd.Odd"
 
 
 def test_both_spellings_of_types(tmp_path: Path, calibrated: SourceOptions) -> None:
