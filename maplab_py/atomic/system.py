@@ -29,7 +29,7 @@ def flush_folder(folder: Path) -> None:
     """Flush the names in a folder to disk, where the file system can."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -53,7 +53,7 @@ def flush_tree(folder: Path, on_disk: Collection[Path] = ()) -> None:
         if path.is_dir():
             flush_folder(path)
         elif path.is_file() and path not in on_disk:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            descriptor = os.open(path, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
             finally:
@@ -88,7 +88,7 @@ def opened_locked(path: Path) -> int | None:
     Raises:
         OSError: The file cannot be opened.
     """
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     while True:
         descriptor = os.open(path, flags, 0o666)
         try:

@@ -10,7 +10,6 @@ import json
 import os
 import queue
 import select
-import signal
 import subprocess
 import sys
 import time
@@ -131,7 +130,7 @@ def check_submap(submap: VIMap) -> None:
 _IDLE_S = 60.0
 _MOST_ORDERS = 200
 """A worker is replaced after so many submaps, so that its memory cannot grow without end."""
-_KILLED = -signal.SIGKILL
+_KILLED = -9  # by SIGKILL
 
 
 class WorkerPool:

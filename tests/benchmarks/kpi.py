@@ -233,6 +233,15 @@ def write_page(releases: list[tuple[str, Figures]], page: Path = PAGE) -> None:
     page.write_text(f"{head}{_BEGIN}{shown}{_END}{tail}", encoding="utf-8")
 
 
+def store(figures: Figures) -> None:
+    """Add figures to those of this release, and write the page."""
+    path = STORED / f"{version('maplab-py')}.json"
+    before = json.loads(path.read_text("utf-8")) if path.exists() else {}
+    STORED.mkdir(exist_ok=True)
+    path.write_text(json.dumps({**before, **figures}, indent=1) + "\n", encoding="utf-8")
+    write_page(stored_releases())
+
+
 def main() -> None:
     """Measure, store and compare."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -242,18 +251,12 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(PARTS):
         parser.error(f"cannot measure {', '.join(sorted(unknown))}; choose from {', '.join(PARTS)}")
-    if not arguments.compare:
-        path = STORED / f"{version('maplab-py')}.json"
-        figures: Figures = {}
-        for name in arguments.names or PARTS:
-            figures |= PARTS[name]()
-            print(json.dumps(figures, indent=1), flush=True)
+    for name in [] if arguments.compare else arguments.names or PARTS:
+        figures = PARTS[name]()
+        print(json.dumps(figures, indent=1), flush=True)
         if arguments.write:
-            before = json.loads(path.read_text("utf-8")) if path.exists() else {}
-            STORED.mkdir(exist_ok=True)
-            path.write_text(json.dumps({**before, **figures}, indent=1) + "\n", encoding="utf-8")
-            write_page(stored_releases())
-    for line in regressions(stored_releases()):
+            store(figures)
+    for line in regressions(stored_releases(STORED)):
         print("worse:", line)
 
 

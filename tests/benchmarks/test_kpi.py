@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
+from tests.benchmarks import kpi
 from tests.benchmarks.kpi import (
     PAGE,
     Change,
@@ -57,3 +59,15 @@ def test_the_page_has_the_table_of_the_stored_figures(tmp_path: Path) -> None:
     copy.write_text(PAGE.read_text("utf-8"), encoding="utf-8")
     write_page(stored_releases(), copy)
     assert copy.read_text("utf-8") == PAGE.read_text("utf-8")
+
+
+def test_a_worsening_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = {"walk_ate_m": 0.012, "solver_ratio": 0.1}
+    (tmp_path / "0.1.0.json").write_text(json.dumps({"walk_ate_m": 0.01, "solver_ratio": 0.1}))
+    (tmp_path / "0.2.0.json").write_text(json.dumps(now))
+    monkeypatch.setattr(kpi, "STORED", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["kpi", "--compare"])
+    kpi.main()
+    assert capsys.readouterr().out == "worse: walk_ate_m: 0.01 in 0.1.0, 0.012 in 0.2.0 (+20 %)\n"

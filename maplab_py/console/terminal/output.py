@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import array
-import fcntl
 import os
 import shutil
 import subprocess
 import sys
-import termios
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -262,6 +260,11 @@ def page(text: str) -> bool:
 
 def keys_are_waiting() -> bool:
     """Tell whether keys have been typed that no program has read yet, with or without Enter."""
+    try:
+        import fcntl
+        import termios
+    except ImportError:  # not a POSIX system
+        return False
     try:
         number = sys.stdin.fileno()
         settings = termios.tcgetattr(number)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import IO
 
 from maplab_py.errors import MaplabError
 
-PIPE_STATUS = 128 + signal.SIGPIPE
+PIPE_STATUS = 128 + 13  # the number of SIGPIPE, which not every system has
 """Exit status of a program whose output pipe was closed, as a shell reports it."""
 
 
