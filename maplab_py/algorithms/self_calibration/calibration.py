@@ -26,8 +26,8 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import ParameterEstimate, SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.algorithms.self_calibration.uncertainty import (
+    LANDMARK_DAMPING,
     Uncertainty,
-    cluster_robust_covariance,
     name_directions,
     posterior_covariance,
     spectrum,
@@ -36,6 +36,7 @@ from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
+from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
 from maplab_py.estimation.states import States
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
@@ -118,7 +119,9 @@ def calibrate(
     uncertainty = Uncertainty(
         problem.parameters.prior_sigma,
         posterior_covariance(problem, states),
-        cluster_robust_covariance(problem, states),
+        cluster_robust_covariance(
+            problem.problem, states, *problem.parameters.nodes(states), LANDMARK_DAMPING
+        ),
         noise_factor=solution.track_test.noise_factor,
     )
     directions = spectrum(uncertainty.formal, problem.parameters).unobservable(_MAX_PRIOR_SHARE)

@@ -22,14 +22,15 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import PrunedSegment, PruneReport
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.uncertainty import (
+    LANDMARK_DAMPING,
     MAX_PRIOR_SHARE,
     Uncertainty,
-    cluster_robust_covariance,
     posterior_covariance,
     spectrum,
 )
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, UserError
+from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
 from maplab_py.vimap import VIMap
@@ -185,7 +186,9 @@ def test_segment(
     change = parameters.difference(states.blocks, problem.states.blocks)
     fit = chi_square_per_freedom(problem, states)
     formal = posterior_covariance(problem, states)
-    robust = cluster_robust_covariance(problem, states)
+    robust = cluster_robust_covariance(
+        problem.problem, states, *parameters.nodes(states), LANDMARK_DAMPING
+    )
     uncertainty = Uncertainty(parameters.prior_sigma, formal, robust)
     actual = uncertainty.covariance(formal_scale=max(fit, 1.0))
     distance, freedom = squared_distance(change, formal, actual, parameters)

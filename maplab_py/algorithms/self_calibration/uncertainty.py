@@ -14,10 +14,8 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.problem.problem import Linearization
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.visual import VisualTerms
 
 MAX_PRIOR_SHARE = 0.5
 """Parameters that keep more of the prior's variance are left at the prior: the data say less."""
@@ -226,61 +224,3 @@ def larger_covariance(first: F64, second: F64) -> F64:
     share, turn = np.linalg.eigh(inverse @ second @ inverse.T)
     root = L @ turn
     return np.asarray((root * np.maximum(share, 1.0)) @ root.T)
-
-
-# Cluster-robust covariance: errors may be correlated within a track (decision 18).
-#
-# The formal covariance takes all observations of a landmark for independent. Where a tracker drifts,
-# errors in neighbouring images are correlated, and the same number of observations contains less
-# information. Tracks are still independent of each other, so the scatter of their contributions to the
-# result shows how uncertain it is, whatever the correlations within a track.
-
-
-_STEP = 1e-3
-"""Step of the numeric derivatives, in formal deviations; landmarks close to a camera allow no more."""
-
-
-def cluster_robust_covariance(problem: SegmentProblem, states: States) -> F64:
-    """Return the covariance (k, k) of the calibration with tracks as independent clusters.
-
-    It is C (sum of g g^T + H) C, with C the formal covariance, g the gradients of the costs of single
-    landmarks, and H the information of everything else, whose covariances are trusted (K.-Y. Liang
-    and S. L. Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986).
-    Where landmarks are at their optimum their elimination does not change g, so products of C and g
-    are derivatives of a landmark's cost along columns of C.
-
-    Args:
-        problem: Factorised at the states, as `posterior_covariance` leaves it.
-        states: The optimum.
-    """
-    inner = problem.problem
-    node, direction = problem.parameters.nodes(states)
-    columns = inner.covariance_columns(node, direction)
-    size = columns.shape[-1]
-    covariance = np.zeros((size, size))
-    for term in inner.factors:
-        _, jacobian = term.evaluate(states)
-        moved = columns[term.nodes].reshape(*jacobian.shape[::2], -1)
-        change = (jacobian @ moved).reshape(-1, size)
-        covariance += change.T @ change
-    if inner.visual is None:
-        return covariance
-    no_step = np.zeros((inner.num_nodes, 3))
-    p_G, _, _ = inner.visual.take_step(states, no_step, states, LANDMARK_DAMPING)
-    optimum = dataclasses.replace(states, p_G=p_G)
-    formal_sigma = np.sqrt(columns[node, direction, np.arange(len(node))])
-    change = np.empty((len(p_G), size))
-    for k, sigma in enumerate(formal_sigma):
-        step = columns[:, :, k] * (_STEP / max(sigma, 1e-300))
-        difference = _costs(inner.visual, optimum, step) - _costs(inner.visual, optimum, -step)
-        change[:, k] = difference * (sigma / (2.0 * _STEP))
-    covariance += change.T @ change
-    return covariance
-
-
-def _costs(visual: VisualTerms, states: States, step: F64) -> F64:
-    """Return the cost (L,) of every landmark after all but the landmarks make a step (nodes, 3)."""
-    data = visual.observations
-    error_px = np.nan_to_num(visual.errors(states.moved(step, states.p_G))[0])
-    cost = loss_and_weight(visual.loss, data.scale2, np.square(error_px * data.inverse_sigma))[0]
-    return np.asarray(0.5 * np.bincount(data.landmark, cost, minlength=len(data.start) - 1))

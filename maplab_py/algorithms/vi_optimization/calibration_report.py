@@ -18,6 +18,7 @@ from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 
 _MATRIX = ["[0,0]", "[1,1]", "[2,2]", "[0,1]", "[0,2]", "[1,2]"]
 _ROTATION = ["rotation x [rad]", "rotation y [rad]", "rotation z [rad]"]
+_OF_CAMERAS = (INTRINSICS, EXTRINSICS, TIMING)
 _POSE = ["x [m]", "y [m]", "z [m]", *_ROTATION]
 
 
@@ -48,7 +49,10 @@ def _rows_of(
     change = block.difference(before.values)
     sigma = np.full(change.shape, np.nan)
     if marginals is not None:
-        sigma = np.sqrt(np.maximum(np.diag(marginals.block(name)), 0.0)).reshape(change.shape)
+        if name in _OF_CAMERAS and map_problem.problem.visual is not None:
+            sigma = marginals.robust_sigma(name)
+        else:
+            sigma = np.sqrt(np.maximum(np.diag(marginals.block(name)), 0.0)).reshape(change.shape)
     rows = []
     for row, column in np.argwhere(is_free[:, : block.dimension]):
         start = before.values[row, column] if block.manifold is Manifold.VECTOR else 0.0

@@ -10,6 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.scale_check import scale_doubts
+from maplab_py.algorithms.vi_optimization.calibration_choice import (
+    freed_note,
+    may_free,
+    with_contradicted_freed,
+)
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build
 from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.report_building import make_report
@@ -54,6 +59,57 @@ def optimize(
         EstimationError: Nothing can be optimised, or the cost is not finite.
         MapError: Calibrations that the terms need are missing.
     """
+    result, report = _optimize(vi_map, options, missions, progress, watch, fixed_vertices)
+    if fixed_vertices is not None or not may_free(options, report):
+        return result, report
+    free = with_contradicted_freed(result, options, missions=missions, progress=progress)
+    if free == options:
+        return result, report
+    result, more = _optimize(result, free, missions, progress, watch)
+    return result, _joined(report, more, freed_note(free, more))
+
+
+def _joined(
+    first: VIOptimizationReport, second: VIOptimizationReport, note: str
+) -> VIOptimizationReport:
+    """Return the report of an optimisation and of what went on with a free calibration."""
+    before = {row.mission: row for row in first.missions}
+    missions = [
+        dataclasses.replace(
+            row,
+            mean_before_px=before[row.mission].mean_before_px,
+            median_before_px=before[row.mission].median_before_px,
+        )
+        for row in second.missions
+        if row.mission in before
+    ]
+    return dataclasses.replace(
+        second,
+        note="; ".join(part for part in (note, second.note) if part),
+        missions=missions,
+        **{
+            name: getattr(first, name)
+            for name in (
+                "cost_before", "observations", "mean_reprojection_before_px",
+                "median_reprojection_before_px",
+            )
+        },
+        **{
+            name: getattr(first, name) + getattr(second, name)
+            for name in ("iterations", "rejected_steps", "seconds_build", "seconds_solve", "seconds_total")
+        },
+    )  # fmt: skip
+
+
+def _optimize(
+    vi_map: VIMap,
+    options: VIOptimizationOptions,
+    missions: NDArray[np.integer] | None,
+    progress: Progress,
+    watch: Watch | None,
+    fixed_vertices: I64 | None = None,
+) -> tuple[VIMap, VIOptimizationReport]:
+    """Optimise what the options leave free."""
     began = time.perf_counter()
     map_problem = build(
         vi_map, options, missions=missions, fixed_vertices=fixed_vertices, progress=progress

@@ -82,6 +82,12 @@ class DataOptions:
 class FixedStates:
     """Fixed states."""
 
+    calibration: str = option(
+        "auto",
+        help="Calibration of the cameras while all of it is fixed: fixed = it stays; auto = once the cost "
+        "has converged, what the residuals contradict is freed, and the optimisation goes on",
+        choices=("auto", "fixed"),
+    )
     fix_vertices: bool = option(False, help="Hold all poses fixed.")
     fix_velocity: bool = option(False, help="Hold all velocities fixed.")
     fix_gyro_bias: bool = option(False, help="Hold all gyroscope biases fixed.")

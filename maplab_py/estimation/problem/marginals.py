@@ -9,16 +9,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import States, pose_nodes
 from maplab_py.geometry import se3, so3
 
 _LANDMARK_DAMPING = 1e-12
 """Relative damping of landmarks' own 3 x 3 systems: those without parallax stay solvable."""
+
+
+_STRETCHES = 20
+"""Stretches of time whose errors are taken for independent."""
 
 
 class Marginals:
@@ -55,6 +60,34 @@ class Marginals:
         width = 3 * block.nodes_each
         kept = np.arange(len(block) * width).reshape(len(block), width)[:, : block.dimension]
         return np.asarray(full[np.ix_(kept.reshape(-1), kept.reshape(-1))])
+
+    def robust_sigma(self, name: str) -> F64:
+        """Return standard deviations (N, d) of a block's parameters, honest with correlated errors.
+
+        They are the largest of the formal ones and of those with tracks, and with stretches of time, as
+        independent clusters.
+        """
+        problem, states = self._problem, self._states
+        block, nodes = states.blocks[name], states.nodes(name)
+        sigma = np.sqrt(np.maximum(np.diag(self.block(name)), 0.0)).reshape(len(block), -1)
+        row, column = np.nonzero(sigma)
+        node, direction = nodes[row, column // 3], column % 3
+        largest = sigma[row, column]
+        for cluster in (None, self._stretches()):
+            robust = cluster_robust_covariance(
+                problem, states, node, direction, _LANDMARK_DAMPING, cluster
+            )
+            largest = np.maximum(largest, np.sqrt(np.maximum(np.diag(robust), 0.0)))
+        sigma[row, column] = largest
+        return sigma
+
+    def _stretches(self) -> I64:
+        """Return the stretch of time (L,) in which each landmark was first seen."""
+        assert self._problem.visual is not None
+        data = self._problem.visual.observations
+        first = np.minimum(data.start[:-1], len(data) - 1)
+        count = len(self._states.T_G_I)
+        return np.asarray(data.vertex[first].astype(np.int64) * _STRETCHES // max(count, 1))
 
     def poses(self, vertices: ArrayLike) -> F64:
         """Return the covariances (N, 6, 6) of poses: position in G [m^2], rotation in I [rad^2]."""

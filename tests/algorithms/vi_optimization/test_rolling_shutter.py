@@ -105,7 +105,7 @@ def test_line_delays_survive_the_files_of_a_map(exact: SimulatedData, tmp_path: 
     )
 
 
-OPTIONS = VIOptimizationOptions(num_iterations=60)
+OPTIONS = VIOptimizationOptions(num_iterations=60, calibration="fixed")
 
 
 def ate_m(start: VIMap, data: SimulatedData, **free: bool) -> tuple[float, Camera]:
