@@ -71,6 +71,7 @@ class Mapping:
         observer: Observer | None = None,
         make_starter: MakeStarter | None = None,
         status: Callable[[], str] = str,
+        keeps_states: bool = True,
     ) -> None:
         """Prepare a run.
 
@@ -81,6 +82,7 @@ class Mapping:
             observer: Told of every frame.
             make_starter: See `Odometry`.
             status: Returns what the status line says beside the odometry; mostly nothing.
+            keeps_states: Keep the state of every frame for `trajectory`; runs of hours need not.
 
         Raises:
             FlagError: An option is wrong.
@@ -109,6 +111,7 @@ class Mapping:
         self.statistics = RunStatistics()
         self.problem = ""
         self.is_ended_early = False
+        self._keeps_states = keeps_states
         self._states = array("d")  # time apart, rows of 16 numbers
         self._times_ns = array("q")
         self._mission = -1
@@ -144,10 +147,10 @@ class Mapping:
         except Cancelled:
             raise
         except MaplabError as error:
-            if not self._times_ns:
+            if not self.statistics.estimated_frames:
                 raise
             self.problem = str(error)
-        if not self._times_ns:
+        if not self.statistics.estimated_frames:
             if self.is_ended_early:
                 raise Cancelled("cancelled")
             raise EstimationError(self._nothing())
@@ -182,7 +185,7 @@ class Mapping:
     def _take(self, update: OdometryUpdate, progress: Progress) -> None:
         """Use the result of a frame."""
         self.statistics.add(update)
-        if update.state is not None:
+        if update.state is not None and self._keeps_states:
             self._times_ns.append(update.time_ns)
             state = update.state
             for column in (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias):

@@ -104,10 +104,11 @@ def rovioli(
         writer = SubmapWriter(submaps, forgets=data.type in TRANSPORTS and folder is None)
     if writer is not None:
         observers.append(writer)
+    is_live = data.type in TRANSPORTS
     with contextlib.ExitStack() as stack:
         is_to_end = stack.enter_context(ending_early())
         recording: Recording
-        if data.type in TRANSPORTS:
+        if is_live:
             _check_live(datasource_folder, data, run)
             live_source = stack.enter_context(
                 live_run(context, data.type, source, network, live, run.stream)
@@ -116,9 +117,14 @@ def rovioli(
             observers.insert(0, live_source)  # poses are published before anything else is done
         else:
             recording, status = open_source(datasource_folder, data, source), str
-        mapping = Mapping(recording, run, observer=_Several(observers), status=status)
+        mapping = Mapping(
+            recording,
+            run,
+            observer=_Several(observers),
+            status=status,
+            keeps_states=not is_live or run.output.export_estimated_poses_to_csv is not None,
+        )
         mapping.run(context.progress, is_to_end=is_to_end)
-        mapping.statistics.notes.extend(recording.notes)
         if writer is not None:
             writer.finish(mapping)
         finished = finish(

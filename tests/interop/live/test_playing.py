@@ -58,19 +58,22 @@ def play(folder: Path, kind: str, network: NetworkOptions, **options: float) -> 
     return thread
 
 
+@pytest.mark.parametrize(("kind", "name"), [("ros1", "again.bag"), ("foxglove", "again")])
 def test_a_played_recording_is_recorded_stamp_by_stamp(
-    folder: Path, content: Content, calibration: Path, tmp_path: Path
+    folder: Path, content: Content, calibration: Path, tmp_path: Path, kind: str, name: str
 ) -> None:
+    """ROS 2 takes two programs, see the last test."""
+    if kind == "foxglove":
+        pytest.importorskip("websockets")
     with small_master() as master:
-        network = NetworkOptions(ros_master_uri=master.uri)
-        player = play(folder, "ros1", network)
+        url = f"ws://127.0.0.1:{PORT + 1}"
+        network = NetworkOptions(ros_master_uri=master.uri, foxglove_url=url)
+        player = play(folder, kind, network)
         names = RecordingOptions("/imu0,/cam0/image_raw,cam1/image_raw")
-        report = record_bag("ros1", tmp_path / "again.bag", network, names, silence_s=1.5)
+        report = record_bag(kind, tmp_path / name, network, names, silence_s=1.5)
         player.join()
     assert [t.messages for t in report.topics] == [len(content.imu_ns), 8, 8]
-    again = open_recording(
-        tmp_path / "again.bag", SourceOptions(sensor_calibration_file=calibration)
-    )
+    again = open_recording(tmp_path / name, SourceOptions(sensor_calibration_file=calibration))
     assert_content(list(EventStream(again)), content)
 
 

@@ -2,113 +2,96 @@
 
 from __future__ import annotations
 
-import json
-import os
 import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from maplab_py.interop.recordings.opening import open_recording
-from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch
-from tests.interop.live.environments import in_network_namespace, python_of
-from tests.interop.recordings.written import write_calibration
+from tests.interop.live.robots import maplab, run_live, write_messages
 from tests.support.data import shared_data
 
 pytestmark = pytest.mark.slow
 
-NODES = Path(__file__).parent / "nodes"
 SECONDS = 5.0
-RATE = 0.15  # of real time: tests share the machine with other tests
-LONGEST_S = 240.0
-TOPICS = "--camera_topics=/cam0/image_raw,/cam1/image_raw --imu_topic=/imu0"
-PLAYERS = {
-    "jazzy": "ros2_player.py",
-    "kilted": "ros2_player.py",
-    "noetic": "ros1_player.py",
-    "foxglove": "foxglove_player.py",
-}
+RATE = "--rate 0.15"  # of real time: tests share the machine with other tests
+FIRST_PART, SECOND_PART = "--limit 480 --killed", "--begin_s 2"
+POSES_ONLY = "--rovioli_run_map_builder=false --export_estimated_poses_to_csv="
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the calibration, the messages to play, and the odometry on the EuRoC folder."""
     source, folder = shared_data("euroc_mh01_10s"), tmp_path_factory.mktemp("recorded")
-    recording = open_recording(source)
-    write_calibration(recording.device, folder / "sensors.yaml")
-    end_ns = recording.start_ns + round(SECONDS * 1e9)
-    times, samples, stamps, pixels = [], [], ([], []), ([], [])  # type: ignore[var-annotated]
-    for item in recording.items(None, end_ns):
-        if isinstance(item, ImuBatch):
-            times.append(item.times_ns)
-            samples.append(item.accel_gyro)
-        elif isinstance(item, CameraImage):
-            stamps[item.camera].append(item.stamp_ns)
-            pixels[item.camera].append(item.decode())
-    arrays: dict[str, Any] = {"imu_ns": np.concatenate(times), "imu": np.concatenate(samples)}
-    for camera in (0, 1):
-        arrays |= {f"stamps_ns{camera}": stamps[camera], f"pixels{camera}": pixels[camera]}
-    np.savez(folder / "messages.npz", cameras=2, **arrays)
-    command = (
-        f"rovioli {source} --vio_rosbag_end_s={SECONDS} --rovioli_run_map_builder=false "
-        f"--export_estimated_poses_to_csv={folder / 'poses.csv'}"
-    )
-    subprocess.run([sys.executable, "-m", "maplab_py", "-c", command], check=True, timeout=600)
+    write_messages(source, folder, seconds=SECONDS)
+    command = f"rovioli {source} --vio_rosbag_end_s={SECONDS} {POSES_ONLY}{folder / 'poses.csv'}"
+    subprocess.run(maplab(command), check=True, timeout=600)
     return folder
 
 
-def run_live(recorded: Path, folder: Path, kind: str, name: str) -> tuple[dict[str, Any], str]:
-    """Play to rovioli; return what the player saw and what rovioli printed."""
-    programs = {
-        "player": [
-            *("env", "-u", "PYTHONSAFEPATH", str(python_of(name))),
-            *(PLAYERS[name], str(recorded / "messages.npz"), "--rate", str(RATE)),
-        ],
-        "rovioli": [
-            sys.executable,
-            "-m",
-            "maplab_py",
-            "-c",
-            f"rovioli --datasource_type={kind} --sensor_calibration_file={recorded / 'sensors.yaml'} "
-            f"{TOPICS} --rovioli_run_map_builder=false --live_wait_s=60 --live_silence_s=5 "
-            "--live_max_delay_s=60 "
-            f"--export_estimated_poses_to_csv={folder / 'poses.csv'}",
-        ],
-    }
-    (folder / "programs.json").write_text(json.dumps(programs))
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": "11",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOCALHOST_ONLY": "1",
-        "ROS_IP": "127.0.0.1",
-        "ROS_MASTER_URI": "http://127.0.0.1:11311",
-    }
-    runner = [*in_network_namespace(), sys.executable, str(NODES / "run_both.py"), str(folder)]
-    subprocess.run(
-        [*runner, kind], check=True, timeout=LONGEST_S + 60.0, env=environment, cwd=NODES
-    )
-    printed = (folder / "rovioli.out").read_text()
-    return json.loads((folder / "player.out").read_text().splitlines()[-1]), printed
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [("ros2", "jazzy"), ("ros2", "kilted"), ("ros1", "noetic"), ("foxglove", "foxglove")],
-)
-def test_poses_are_those_of_the_folder(
-    recorded: Path, tmp_path: Path, kind: str, name: str
-) -> None:
-    seen, printed = run_live(recorded, tmp_path, kind, name)
+@pytest.mark.parametrize("robot", ["jazzy", "kilted", "noetic", "foxglove"])
+def test_poses_are_those_of_the_folder(recorded: Path, tmp_path: Path, robot: str) -> None:
+    flags = f"--live_max_delay_s=60 {POSES_ONLY}{tmp_path / 'poses.csv'}"
+    run = run_live(tmp_path, robot, recorded, flags, RATE)
     expected, poses = (
         np.loadtxt(folder / "poses.csv", delimiter=",") for folder in (recorded, tmp_path)
     )
     times, rows, live_rows = np.intersect1d(expected[:, 0], poses[:, 0], return_indices=True)
-    assert len(times) >= len(expected) - 2, printed  # a reliable reader may join after the first
+    assert len(times) >= len(expected) - 2, (
+        run.printed
+    )  # a reliable reader may join after the first
     error_m = np.linalg.norm(expected[rows, 1:4] - poses[live_rows, 1:4], axis=1)
-    assert np.sqrt(np.mean(error_m**2)) < 1e-3, printed
-    assert seen["odometry"] >= len(poses) - 2
-    assert seen["frames"] == ["odom", "imu"]
+    assert np.sqrt(np.mean(error_m**2)) < 1e-3, run.printed
+    assert run.seen["odometry"] >= len(poses) - 2
+    assert run.seen["frames"] == ["odom", "imu"]
+
+
+@pytest.mark.parametrize("robot", ["jazzy", "noetic", "foxglove"])
+def test_a_publisher_that_was_killed_comes_again(
+    recorded: Path, tmp_path: Path, robot: str
+) -> None:
+    """The second is of best effort in ROS 2; its stamps go on where those of the first end."""
+    flags = f"--live_max_delay_s=60 --live_silence_s=30 {POSES_ONLY}{tmp_path / 'poses.csv'}"
+    first, second = f"{RATE} {FIRST_PART}", f"{RATE} {SECOND_PART} --best_effort"
+    run = run_live(tmp_path, robot, recorded, flags, first, second)
+    assert run.status == 0, run.printed
+    assert run.seen["odometry"] > 20  # by the second player
+    poses = np.loadtxt(tmp_path / "poses.csv", delimiter=",")
+    assert np.all(np.diff(poses[:, 0]) > 0)
+
+
+def test_a_master_that_starts_again_is_found(recorded: Path, tmp_path: Path) -> None:
+    """Connections go on without a master; nodes of ROS 1 that start afterwards need it."""
+    master = "timeout -s KILL 35 rosmaster --core -p 11311; sleep 3; rosmaster --core -p 11311"
+    flags = f"--live_max_delay_s=60 --live_silence_s=30 {POSES_ONLY}{tmp_path / 'poses.csv'}"
+    first, second = f"--rate 0.05 {FIRST_PART}", f"{RATE} {SECOND_PART}"
+    run = run_live(tmp_path, "noetic", recorded, flags, first, second, master=master)
+    assert run.status == 0, run.printed
+    assert "does not answer" in run.printed
+    assert "is there again" in run.printed
+    assert run.seen["odometry"] > 20
+
+
+def test_another_domain_is_answered_with_what_to_do(recorded: Path, tmp_path: Path) -> None:
+    run = run_live(
+        tmp_path,
+        "jazzy",
+        recorded,
+        "--ros_domain_id=12 --live_wait_s=5",
+        f"{RATE} --limit 20 --no_wait",
+    )
+    assert run.status == 2
+    assert "ROS 2 domain 12: nobody publishes /imu0" in run.printed
+    assert "start the publisher, or choose other topics" in run.printed
+
+
+def test_a_topic_of_another_type_is_answered_with_what_to_do(
+    recorded: Path, tmp_path: Path
+) -> None:
+    run = run_live(
+        tmp_path, "jazzy", recorded, "--imu_topic=/cam0/image_raw", f"{RATE} --limit 20 --no_wait"
+    )
+    assert run.status == 2
+    assert (
+        "has messages of type sensor_msgs/msg/Image, needed is sensor_msgs/msg/Imu" in run.printed
+    )

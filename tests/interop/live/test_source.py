@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.live import receiving
+from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.transport import Topic
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
@@ -23,8 +26,10 @@ from tests.interop.live.support import (
     live,
     messages_of,
     small_device,
+    small_master,
 )
 from tests.interop.recordings.written import make_content
+from tests.support.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -196,3 +201,45 @@ def test_the_domain_is_that_of_the_environment(
     monkeypatch.setenv("ROS_DOMAIN_ID", "home")
     with pytest.raises(UserError, match="ROS_DOMAIN_ID=home"):
         _ = NetworkOptions().domain
+
+
+def test_a_consumer_that_is_too_slow_gets_all_samples_and_new_images(
+    device: RecordedSensors, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through real sockets: 40 sets at 20 Hz to a consumer that takes 120 ms for each."""
+    monkeypatch.setattr(receiving, "_START_DELAY_S", 0.0)
+    content = gravity(make_content(frames=40))
+    messages = messages_of(content, is_ros_2=False)
+    options = LiveOptions(silence_s=1.0, max_delay_s=0.3)
+    with small_master() as master:
+        network = NetworkOptions(ros_master_uri=master.uri)
+        with open_transport("ros1", network) as robot, open_transport("ros1", network) as listener:
+            publishers = {topic.name: robot.advertise(topic.name, topic.type) for topic in TOPICS}
+            recording = live(listener, device, options=options, wait_s=5.0)
+            assert wait_until(lambda: all(robot.subscribers(topic.name) for topic in TOPICS))
+            sent_s: dict[int, float] = {}
+
+            def send() -> None:
+                begin_s = time.monotonic()
+                for stamp_ns, topic, data in messages:
+                    due_s = begin_s + (stamp_ns - messages[0][0]) * 1e-9
+                    time.sleep(max(0.0, due_s - time.monotonic()))
+                    sent_s[stamp_ns] = time.monotonic()
+                    publishers[topic](data)
+
+            thread = threading.Thread(target=send)
+            thread.start()
+            samples, delays_s = [], []
+            for item in recording.items():
+                if isinstance(item, ImuBatch):
+                    samples.append(item.times_ns)
+                elif item.camera == 0:
+                    delays_s.append(time.monotonic() - sent_s[item.stamp_ns])
+                    time.sleep(0.12)
+            thread.join()
+    assert np.array_equal(np.concatenate(samples), content.imu_ns)
+    assert 10 <= len(delays_s) < 30
+    assert recording.inbox.dropped_sets == 40 - len(delays_s)
+    assert np.median(delays_s) < 1.0
+    (note,) = [note for note in recording.notes if "left out because they had waited" in note]
+    assert note.startswith(f"{recording.inbox.dropped_sets} sets of images")

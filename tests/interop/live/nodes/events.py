@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +29,9 @@ def options() -> argparse.Namespace:
     parser.add_argument("--limit", type=int, default=0, help="events to send; 0 = all")
     parser.add_argument("--rounds", type=int, default=1, help="forward and backward in turn")
     parser.add_argument("--ahead_s", type=float, default=0.0, help="before the odometry; 0 = any")
+    parser.add_argument("--begin_s", type=float, default=0.0, help="leave out the first seconds")
     parser.add_argument("--last_s", type=float, default=0.0, help="end after so long; 0 = never")
+    parser.add_argument("--killed", action="store_true", help="die without a word at the end")
     parser.add_argument("--best_effort", action="store_true", help="ROS 2")
     parser.add_argument("--no_wait", action="store_true", help="do not wait for subscribers")
     return parser.parse_args()
@@ -66,6 +70,8 @@ class Player:
                 self._sent_s[stamp_ns] = time.monotonic()
             send(stamp_ns, sensor, content)
             self._sent[sensor] += 1
+        if self._options.killed:
+            os.kill(os.getpid(), signal.SIGKILL)
         deadline_s, count = time.monotonic() + _LONGEST_QUIET_S, -1
         while self.odometry != count and time.monotonic() < deadline_s:
             count = self.odometry
@@ -115,6 +121,7 @@ class Player:
         chosen = self._options
         events = _load(chosen.recording, chosen.cameras)[: chosen.limit or None]
         begin_ns, end_ns = events[0][0], events[-1][0]
+        events = [e for e in events if e[0] >= begin_ns + round(1e9 * chosen.begin_s)]
         for number in range(chosen.rounds):
             offset_ns = number * (end_ns - begin_ns)
             is_backward = number % 2 == 1
