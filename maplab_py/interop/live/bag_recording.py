@@ -13,7 +13,14 @@ from typing import ClassVar
 from maplab_py.errors import FlagError, UserError
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import Topic, Transport, pause, wait_for_topics
+from maplab_py.interop.live.transport import (
+    LOOK_EVERY_S,
+    Topic,
+    Transport,
+    pause,
+    topic_of,
+    wait_for_topics,
+)
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.bag_writing import (
     BagMessage,
@@ -26,7 +33,6 @@ from maplab_py.options import option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
 
-_LOOK_EVERY_S = 0.1
 _MAX_WAITING = 20_000
 """Messages that may wait for the disk; beyond, they are left out and counted."""
 _MAX_WAITING_BYTES = 1 << 30
@@ -50,7 +56,7 @@ class RecordingOptions:
         """
         if not 0.0 <= self.duration_s < 1e9:
             raise FlagError(f"--record_duration_s={self.duration_s:g}: wants 0 or more")
-        return [f"/{word.strip().strip('/')}" for word in self.topics.split(",") if word.strip()]
+        return [topic_of(word) for word in self.topics.split(",") if word.strip()]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +191,7 @@ class _Arrivals:
         last_ns = 0
         while not is_to_end() and not 0.0 < self._longest_s <= time.monotonic() - begin_s:
             try:
-                message = self._queue.get(timeout=_LOOK_EVERY_S)
+                message = self._queue.get(timeout=LOOK_EVERY_S)
             except queue.Empty:
                 if 0.0 < self._silence_s < time.monotonic() - heard_s:
                     break

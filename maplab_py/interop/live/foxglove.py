@@ -15,14 +15,21 @@ from typing import Any, NamedTuple
 
 from maplab_py.errors import UserError
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES, Publish, Take, Topic, answer_of
+from maplab_py.interop.live.transport import (
+    MAX_MESSAGE_BYTES,
+    Publish,
+    Take,
+    Topic,
+    answer_of,
+    ros2_type,
+)
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Those of foxglove_bridge from 3.0 on, and before."""
 MESSAGE_HEADER = struct.Struct("<BIQ")  # operation, subscription, time of the log
 CLIENT_HEADER = struct.Struct("<BI")  # operation, channel of the client
 MESSAGE_DATA = 1
-_ENCODINGS = {"cdr": True, "ros1": False}
+_ENCODINGS = ("cdr", "ros1")
 _CONNECT_S = 5.0
 _RETRY_S = 1.0
 _RECEIVE_S = 0.5
@@ -238,10 +245,7 @@ class FoxgloveClient:
 
 def _channel(entry: dict[str, Any]) -> _Channel:
     """Return a channel as the server announces it; schemas of ROS 1 have names of two parts."""
-    kind = str(entry["schemaName"])
-    package, _, name = kind.partition("/")
-    if "/" in kind and kind.count("/") == 1:
-        kind = f"{package}/msg/{name}"
+    kind = ros2_type(str(entry["schemaName"]))
     return _Channel(int(entry["id"]), str(entry["topic"]), str(entry["encoding"]), kind)
 
 

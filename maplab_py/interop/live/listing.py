@@ -9,12 +9,10 @@ from functools import partial
 from maplab_py.errors import FlagError
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import Topic, Transport
+from maplab_py.interop.live.transport import LOOK_EVERY_S, Topic, Transport
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-
-_LOOK_EVERY_S = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +80,7 @@ def _listen(transport: Transport, listen_s: float, progress: Progress) -> dict[s
             if name not in sizes and topic.type in known:
                 sizes[name] = []
                 transport.subscribe(topic, partial(_note_size, sizes[name]))
-        time.sleep(_LOOK_EVERY_S)
+        time.sleep(LOOK_EVERY_S)
     return sizes
 
 

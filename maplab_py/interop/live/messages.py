@@ -10,7 +10,6 @@ from maplab_py.errors import MapError
 from maplab_py.interop.live.transport import MAX_MESSAGE_BYTES
 from maplab_py.interop.recordings.bag_files import imu_sample
 from maplab_py.interop.recordings.images import image_of_message
-from maplab_py.interop.recordings.paired_imu import PairedImu as PairedImu
 from maplab_py.interop.recordings.paired_imu import Sample
 from maplab_py.interop.recordings.protocol import ImageData
 from maplab_py.sensors import Camera

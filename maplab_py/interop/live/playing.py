@@ -11,7 +11,7 @@ from maplab_py.errors import FlagError, UserError
 from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import Publish, Transport
+from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
 from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bags import IMU_TYPE
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Recording
@@ -19,12 +19,10 @@ from maplab_py.options import option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
-_LOOK_EVERY_S = 0.1
 _STATUS_EVERY = 50
 _SETTLE_S = 0.5
 """Both sides have to learn of each other before the first message."""
 _DRAIN_S = 1.0
-_LONGEST_SLEEP_S = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +140,7 @@ class _Player:
                 time.sleep(_SETTLE_S)
                 return
             progress.step(0.0, 0.0, "waiting for subscribers")
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(LOOK_EVERY_S)
 
     def play(self, progress: Progress, is_to_end: Callable[[], bool]) -> None:
         """Send everything at its time."""
@@ -224,5 +222,5 @@ class _Player:
             return
         due_s = self._begin_s + (time_ns - self._first_ns) * 1e-9 / rate
         while (left_s := due_s - time.monotonic()) > 0.0 and not is_to_end():
-            time.sleep(min(left_s, _LONGEST_SLEEP_S))
+            time.sleep(min(left_s, LOOK_EVERY_S))
         self._largest_delay_s = max(self._largest_delay_s, -left_s)

@@ -26,7 +26,14 @@ from maplab_py.interop.live.tcpros import (
     receive_header,
     receive_message,
 )
-from maplab_py.interop.live.transport import Publish, Take, Topic, answer_of, listening_address
+from maplab_py.interop.live.transport import (
+    Publish,
+    Take,
+    Topic,
+    answer_of,
+    listening_address,
+    ros2_type,
+)
 from maplab_py.interop.recordings.bag_files import message_types
 
 _MASTER_TIMEOUT_S = 5.0
@@ -75,7 +82,7 @@ class Ros1:
         types = dict(self._ask("getTopicTypes"))
         publishers = dict(self._ask("getSystemState")[0])
         return {
-            name: Topic(name, _two_part_to_ros2(types[name]), len(nodes))
+            name: Topic(name, ros2_type(types[name]), len(nodes))
             for name, nodes in sorted(publishers.items())
             if name in types and set(nodes) != {self._node}
         }
@@ -88,7 +95,7 @@ class Ros1:
     def advertise(self, topic: str, kind: str) -> Publish:
         """Announce messages of a type; return what sends them."""
         definition, md5sum = self._store.generate_msgdef(kind, ros_version=1)
-        publication = _Publication(self._node, topic, _ros2_to_two_part(kind), md5sum, definition)
+        publication = _Publication(self._node, topic, _ros1_type(kind), md5sum, definition)
         self._publications[topic] = publication
         self._ask("registerPublisher", topic, publication.type, self._api)
         return publication.send
@@ -138,7 +145,7 @@ class Ros1:
         return value
 
     def _register(self, topic: Topic) -> list[str]:
-        kind = _ros2_to_two_part(topic.type)
+        kind = _ros1_type(topic.type)
         return list(self._ask("registerSubscriber", topic.name, kind, self._api))
 
     def _keep_registered(self) -> None:
@@ -226,7 +233,7 @@ class Ros1:
             request = {
                 "callerid": self._node,
                 "topic": topic.name,
-                "type": _ros2_to_two_part(topic.type),
+                "type": _ros1_type(topic.type),
                 "md5sum": md5sum,
                 "tcp_nodelay": "1",
             }
@@ -319,11 +326,6 @@ def _proxy(uri: str, timeout_s: float) -> xmlrpc.client.ServerProxy:
     return xmlrpc.client.ServerProxy(uri, transport=transport)
 
 
-def _two_part_to_ros2(kind: str) -> str:
-    """Return sensor_msgs/msg/Image for sensor_msgs/Image, as the readers of bags call it."""
-    package, _, name = kind.partition("/")
-    return f"{package}/msg/{name}"
-
-
-def _ros2_to_two_part(kind: str) -> str:
+def _ros1_type(kind: str) -> str:
+    """Return sensor_msgs/Image for sensor_msgs/msg/Image."""
     return kind.replace("/msg/", "/")

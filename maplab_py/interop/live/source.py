@@ -14,13 +14,20 @@ from maplab_py.array_types import F64
 from maplab_py.cancellation import current_token
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import Pixels, bits_of
-from maplab_py.interop.live.messages import PairedImu, image_data, imu_values
+from maplab_py.interop.live.messages import image_data, imu_values
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
-from maplab_py.interop.live.transport import Topic, Transport, wait_for_topics
+from maplab_py.interop.live.transport import (
+    LOOK_EVERY_S,
+    Topic,
+    Transport,
+    topic_of,
+    wait_for_topics,
+)
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.bags import IMAGE_TYPES, IMU_TYPE
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.paired_imu import PairedImu
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
     ImuBatch,
@@ -30,7 +37,6 @@ from maplab_py.interop.recordings.protocol import (
 )
 from maplab_py.report import counted
 
-_LOOK_EVERY_S = 0.1
 _MAX_REMEMBERED = 1000
 _CHECK_AFTER_S = 2.0
 _TELL_AFTER_S = 2.0
@@ -170,7 +176,7 @@ class LiveRecording:
             )
         heard_s, has_told = time.monotonic(), False
         while not self._is_to_end():
-            arrivals = self.inbox.take(_LOOK_EVERY_S)
+            arrivals = self.inbox.take(LOOK_EVERY_S)
             self._tell_problems()
             if arrivals is None:
                 silent_s = time.monotonic() - heard_s
@@ -369,7 +375,7 @@ def _imu_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
             "the calibration names no topic of the IMU: give --imu_topic=TOPIC, or two topics "
             "separated by a comma (gyroscope, accelerometer); live_topics lists what there is"
         )
-    return [_absolute(name) for name in names]
+    return [topic_of(name) for name in names]
 
 
 def _camera_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
@@ -389,11 +395,7 @@ def _camera_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
         )
     if len(set(names)) < len(names):
         raise UserError("two cameras have the same topic: give different --camera_topics")
-    return [_absolute(name) for name in names]
-
-
-def _absolute(topic: str) -> str:
-    return f"/{topic.strip('/')}"
+    return [topic_of(name) for name in names]
 
 
 def _check_type(transport: Transport, topic: Topic, wanted: Sequence[str]) -> None:

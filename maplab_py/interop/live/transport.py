@@ -18,7 +18,8 @@ from maplab_py.interop.recordings.bag_files import listed_topics
 MAX_MESSAGE_BYTES = 200_000_000
 """Larger messages are refused before memory is reserved for them; an image of 60 megapixels fits."""
 LOOPBACK = "127.0.0.1"
-_LOOK_EVERY_S = 0.1
+LOOK_EVERY_S = 0.1
+"""Interval at which waiting loops look for messages, publishers and the end."""
 _SIOCGIFADDR = 0x8915  # <linux/sockios.h>
 
 _T = TypeVar("_T")
@@ -92,6 +93,17 @@ def wait_for_topics(transport: Transport, names: list[str], wait_s: float) -> li
     )
 
 
+def topic_of(name: str) -> str:
+    """Return the full name of a topic as the user writes it."""
+    return f"/{name.strip().strip('/')}"
+
+
+def ros2_type(kind: str) -> str:
+    """Return sensor_msgs/msg/Image for sensor_msgs/Image of ROS 1; another name as it is."""
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}" if kind.count("/") == 1 else kind
+
+
 def answer_of(ask: Callable[[], _T], wait_s: float) -> _T:
     """Ask until there is an answer; a robot may start later than this program.
 
@@ -109,7 +121,7 @@ def answer_of(ask: Callable[[], _T], wait_s: float) -> _T:
         pause()
 
 
-def pause(wait_s: float = _LOOK_EVERY_S) -> None:
+def pause(wait_s: float = LOOK_EVERY_S) -> None:
     """Wait a moment, unless the user wants the end.
 
     Raises:

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.errors import MapError
-from maplab_py.interop.live.messages import PairedImu, image_data, imu_values
+from maplab_py.interop.live.messages import image_data, imu_values
 from maplab_py.interop.live.receiving import Inbox, Message, SetMatcher, TopicCounts
 from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.paired_imu import PairedImu
 from maplab_py.sensors import Camera, Distortion, Projection
 from tests.interop.live.support import imu_message
 
