@@ -16,6 +16,11 @@ from maplab_py.interop.recordings.bag_files import header_stamp_ns
 
 _MAX_PENDING = 20
 """Images of a camera that may wait for their partners."""
+_FIRST_STEPS = 20
+"""Steps between stamps from which the usual step is taken."""
+_TRACKING_RATE = 0.02  # by which the usual step follows later ones
+_LONGEST_HOLE_NS = 10**9
+"""A longer pause is the publisher's: it was stopped, or started again."""
 _START_S, _START_DELAY_S = 30.0, 10.0
 """In the beginning images may wait longer: the estimator loads its kernels, and catches up."""
 
@@ -25,6 +30,7 @@ class TopicCounts:
     """Messages of one topic."""
 
     received: int = 0
+    missing: int = 0  # as the holes between the stamps tell: lost on the way, or never sent
     not_later: int = 0  # stamps that do not come after their predecessor's: left out
     damaged: int = 0
     first_s: float = 0.0  # arrival, monotonic
@@ -32,6 +38,8 @@ class TopicCounts:
     first_stamp_ns: int = 0
     last_stamp_ns: int = -1
     stamp_delay_s: float = 0.0  # from the last stamp to its arrival, by the clock of this computer
+    _first_steps_ns: list[int] = dataclasses.field(default_factory=list)
+    _usual_step_ns: float = 0.0
 
     @property
     def rate_hz(self) -> float:
@@ -55,9 +63,23 @@ class TopicCounts:
             return None
         if self.last_stamp_ns < 0:
             self.first_stamp_ns = stamp_ns
+        else:
+            self._note_step(stamp_ns - self.last_stamp_ns)
         self.last_stamp_ns = stamp_ns
         self.stamp_delay_s = time.time() - stamp_ns * 1e-9
         return stamp_ns
+
+    def _note_step(self, step_ns: int) -> None:
+        """Count the messages that are missing in a step, by the usual one (a running median)."""
+        if not self._usual_step_ns:
+            self._first_steps_ns.append(step_ns)
+            if len(self._first_steps_ns) == _FIRST_STEPS:
+                self._usual_step_ns = float(sorted(self._first_steps_ns)[_FIRST_STEPS // 4])
+            return
+        if step_ns < _LONGEST_HOLE_NS:
+            self.missing += max(round(step_ns / self._usual_step_ns) - 1, 0)
+        is_longer = step_ns > self._usual_step_ns
+        self._usual_step_ns *= 1.0 + (_TRACKING_RATE if is_longer else -_TRACKING_RATE)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from maplab_py.interop.live.ros2_types import dds_type, ros_type_name, type_hash
 from maplab_py.interop.live.transport import (
     LOOPBACK,
     MAX_MESSAGE_BYTES,
+    RAISE_RECEIVE_BUFFERS,
+    SOCKET_BYTES,
     Publish,
     Take,
     Topic,
@@ -26,7 +29,6 @@ from maplab_py.interop.live.transport import (
 
 _PREFIX = "rt"  # of the topics of ROS, in DDS
 _MAX_PARTICIPANTS = 30
-_SOCKET_BYTES = 8 << 20
 _ENOUGH_SOCKET_BYTES = 4_000_000
 """An image is sent as hundreds of packets at once; with the usual 208 kB a fifth of the images is lost."""
 _RECEIVE_LIMIT = Path("/proc/sys/net/core/rmem_max")
@@ -34,9 +36,10 @@ _LARGEST_TAKE = 1000
 _WAIT_MS = 100
 _BLOCK_MS = 100
 """A writer that waits for a slow reader holds all threads of Python; so it does not wait long."""
-_CHECK_EVERY = 10  # waits
+_CHECK_EVERY_S = 1.0
 _DEPTHS = {"sensor_msgs/msg/Imu": 2000}
-_DEPTH = 10
+_DEPTH = 30
+"""Messages that wait while Python does something else: 10 s of an IMU, 1.5 s of a camera."""
 _FAST_DDS = "1.15"
 """Vendor whose type information is ignored: Cyclone DDS cannot read that of ROS 2 Kilted, and would
 wait for ever for one that it can (cyclonedds#2333). Topics then match by the names of their types."""
@@ -153,16 +156,15 @@ class Ros2:
         """Take messages as they come; the thread does nothing else, so that none is lost."""
         from cyclonedds.util import duration
 
-        timeout, waits = duration(milliseconds=_WAIT_MS), 0
+        timeout, check_s = duration(milliseconds=_WAIT_MS), time.monotonic() + _CHECK_EVERY_S
         while not self._is_closed:
-            count = self._waits.wait(timeout)
+            self._waits.wait(timeout)
             with self._lock:
                 readers = list(self._readers.values())
             for reader in readers:
                 reader.take_all()
-            waits += not count
-            if waits >= _CHECK_EVERY:
-                waits = 0
+            if time.monotonic() >= check_s:
+                check_s = time.monotonic() + _CHECK_EVERY_S
                 self._follow_publishers()
 
     def _follow_publishers(self) -> None:
@@ -237,7 +239,7 @@ def _configuration(network: NetworkOptions) -> str:
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
         f"<Peers>{listed}</Peers></Discovery>"
         # a least size that the kernel refuses would end the domain
-        f'<Internal><SocketReceiveBufferSize max="{_SOCKET_BYTES} B"/>'
+        f'<Internal><SocketReceiveBufferSize max="{SOCKET_BYTES} B"/>'
         f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal>"
         f"<Compatibility><IgnoreTypeInformation>{_FAST_DDS}</IgnoreTypeInformation></Compatibility>"
         "</Domain></CycloneDDS>"
@@ -255,5 +257,5 @@ def _socket_problems() -> list[str]:
         return []
     return [
         f"receive buffers are limited to {limit} bytes, so images will be lost: "
-        f"`sudo sysctl -w net.core.rmem_max={_SOCKET_BYTES}`, or publish compressed images"
+        f"`{RAISE_RECEIVE_BUFFERS}`, or publish compressed images"
     ]

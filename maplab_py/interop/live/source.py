@@ -19,6 +19,7 @@ from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
 from maplab_py.interop.live.transport import (
     LOOK_EVERY_S,
+    RAISE_RECEIVE_BUFFERS,
     Topic,
     Transport,
     topic_of,
@@ -346,6 +347,12 @@ class LiveRecording:
                 name = list(self.counts)[len(self._imu_names) + row]
                 yield f"{name}: {counted(count, 'image')} without a partner in the other cameras"
         for name, counts in self.counts.items():
+            if counts.missing:
+                yield (
+                    f"{name}: about {counted(counts.missing, 'message')} missing by the stamps: where the "
+                    "driver leaves none out, raise the receive buffers (on Linux "
+                    f"`{RAISE_RECEIVE_BUFFERS}`), or publish compressed images"
+                )
             if counts.damaged:
                 yield f"{name}: {counted(counts.damaged, 'damaged message')} left out"
             if counts.not_later:

@@ -17,6 +17,8 @@ from maplab_py.interop.recordings.bag_files import listed_topics
 
 MAX_MESSAGE_BYTES = 200_000_000
 """Larger messages are refused before memory is reserved for them; an image of 60 megapixels fits."""
+SOCKET_BYTES = 8 << 20
+RAISE_RECEIVE_BUFFERS = f"sudo sysctl -w net.core.rmem_max={SOCKET_BYTES}"
 LOOPBACK = "127.0.0.1"
 LOOK_EVERY_S = 0.1
 """Interval at which waiting loops look for messages, publishers and the end."""

@@ -117,3 +117,17 @@ def test_a_message_that_claims_a_huge_array_is_refused() -> None:
 def test_samples_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(MapError, match="not a number"):
         imu_values(imu_message(1, is_ros_2=True, accel=float("nan")), is_ros_2=True)
+
+
+def test_missing_messages_are_counted_by_the_holes_between_the_stamps() -> None:
+    counts = TopicCounts()
+    rng = np.random.default_rng(3)
+    lost = set((30 + np.flatnonzero(rng.random(400) < 0.1)).tolist())
+    for row in range(430):
+        pause_ns = 5 * 10**9 if row >= 250 else 0  # the publisher was started again
+        stamp_ns = 10**9 + 50_000_000 * row + int(rng.integers(-4_000_000, 4_000_000)) + pause_ns
+        if row not in lost:
+            counts.stamp_of(imu_message(stamp_ns, is_ros_2=True), is_ros_2=True)
+    assert counts.received == 430 - len(lost)
+    assert abs(counts.missing - len(lost)) <= 2
+    assert counts.not_later == 0

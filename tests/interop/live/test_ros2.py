@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 
 import numpy as np
@@ -12,8 +13,9 @@ from maplab_py.errors import UserError
 from maplab_py.interop.live import ros2
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.live.receiving import TopicCounts
 from maplab_py.interop.live.ros2_types import dds_type_name, ros_type_name
-from maplab_py.interop.live.transport import Topic
+from maplab_py.interop.live.transport import Topic, wait_for_topics
 from tests.interop.live.support import IMU, imu_message
 from tests.support.own_process import in_own_process
 from tests.support.waiting import wait_until
@@ -71,6 +73,50 @@ def test_small_socket_buffers_are_told_with_the_remedy(
     limit.write_text("212992\n")
     (problem,) = ros2._socket_problems()
     assert "sudo sysctl -w net.core.rmem_max=8388608" in problem
+
+
+_SENDER = """
+import sys, time
+import numpy as np
+from maplab_py.interop.bags.sensor_messages import MessageMaker
+from maplab_py.interop.live import ros2
+from maplab_py.interop.live.options import NetworkOptions
+quality = ros2._quality
+ros2._quality = lambda kind, is_reliable: quality(kind, is_reliable=False)
+node = ros2.Ros2(NetworkOptions(ros_domain_id=int(sys.argv[1])))
+publish = node.advertise("/image", "sensor_msgs/msg/Image")
+maker, pixels = MessageMaker(is_ros_2=True), np.zeros((600, 700), np.uint8)
+while not node.subscribers("/image"):
+    time.sleep(0.05)
+for stamp_ns in range(10**9, 9 * 10**9, 50_000_000):
+    publish(maker.image(stamp_ns, "cam0", pixels))
+    time.sleep(0.02)
+"""
+
+
+def _with_small_buffers() -> tuple[int, int]:
+    os.environ["CYCLONEDDS_URI"] = (
+        "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max='100 kB'/></Internal></Domain>"
+        "</CycloneDDS>"
+    )
+    program = subprocess.Popen([sys.executable, "-c", _SENDER, str(_domain())])
+    try:
+        with open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
+            (topic,) = wait_for_topics(node, ["/image"], 60.0)
+            assert not topic.is_reliable
+            counts = TopicCounts()
+            node.subscribe(topic, lambda data: counts.stamp_of(data, is_ros_2=True))
+            assert program.wait(60.0) == 0
+            return counts.received, counts.missing
+    finally:
+        program.kill()
+
+
+def test_images_lost_to_small_buffers_are_counted() -> None:
+    """Of 160 images by best effort; what arrives last may have been lost as well."""
+    received, missing = in_own_process(_with_small_buffers)
+    assert 0 < received < 160
+    assert missing > 0
 
 
 def _wrong_interface() -> str:
