@@ -1,14 +1,17 @@
-"""Triangle meshes as PLY, OBJ, STL and GLB files, the last three written by trimesh."""
+"""Triangle meshes as PLY, OBJ, STL and GLB files, the last three written and read by trimesh."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from maplab_py.array_types import F64, I32, U8
-from maplab_py.errors import UserError
-from maplab_py.interop.ply import PlyCloud, encode_ply
+from maplab_py.errors import MapError, UserError
+from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
+from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
 from maplab_py.output_files import write_bytes
 
 
@@ -39,6 +42,49 @@ def write_mesh(
     """
     check_mesh_path(path)
     write_bytes(path, _ENCODERS[path.suffix.lower()](p, faces, colours), overwrite=overwrite)
+
+
+def read_mesh(path: Path) -> PlyCloud:
+    """Return the mesh of a file; the axes of glTF are y up and are turned back.
+
+    Raises:
+        OSError: The file cannot be read.
+        MapError: It is damaged, too large, or has no triangles.
+    """
+    kind = path.suffix.lower()
+    data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="reduce the mesh", error=MapError)
+    mesh = (
+        _parsed(data, kind, path)
+        if kind in (".obj", ".stl", ".glb")
+        else parse_ply(data, str(path))
+    )
+    if mesh.faces is None or not len(mesh.faces):
+        raise MapError(f"{path} has no triangles: give a mesh")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.p):
+        raise MapError(f"{path}: a triangle refers to a vertex that is not there")
+    return mesh
+
+
+def _parsed(data: bytes, kind: str, path: Path) -> PlyCloud:
+    import trimesh
+
+    try:
+        content: Any = trimesh.load(
+            io.BytesIO(data), file_type=kind[1:], force="mesh", process=False, maintain_order=True
+        )
+        p = np.asarray(content.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.asarray(content.faces, dtype=np.int32).reshape(-1, 3)
+        colours = content.visual.vertex_colors[:, :3] if content.visual.kind == "vertex" else None
+    except Exception as error:
+        remedy = f"write it again, as one of {', '.join(_ENCODERS)}"
+        raise MapError(
+            f"{path}: is damaged, or no mesh in the format of its name: {remedy}"
+        ) from error
+    if not np.all(np.isfinite(p)):
+        raise MapError(f"{path}: a vertex is not a number: write the mesh again")
+    if kind == ".glb":
+        p = np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1)
+    return PlyCloud(p, None if colours is None else np.array(colours, dtype=np.uint8), faces=faces)
 
 
 def _ply(p: F64, faces: I32, colours: U8 | None) -> list[bytes]:

@@ -11,9 +11,8 @@ from maplab_py.algorithms.dense.field import known_voxels, load_fields
 from maplab_py.algorithms.dense.meshing import map_mesh, vertex_colours
 from maplab_py.algorithms.dense.triangle_tree import TriangleTree
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.errors import MapError, UserError
-from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
-from maplab_py.interop.ply import parse_ply
+from maplab_py.errors import UserError
+from maplab_py.interop import mesh_files
 from maplab_py.progress import SILENT, Progress
 from maplab_py.viewer import colours
 from maplab_py.viewer.layers.clouds import Cloud
@@ -83,21 +82,16 @@ def _ramp(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> 
 
 
 def read_mesh(path: Path, flag: str = "--mesh_file") -> Cloud:
-    """Return the mesh of a PLY file, in G; messages name the flag.
+    """Return the mesh of a file (.ply, .obj, .stl or .glb), in G; messages name the flag.
 
     Raises:
-        UserError: The file cannot be read, or has no triangles.
-        MapError: It is no PLY file, or damaged.
+        UserError: The file cannot be read.
+        MapError: It is no mesh, or damaged.
     """
     try:
-        data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="reduce the mesh", error=MapError)
+        content = mesh_files.read_mesh(path)
     except OSError as error:
         raise UserError(f"{flag}={path} cannot be read ({error.strerror})") from error
-    content = parse_ply(data, str(path))
-    if content.faces is None or not len(content.faces):
-        raise UserError(f"{flag}={path} has no triangles: give a mesh")
-    if content.faces.min() < 0 or content.faces.max() >= len(content.p):
-        raise MapError(f"{path}: a triangle refers to a vertex that is not there")
     return Cloud(path.name, content.p, content.colours, faces=content.faces)
 
 

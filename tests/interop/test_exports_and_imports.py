@@ -10,17 +10,32 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.evaluation.localization_evaluation import read_localized
+from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.frontend.localization.record import _HEADER as LOCALIZED_HEADER
 from maplab_py.geometry import se3, so3
-from maplab_py.interop import vertex_states
+from maplab_py.interop import mesh_files, vertex_states
+from maplab_py.interop.bags.exporting import export_bag
+from maplab_py.interop.bags.options import BagExportOptions
+from maplab_py.interop.calibration_export import exported
 from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.interop.imu_csv import read_imu_csv
+from maplab_py.interop.ply import PlyCloud, write_ply
+from maplab_py.interop.recordings.bag_writing import BagFormat
+from maplab_py.interop.recordings.map_replay import mission_sample_rows
+from maplab_py.interop.recordings.opening import given_device
+from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.resources.point_clouds import read_cloud
 from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc, write_tum
+from maplab_py.sensors import Distortion
+from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
+from tests.algorithms.self_calibration.scenes import scene_map
 from tests.algorithms.test_external_trajectories import flat_map
+from tests.interop.bags.small_bags import map_with_resources, named
 from tests.interop.small_map import VERTICES
 
 Write = Callable[[VIMap, Path], Path]
@@ -158,3 +173,91 @@ def test_colmap_models_are_read_as_maps_and_calibrations(form: str, tmp_path: Pa
         np.testing.assert_allclose(session.vi_map.T_G_I, vi_map.T_G_I, atol=1e-12)
         report = session.run("import_calibration", calibration_file=tmp_path)
         assert len(report.cameras) == 2
+
+
+def calibrations(vi_map: VIMap, folder: Path, form: str) -> tuple[Path, ...]:
+    """Write the device of a map as every command does; return the files, cameras first."""
+    if form == "save":
+        save_map(vi_map, folder / "map")
+        return (next((folder / "map").rglob("sensors.yaml")),)
+    if form == "export_ncamera_calibration":
+        with Session(load_registry()) as session:
+            session.maps.add("small", vi_map)
+            session.run(form, ncamera_calibration_export_folder=folder)
+        return tuple(folder.glob("ncamera-*.yaml"))
+    for name, text in exported(vi_map.sensors, *device_of(vi_map), form, imu_rate_hz=200.0).items():
+        (folder / name).write_text(text)
+    return tuple(sorted(folder.iterdir(), key=lambda path: "cam" not in path.name))
+
+
+@pytest.mark.parametrize(
+    "form", ["save", "maplab", "kalibr", "openvins", "basalt", "export_ncamera_calibration"]
+)
+def test_calibrations_are_read_by_the_import_and_by_flags(form: str, tmp_path: Path) -> None:
+    vi_map = scene_map(distortion=Distortion.RADTAN)
+    device = device_of(vi_map)
+    files = calibrations(vi_map, tmp_path, form)
+    with Session(load_registry()) as session:
+        flags = dict(zip(("calibration_file", "imu_calibration_file"), files, strict=False))
+        report: Any = session.run("import_calibration", **flags)
+        assert len(report.cameras) == len(vi_map.sensors.camera_rig(device.rig).cameras)
+    flags = dict(zip(("sensor_calibration_file", "imu_calibration_file"), files, strict=False))
+    read = given_device(SourceOptions(**flags), "a bag")
+    expected = vi_map.sensors.camera_rig(device.rig).cameras
+    for camera, own in zip(read.cameras, expected, strict=True):
+        np.testing.assert_allclose(camera.intrinsics, own.intrinsics, rtol=1e-12)
+        np.testing.assert_allclose(camera.distortion_parameters, own.distortion_parameters)
+        assert (camera.width_px, camera.height_px) == (own.width_px, own.height_px)
+    if form == "export_ncamera_calibration":
+        assert not read.imu_id  # a rig alone: its cameras are relative to each other
+        return
+    np.testing.assert_allclose(read.T_I_C, vi_map.sensors.T_I_C(*device), atol=1e-9)
+    imu, own_imu = read.sensors.imu(read.imu_id), vi_map.sensors.imu(device.imu)
+    assert imu.acc_noise_density == pytest.approx(own_imu.acc_noise_density, rel=1e-12)
+    assert imu.gyro_noise_density == pytest.approx(own_imu.gyro_noise_density, rel=1e-12)
+
+
+def test_graphs_are_read_with_their_values(tmp_path: Path) -> None:
+    vi_map = flat_map()
+    with Session(load_registry()) as session:
+        session.maps.add("small", vi_map)
+        session.run("export_g2o", file=tmp_path / "graph.g2o")
+        session.run("import_g2o", file=tmp_path / "graph.g2o", map_key="graph")
+        graph = session.vi_map
+    np.testing.assert_allclose(graph.T_G_I[:, 4:], vi_map.T_G_I[:, 4:], atol=1e-9)
+    turns = so3.multiply(so3.inverse(graph.T_G_I[:, :4]), vi_map.T_G_I[:, :4])
+    assert np.linalg.norm(so3.log(turns), axis=1).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", BagFormat)
+def test_bags_are_described_by_recording_info(kind: BagFormat, tmp_path: Path) -> None:
+    vi_map, images, _ = map_with_resources()
+    path = named(tmp_path, kind)
+    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
+    (tmp_path / "sensors.yaml").write_text(write_sensors(vi_map.sensors))
+    with Session(load_registry()) as session:
+        report: Any = session.run(
+            "recording_info",
+            recording=path,
+            sensor_calibration_file=tmp_path / "sensors.yaml",
+            imu_topic="/imu0",
+        )
+    assert report.frame_sets == len(images)
+    assert report.imu.samples == len(mission_sample_rows(vi_map, 0))
+    assert report.notes == ()
+
+
+def test_clouds_are_read_as_resources_and_meshes(tmp_path: Path) -> None:
+    p = np.random.default_rng(5).normal(size=(12, 3)).astype(np.float32).astype(np.float64)
+    colours = np.arange(36, dtype=np.uint8).reshape(12, 3)
+    for cloud in (PlyCloud(p), PlyCloud(p, colours), PlyCloud(p, intensity=p[:, 0])):
+        write_ply(cloud, tmp_path / "cloud.ply")
+        read = read_cloud(tmp_path / "cloud.ply")
+        np.testing.assert_array_equal(read.p, p)
+        for name in ("colours", "intensity"):
+            np.testing.assert_array_equal(getattr(read, name), getattr(cloud, name))
+    faces = np.arange(12, dtype=np.int32).reshape(4, 3)
+    for suffix in (".ply", ".obj", ".stl", ".glb"):
+        mesh_files.write_mesh(p, faces, tmp_path / f"mesh{suffix}", colours)
+        mesh = mesh_files.read_mesh(tmp_path / f"mesh{suffix}")
+        np.testing.assert_allclose(mesh.p[mesh.faces], p[faces], atol=1e-6)

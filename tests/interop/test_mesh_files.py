@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.errors import UserError
-from maplab_py.interop.mesh_files import write_mesh
+from maplab_py.errors import MapError, UserError
+from maplab_py.interop.mesh_files import read_mesh, write_mesh
 from maplab_py.interop.ply import parse_ply
 
 P = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
@@ -91,3 +91,29 @@ def test_other_formats_and_existing_files_are_refused(tmp_path: Path) -> None:
     write_mesh(P, FACES, tmp_path / "mesh.stl")
     with pytest.raises(UserError, match="--overwrite"):
         write_mesh(P, FACES, tmp_path / "mesh.stl")
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "stl", "glb"])
+def test_every_format_reads_back(kind: str, tmp_path: Path) -> None:
+    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [10, 20, 30]], dtype=np.uint8)
+    path = tmp_path / f"mesh.{kind}"
+    write_mesh(P, FACES, path, colours)
+    read = read_mesh(path)
+    assert read.faces is not None
+    np.testing.assert_allclose(read.p[read.faces], P[FACES], atol=1e-7)
+    if kind == "stl":
+        assert read.colours is None
+    else:
+        assert read.colours is not None
+        np.testing.assert_array_equal(read.colours[read.faces], colours[FACES])
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "stl", "glb"])
+def test_damaged_meshes_are_refused_by_name(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"mesh.{kind}"
+    write_mesh(P, FACES, path)
+    data = path.read_bytes()
+    for cut in (b"", b"\xff\xfe", data[: len(data) // 4]):
+        path.write_bytes(cut)
+        with pytest.raises(MapError, match=rf"mesh\.{kind}"):
+            read_mesh(path)

@@ -35,11 +35,11 @@ def visualize_mesh(
     """Show the map with the mesh of its grids, or with a mesh from a file.
 
     Args:
-        mesh_file: PLY file with triangles in the global frame; empty = the mesh of the map's grids.
+        mesh_file: Triangles in the global frame (PLY, OBJ, STL, GLB); empty = the mesh of the map's grids.
         mesh_colouring: shaded = one colour, colour = that of the images or of the file, height = by z,
             distance = from the mesh of --mesh_reference_file; auto = the distance with such a file, else
             colours if there are any, else one colour.
-        mesh_reference_file: PLY file of another mesh, in the global frame.
+        mesh_reference_file: File of another mesh, in the global frame.
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
         dense_result_mesh_colours: Colour the mesh of the grids by the images of the map, as colour does.
     """
