@@ -15,6 +15,8 @@ from maplab_py.interop.ply import PlyCloud
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER_BYTES = 100_000
 _MAX_POINTS = 100_000_000
+_SINGLE = ("x", "y", "z", "intensity", "rgb", "rgba")
+"""Fields of one value."""
 
 
 def parse_pcd(data: bytes, source: str) -> PlyCloud:
@@ -31,16 +33,14 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
         raise MapError(f"{source}: the PCD header has no number of POINTS") from None
     if not 0 <= count <= _MAX_POINTS:
         raise MapError(f"{source}: the PCD header names {count} points; take fewer")
-    form = header.get("DATA", [""])[0]
+    form = next(iter(header.get("DATA", [])), "")
     if form == "binary_compressed":
         raise MapError(f"{source}: compressed PCD is not read: save it as binary or ascii")
     if form not in ("ascii", "binary"):
         raise MapError(f"{source}: the PCD header has no line DATA ascii or DATA binary")
-    if any(
-        dtype[name].shape for name in ("x", "y", "z", "intensity") if name in (dtype.names or ())
-    ):
+    if any(dtype[name].shape for name in dtype.names or () if name in _SINGLE):
         raise MapError(
-            f"{source}: the PCD header gives a coordinate or intensity several values (COUNT)"
+            f"{source}: the PCD header gives a coordinate, intensity or colour several values (COUNT)"
         )
     try:
         if form == "binary":
