@@ -196,9 +196,8 @@ def _dense() -> Figures:
 
 
 def _localisation() -> Figures:
-    from maplab_py.algorithms.localization.queries import queries, query_vertices
-
     from maplab_py.algorithms.localization.database import database_of_map
+    from maplab_py.algorithms.localization.localization import queries, query_vertices
     from maplab_py.algorithms.localization.localizer import Localizer, Outcome
     from maplab_py.algorithms.localization.options import LocalizationOptions
     from tests.benchmarks.localization import QUERIES, maps

@@ -15,10 +15,11 @@ from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.interop.calibration_export import exported
 from maplab_py.interop.calibration_import import CalibrationFile, import_calibration
 from maplab_py.sensors import Distortion, Projection, SensorSet
-from maplab_py.sensors.camera import Camera
+from maplab_py.sensors.camera import CAMERA_MODELS, Camera
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from tests.algorithms.self_calibration.scenes import INTRINSICS, scene_map
 from tests.support.data import shared_data
+from tests.support.scene import Scene
 
 CAMCHAIN = """cam0:
   T_cam_imu:
@@ -339,6 +340,30 @@ def test_basalt_models_there_and_back(
         0
     ]
     np.testing.assert_array_equal(again.intrinsics, camera.intrinsics)
+    np.testing.assert_array_equal(again.distortion_parameters, camera.distortion_parameters)
+
+
+@pytest.mark.parametrize("form", ["kalibr", "basalt"])
+@pytest.mark.parametrize("model", CAMERA_MODELS, ids=lambda m: "-".join(x.value for x in m))
+def test_every_camera_comes_back_or_is_refused(
+    model: tuple[Projection, Distortion], form: str, tmp_path: Path
+) -> None:
+    vi_map = Scene(vertices=3, models=(model,)).make()
+    device = device_of(vi_map)
+    if (
+        model[1] in (Distortion.RADTAN5, Distortion.RATIONAL)
+        if form == "kalibr"
+        else model[0] is Projection.UNIFIED and model[1] is not Distortion.NONE
+    ):
+        with pytest.raises(UserError, match=rf"no .*{model[1].value} distortion"):
+            exported(vi_map.sensors, *device, form, imu_rate_hz=200.0)
+        return
+    files = exported(vi_map.sensors, *device, form, imu_rate_hz=200.0)
+    paths = [written(tmp_path, name, text) for name, text in files.items()]
+    (again,) = cameras(import_calibration(*sorted(paths)))
+    (camera,) = vi_map.sensors.camera_rig(device[1]).cameras
+    assert (again.projection, again.distortion) == model
+    np.testing.assert_allclose(again.intrinsics, camera.intrinsics, rtol=1e-14)
     np.testing.assert_array_equal(again.distortion_parameters, camera.distortion_parameters)
 
 
