@@ -120,6 +120,7 @@ class BagRecording:
         self._bits = [CONTAINER_BITS] * len(device.cameras)
         self.first_sizes_px: dict[int, tuple[int, int]] = {}
         self._clocks: list[ClockFilter[Any]] = []
+        self._is_apart = False
         topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
         if len(topics) != len(device.cameras):
             raise UserError(
@@ -384,6 +385,7 @@ class BagRecording:
             )
         sensors = [counts[s.camera] for s in self._streams if s.camera < 0]
         cameras = [counts[s.camera] for s in self._streams if s.camera >= 0]
+        self._is_apart = part > 1 and min(counts.values()) < count
         common_part_count(self.name, max(sensors, default=None), cameras)
         divided = [of_stream for of_stream in runs if len(of_stream) == count]
         if part > 1:
@@ -400,11 +402,14 @@ class BagRecording:
                 for stream, of_stream in zip(self._streams, runs, strict=True)
             ]
 
-    def check_common_time(self) -> None:
+    def check_common_time(self, *, has_shift: bool) -> None:
         """Check that IMU and images have some time in common, as far as first stamps tell.
 
+        Args:
+            has_shift: The shift between their clocks was given.
+
         Raises:
-            MapError: They have none.
+            MapError: They have none, or are of clocks that differ.
         """
         spans_ns: tuple[list[tuple[int, int]], ...] = [], []  # of the IMU, of cameras
         for stream in self._streams:
@@ -414,7 +419,13 @@ class BagRecording:
             imu, images = ((min(s)[0], max(end for _, end in s)) for s in spans_ns)
             delay_ns = self._streams[-1].delay_ns - self._streams[0].delay_ns
             shift_ns = self.device.cameras[-1].time_offset_ns + delay_ns
-            check_common_time(self.name, imu, images, f"{shift_ns} by the times of arrival")
+            check_common_time(
+                self.name,
+                imu,
+                images,
+                f"{shift_ns} by the times of arrival",
+                is_apart=self._is_apart and not has_shift,
+            )
 
     def _examined(
         self, reader: BagReader, stream: _Stream, within_ns: tuple[int, int] | None = None

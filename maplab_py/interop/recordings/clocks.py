@@ -150,7 +150,12 @@ def restart_error(name: str, restart: Dropped) -> ClockRestart:
 
 
 def check_common_time(
-    name: str, imu_ns: tuple[int, int], images_ns: tuple[int, int], proposal: str
+    name: str,
+    imu_ns: tuple[int, int],
+    images_ns: tuple[int, int],
+    proposal: str,
+    *,
+    is_apart: bool = False,
 ) -> None:
     """Check that the spans (first, last) of IMU and images have some time in common.
 
@@ -159,16 +164,22 @@ def check_common_time(
         imu_ns: Times of the IMU.
         images_ns: Times of the images in the clock of the IMU.
         proposal: Shift of the images that would help, and why.
+        is_apart: Only one of their clocks has started again, and no shift was given.
 
     Raises:
-        MapError: They have none.
+        MapError: They have none, or are of clocks that differ.
     """
-    if imu_ns[0] <= images_ns[1] and images_ns[0] <= imu_ns[1]:
+    is_common = imu_ns[0] <= images_ns[1] and images_ns[0] <= imu_ns[1]
+    if is_common and not is_apart:
         return
+    reason = (
+        "only one of the clocks of IMU and images starts again before this part"
+        if is_apart
+        else "IMU and images have no time in common"
+    )
     raise MapError(
-        f"{name}: IMU and images have no time in common: the IMU is from {imu_ns[0]} to {imu_ns[1]} ns, the "
-        f"images from {images_ns[0]} to {images_ns[1]} ns: if only a clock is shifted, give "
-        f"--imu_to_camera_time_offset_ns ({proposal})"
+        f"{name}: {reason}: the IMU is from {imu_ns[0]} to {imu_ns[1]} ns, the images from {images_ns[0]} to "
+        f"{images_ns[1]} ns: if only a clock is shifted, give --imu_to_camera_time_offset_ns ({proposal})"
     )
 
 

@@ -84,6 +84,7 @@ class FolderRecording:
         self._bits = [CONTAINER_BITS] * len(device.cameras)
         self._numbers = camera_folders or tuple(range(len(device.cameras)))
         self._names_all = not camera_folders
+        self._is_apart = False
         self._cameras = [
             _ImageTable(root / f"cam{number}", camera, reading)
             for number, camera in zip(self._numbers, device.cameras, strict=True)
@@ -155,13 +156,17 @@ class FolderRecording:
             for table in self._tables:
                 if len(table.parts) < count:
                     table.divide_like(restarting)
+                    self._is_apart = part > 1
         return max(part - 1, 0)
 
-    def check_common_time(self) -> None:
+    def check_common_time(self, *, has_shift: bool) -> None:
         """Check that IMU and images have some time in common.
 
+        Args:
+            has_shift: The shift between their clocks was given.
+
         Raises:
-            MapError: They have none.
+            MapError: They have none, or are of clocks that differ.
             UserError: There is no such part.
         """
         part = self._part
@@ -172,7 +177,8 @@ class FolderRecording:
             span_ns = int(imu_ns[0]), int(imu_ns[-1])
             shift_ns = self.device.cameras[0].time_offset_ns + span_ns[0] - images_ns[0]
             proposal = f"{shift_ns} lets both begin together"
-            check_common_time(self.name, span_ns, images_ns, proposal)
+            is_apart = self._is_apart and not has_shift
+            check_common_time(self.name, span_ns, images_ns, proposal, is_apart=is_apart)
 
     def parts(self) -> tuple[PartSpan, ...]:
         """Return the parts into which restarts of the clock divide the recording."""

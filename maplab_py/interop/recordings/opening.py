@@ -35,7 +35,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             raise UserError(f"{path} is a folder: --use_arrival_time applies to bags only")
         active = options.active_cameras
         device = _chosen(_calibration(options) or import_calibration(root), options)
-        return _checked(FolderRecording(root, device, active, options.reading))
+        return _checked(FolderRecording(root, device, active, options.reading), options)
     if not path.exists():
         raise UserError(f"{path} does not exist: give a folder with mav0, or a ROS bag")
     if not is_bag(path):
@@ -50,18 +50,19 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
             imu_topics=options.topics_of_imu,
             camera_topics=options.topics_of_cameras,
             reading=options.reading,
-        )
+        ),
+        options,
     )
 
 
-def _checked(recording: BagRecording | FolderRecording) -> Recording:
+def _checked(recording: BagRecording | FolderRecording, options: SourceOptions) -> Recording:
     """Return the recording if its sensors have time in common and images the size that was calibrated.
 
     Raises:
         MapError: They have not.
         UserError: There is no such part.
     """
-    recording.check_common_time()
+    recording.check_common_time(has_shift=options.imu_to_camera_time_offset_ns is not None)
     for row, size_px in recording.first_sizes_px.items():
         check_size(f"{recording.name}: camera {row}", recording.device.cameras[row], *size_px)
     return recording
