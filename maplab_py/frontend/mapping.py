@@ -70,6 +70,7 @@ class Mapping:
         staging_parent: Path | None = None,
         observer: Observer | None = None,
         make_starter: MakeStarter | None = None,
+        on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None,
         status: Callable[[], str] = str,
         keeps_states: bool = True,
     ) -> None:
@@ -81,6 +82,7 @@ class Mapping:
             staging_parent: Folder for the temporary folder of images; None = the system's.
             observer: Told of every frame.
             make_starter: See `Odometry`.
+            on_estimate: Told of every frame before the map is built, as publishers of poses are.
             status: Returns what the status line says beside the odometry; mostly nothing.
             keeps_states: Keep the state of every frame for `trajectory`; runs of hours need not.
 
@@ -91,6 +93,7 @@ class Mapping:
         self.options = options or RunOptions()
         self.options.check()
         self._recording, self._observer, self._status = recording, observer, status
+        self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization
         self.localization = opened_localization(localization, device, self.options.odometry.window)
         self.localized = LocalizationRecord()
@@ -192,6 +195,8 @@ class Mapping:
                 self._states.extend(column[0])
         if self.localization is not None:
             self._localize(update, self.localization, progress)
+        if self._on_estimate is not None:
+            self._on_estimate(update, self)
         if self.builder is not None:
             begin = time.perf_counter()
             self._build(update, self.builder)

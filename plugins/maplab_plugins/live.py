@@ -134,14 +134,14 @@ def record_bag(
 
 
 class LiveRun:
-    """A live recording, and the publisher of its poses; observes the run."""
+    """A live recording, and the publisher of its poses."""
 
     def __init__(self, recording: LiveRecording, publisher: PosePublisher | None) -> None:
         """Publish poses of a recording; None = nothing is published."""
         self.recording, self._publisher = recording, publisher
 
-    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
-        """Publish the state of a frame."""
+    def publish(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Publish the state of a frame as soon as it is known."""
         from maplab_py.interop.live.publishing import Estimate
 
         state = update.state

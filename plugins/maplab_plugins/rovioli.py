@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,19 +109,21 @@ def rovioli(
     with contextlib.ExitStack() as stack:
         is_to_end = stack.enter_context(ending_early())
         recording: Recording
+        on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None
         if is_live:
             _check_live(datasource_folder, data, run)
             live_source = stack.enter_context(
                 live_run(context, data.type, source, network, live, run.stream)
             )
             recording, status = live_source.recording, live_source.recording.status
-            observers.insert(0, live_source)  # poses are published before anything else is done
+            on_estimate = live_source.publish
         else:
             recording, status = open_source(datasource_folder, data, source), str
         mapping = Mapping(
             recording,
             run,
             observer=_Several(observers),
+            on_estimate=on_estimate,
             status=status,
             keeps_states=not is_live or run.output.export_estimated_poses_to_csv is not None,
         )
