@@ -90,9 +90,9 @@ def write_messages(
     return recording.device
 
 
-def maplab(command: str, *flags: str) -> list[str]:
+def maplab(command: str) -> list[str]:
     """Return the program that runs a command and prints its report as JSON."""
-    return [sys.executable, "-m", "maplab_py", "--json", "-c", command, *flags]
+    return [sys.executable, "-m", "maplab_py", "--json", "--discard", "-c", command]
 
 
 def run_live(
