@@ -12,6 +12,7 @@ import datetime as dt
 import functools
 import operator
 import re
+from collections.abc import Set
 from pathlib import Path
 from typing import NamedTuple
 
@@ -209,8 +210,8 @@ def _from_nmea(text: str, source: str, date: str) -> GpsTrack:
     given_ns = _day_ns(date) if date else None
     lines = [line for line in text.splitlines() if re.search("(GGA|RMC),", line, re.IGNORECASE)]
     matches = [match for line in lines if (match := _SENTENCE.search(line)) is not None]
-    has_sums = any(match["sum"] for match in matches)
-    sentences = [s for match in matches if (s := _parse(match, has_sums)) is not None]
+    summed = {match["kind"].upper() for match in matches if match["sum"]}
+    sentences = [s for match in matches if (s := _parse(match, summed)) is not None]
     timed = [s for s in sentences if s.clock_ns is not None]
     is_fix = np.array([s.fix is not None for s in timed], dtype=np.bool_)
     times_ns = _times_ns(timed, is_fix, given_ns)
@@ -229,10 +230,10 @@ def _from_nmea(text: str, source: str, date: str) -> GpsTrack:
     )
 
 
-def _parse(match: re.Match[str], has_sums: bool) -> _Sentence | None:
-    """Return what a sentence tells, None if it is damaged."""
+def _parse(match: re.Match[str], summed: Set[str]) -> _Sentence | None:
+    """Return what a sentence tells, None if it is damaged; `summed` are the kinds with check sums."""
     fields, kind = match["fields"].strip().split(","), match["kind"].upper()
-    if not (_is_intact(match) if has_sums else len(fields) >= _LEAST_FIELDS[kind]):
+    if not (_is_intact(match) if kind in summed else len(fields) >= _LEAST_FIELDS[kind]):
         return None
     if kind == "GGA" and (len(fields) < 11 or fields[5] in ("", "0")):
         return _Sentence(None, reason=NO_FIX)
