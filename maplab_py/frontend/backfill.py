@@ -91,8 +91,11 @@ class WaitingFrames:
             from_ns = self.frames[-1].time_ns if self.frames else at_ns
             cut_ns, cut = _cut(times_ns, samples, from_ns, at_ns)
             self.frames.append(
-                dataclasses.replace(frame, time_ns=at_ns, imu_times_ns=cut_ns, accel_gyro=cut)
-            )
+                dataclasses.replace(
+                    frame, time_ns=at_ns, imu_times_ns=cut_ns, accel_gyro=cut,
+                    delay_s=frame.delay_s + 1e-9 * delay_ns,
+                )
+            )  # fmt: skip
             self.stamps_ns.append(stamp_ns)
 
 
@@ -183,6 +186,7 @@ class BackwardReading:
             imu_times_ns=2 * self._origin_ns - after.imu_times_ns[::-1],
             accel_gyro=after.accel_gyro[::-1] * _REVERSED_GYRO,
             motion=after.motion if self._is_resting else Motion.MOVING,
+            delay_s=-frame.delay_s,
         )
 
 

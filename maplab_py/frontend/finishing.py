@@ -201,6 +201,17 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
             f"--imu_to_camera_time_offset_ns={_offset_ns(mapping, delays.delay_s)}"
             " to have it from the beginning (--vio_estimate=none keeps the stamps)"
         )
+    if odometry.calibration_found is not None:
+        found = odometry.calibration_found
+        words, differs = found.words(), found.differs
+        notes.append(f"calibration by the images and the IMU, changes: {', '.join(words)}")
+        if differs:
+            of_map = (
+                "the map has it (--vio_apply_calibration=false keeps the file's)"
+                if mapping.options.odometry.apply_calibration
+                else "the map keeps the file's"
+            )
+            notes.append(f"it differs from the file's by more than three deviations: {of_map}")
     if odometry.scale_sigma > 0.0:
         first_ns = mapping.statistics.first_ns
         since_ns = odometry.trusted_ns

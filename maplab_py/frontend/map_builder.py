@@ -74,6 +74,10 @@ class MapBuilder:
         self._device = device or self._device
         self._missions.append(RecordedMission())
 
+    def calibrate(self, device: RecordedSensors) -> None:
+        """Take the sensors with another calibration, for all missions."""
+        self._device = device
+
     def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
         """Add the samples (S, 6) between two frames, those at the times of both included.
 

@@ -11,6 +11,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.estimation.linear.threads import single_thread
+from maplab_py.estimation.window.calibration import FoundCalibration, WindowCalibration
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.map_rule import MapRule
@@ -117,7 +118,11 @@ class Odometry:
         self.notes: list[str] = []  # what is wrong with the calibration
         self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
         self._delay_ns = 0  # that frames have in addition to the calibrated offset
-        self._backfiller = Backfiller(self._plain_smoother, is_wanted=self.options.backfill)
+        self._calibration = WindowCalibration.of(
+            device.cameras, device.T_I_C, self.options.window_states
+        )
+        self.calibration_found: FoundCalibration | None = None
+        self._backfiller = Backfiller(self._backward_smoother, is_wanted=self.options.backfill)
         self._starter: Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
         self._start_again()
@@ -293,7 +298,7 @@ class Odometry:
         )
         if self._gap_end_ns >= 0:
             return update
-        frame = update.window_frame()
+        frame = dataclasses.replace(update.window_frame(), delay_s=1e-9 * self._delay_ns)
         has_new_delay = self._measure_delay(update, frame)
         if self._smoother is not None:
             return self._smoothed(update, frame, self._smoother)
@@ -421,15 +426,33 @@ class Odometry:
         update.stage_ms["backfill"] = 1e3 * (time.perf_counter() - begin)
         return dataclasses.replace(update, backfill=backfill)
 
-    def _plain_smoother(self) -> FixedLagSmoother:
-        device = self._device
-        return FixedLagSmoother(device.cameras, device.T_I_C, self._imu, self.options.window)
+    def _backward_smoother(self) -> FixedLagSmoother:
+        """Return a smoother for frames before the start, with what is known of the calibration now."""
+        device, values = self._device, self._calibration.mean
+        if self._smoother is not None:
+            values = self._smoother.states.calibration
+        return FixedLagSmoother(
+            device.cameras, device.T_I_C, self._imu, self.options.window,
+            self._calibration.reversed_at(values),
+        )  # fmt: skip
 
     def _new_smoother(self) -> FixedLagSmoother:
-        if self._map_rule is None:
-            return self._plain_smoother()
         device, window = self._device, self.options.window
-        return LocalizedSmoother(device.cameras, device.T_I_C, self._imu, window, self._map_rule)
+        rig = device.cameras, device.T_I_C, self._imu, window
+        if self._map_rule is None:
+            return FixedLagSmoother(*rig, self._calibration)
+        return LocalizedSmoother(*rig, self._map_rule, self._calibration)
+
+    def find_calibration(self) -> None:
+        """Keep what the window says of the calibration now, for the report and the next start."""
+        if self._smoother is None or not len(self._calibration):
+            return
+        found = FoundCalibration(
+            self._calibration, self._smoother.states.calibration,
+            self._smoother.calibration_sigma(), 1e-9 * self._delay_ns,
+        )  # fmt: skip
+        self.calibration_found = found
+        self._calibration = dataclasses.replace(self._calibration, mean=found.values)
 
     def _smoothed(
         self, update: OdometryUpdate, frame: WindowFrame, smoother: FixedLagSmoother
@@ -462,7 +485,7 @@ class Odometry:
         )
 
     def _start_again(self, reason: str = "") -> str:
-        """Forget all estimates and tracks; return the reason as a note."""
+        """Forget all estimates and tracks but the calibration's; return the reason as a note."""
         self._smoother = None
         self._health = HealthMonitor(self.options.health)
         self._starter = self._make_starter(self._device)

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from maplab_py.errors import FlagError
+from maplab_py.estimation.window.calibration import KINDS
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.options import option
@@ -110,9 +111,11 @@ class OdometryOptions:
 
     estimate: str = option(
         "time_offset",
-        choices=("time_offset", "none"),
-        help="Calibration that is estimated beside the motion: time_offset = of the images on the clock of "
-        "the IMU",
+        help="Calibration that is estimated beside the motion, separated by commas: extrinsics, time_offset "
+        "(of the images on the clock of the IMU), intrinsics, line_delay; or none",
+    )
+    apply_calibration: bool = option(
+        True, help="Give the map the calibration that was estimated, where it differs significantly"
     )
     imu_noise: str = option(
         "auto",
@@ -129,7 +132,21 @@ class OdometryOptions:
     @property
     def estimates_time_offset(self) -> bool:
         """Whether the times of images are corrected."""
-        return self.estimate == "time_offset"
+        return "time_offset" in self.estimated
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Kinds of calibration that are estimated."""
+        names = tuple(name.strip() for name in self.estimate.split(","))
+        return () if names == ("none",) else names
+
+    @property
+    def window_states(self) -> tuple[str, ...]:
+        """Kinds of calibration that are states of the window.
+
+        A delay alone is measured beside it, which costs less.
+        """
+        return () if self.estimated == ("time_offset",) else self.estimated
 
     def check(self) -> None:
         """Check the values.
@@ -138,6 +155,12 @@ class OdometryOptions:
             FlagError: A value is out of its range.
         """
         self.tracking.check()
+        for name in self.estimated:
+            if name not in KINDS:
+                raise FlagError(
+                    f"--{self.flag_prefix}estimate: there is no {name}: give some of {', '.join(KINDS)}, "
+                    "separated by commas, or none"
+                )
         self.initialization.check()
         self._check_window()
         self.rest.check()

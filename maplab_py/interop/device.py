@@ -49,6 +49,14 @@ class RecordedSensors:
         """Poses (C, 7) of the cameras on the IMU, on the rig's body when there is no IMU."""
         return self.sensors.T_I_C(self.imu_id, self.rig_id) if self.imu_id else self.rig.T_B_C
 
+    def with_cameras(self, cameras: tuple[Camera, ...], T_I_C: F64) -> RecordedSensors:
+        """Return the same sensors with another calibration of the cameras, poses (C, 7) on the IMU."""
+        T_I_B = self.sensors.T_I_S(self.imu_id, self.rig_id)
+        T_B_C = se3.compose(se3.inverse(T_I_B), T_I_C)
+        rig = dataclasses.replace(self.rig, cameras=cameras, T_B_C=T_B_C)
+        known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, rig.id: rig})
+        return dataclasses.replace(self, sensors=known)
+
     def with_imu(self, imu: Imu) -> RecordedSensors:
         """Return the same sensors with other figures of the IMU."""
         known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, imu.id: imu})

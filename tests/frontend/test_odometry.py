@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.body_states import BodyStates
@@ -15,7 +15,7 @@ from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_options import HealthOptions, OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
 from maplab_py.frontend.starting import Start
-from maplab_py.geometry import so3
+from maplab_py.geometry import se3, so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.protocol import (
     Event,
@@ -360,3 +360,35 @@ def test_without_an_imu() -> None:
     device, _, _ = events_of()
     with pytest.raises(UserError, match="needs an IMU"):
         Odometry(dataclasses.replace(device, imu_id=""))
+
+
+def test_a_wrong_mounting_is_estimated_and_given_to_the_sensors() -> None:
+    device, events, start = events_of(cameras=1)
+    step = np.array([[0.0, 0.0, 0.0, 0.03, -0.02, 0.03]])  # 2.7 deg
+    wrong = device.with_cameras(device.cameras, se3.retract(device.T_I_C, step))
+    odometry = Odometry(wrong, OdometryOptions(estimate="extrinsics"), make_starter=start)
+    states = states_of(pushed(odometry, events))
+    odometry.find_calibration()
+    found = odometry.calibration_found
+    assert found is not None
+    assert found.differs
+    mended = wrong.with_cameras(*found.cameras())
+    off = np.abs(se3.local(device.T_I_C, mended.T_I_C))
+    assert np.degrees(off[:, 3:].max()) < 0.5
+    assert position_errors(start.truth, states.times_ns, states.T_M_I)[-1] < 0.1
+    assert mended.cameras[0].image_delay_s == 0.0
+
+
+def test_only_what_is_named_is_estimated() -> None:
+    device, events, start = events_of(cameras=1)
+    for names, kinds in (("none", ()), ("time_offset", ()), ("line_delay, extrinsics", None)):
+        options = OdometryOptions(estimate=names)
+        options.check()
+        expected = ("line_delay", "extrinsics") if kinds is None else kinds
+        assert options.window_states == expected
+    odometry = Odometry(device, make_starter=start)
+    pushed(odometry, events[:40])
+    odometry.find_calibration()
+    assert odometry.calibration_found is None
+    with pytest.raises(FlagError, match="--vio_estimate: there is no focus: give some of"):
+        OdometryOptions(estimate="extrinsics,focus").check()

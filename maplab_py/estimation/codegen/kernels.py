@@ -81,7 +81,10 @@ def _visual_source() -> str:
 
 def _window_source() -> str:
     anchor, landmark, end = _POSE + 12, _POSE + 24, _POSE + 30
-    places = f"POSE, ANCHOR, LANDMARK, NUM_OUT = {_POSE}, {anchor}, {landmark}, {end}\n\n\n"
+    places = (
+        f"POSE, ANCHOR, LANDMARK, NUM_OUT = {_POSE}, {anchor}, {landmark}, {end}\n"
+        f"DELAY, INTRINSICS = {CAMERA_DELAY_COLUMN}, {CAMERA_INTRINSICS_COLUMN}\n\n\n"
+    )
     names = ("camera", "visual_common", "window")
     return "\n\n".join([_HEADER + places + _camera_source(), *map(template_source, names)])
 

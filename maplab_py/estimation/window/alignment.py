@@ -70,7 +70,7 @@ class AlignmentProblem:
             step = np.linalg.solve(linear.square + np.diag(added), -linear.gradient)
         except np.linalg.LinAlgError:
             raise NotPositiveDefinite(0) from None
-        every = np.zeros(FRAME_SIZE * len(states) + 6)
+        every = np.zeros(FRAME_SIZE * len(states) + len(states.calibration) + 6)
         every[-6:] = step
         moved = states.moved(every, states.h)
         residual, _ = self._prior(moved)

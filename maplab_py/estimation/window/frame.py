@@ -33,6 +33,7 @@ class WindowFrame:
     uv_px: F64  # (K, 2) of the distorted image
     sigma_px: F64  # (K,)
     motion: Motion = Motion.MOVING
+    delay_s: float = 0.0  # by which its time differs from the stamps of its images
 
     def __post_init__(self) -> None:
         """Check the lengths."""

@@ -14,6 +14,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.map_gate import MAP_GATE_CHI2, contradicted_unless_most
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_terms import MapTerms
@@ -53,12 +54,12 @@ class LocalizedSmoother(FixedLagSmoother):
         imu: Imu,
         options: WindowOptions,
         rule: MapRule | None = None,
+        calibration: WindowCalibration | None = None,
     ) -> None:
         """Prepare as `FixedLagSmoother` does."""
-        super().__init__(cameras, T_I_C, imu, options)
+        super().__init__(cameras, T_I_C, imu, options, calibration)
         self.rule = rule or MapRule()
         self.map_tracks = MapTracks(estimates_landmarks=self.rule.estimates_landmarks)
-        self._rig, self._T_I_C = cameras, np.asarray(T_I_C, dtype=np.float64)
         self._used: I64 = np.zeros(0, dtype=np.int64)  # associations of the latest terms
         self._map_rows = self._used  # of these, whose landmarks are states
         self._latest_terms: MapTerms | None = None
@@ -194,8 +195,11 @@ class LocalizedSmoother(FixedLagSmoother):
         )
         self._map_rows = used if self.rule.estimates_landmarks else used[:0]
         self._states = dataclasses.replace(self._states, p_G=self.map_tracks.p_G[self._map_rows])
+        rig = self.calibration.cameras, self.calibration.T_I_C
+        if len(self.calibration):
+            rig = self.calibration.calibrated(self._states.calibration)
         self._latest_terms = MapTerms(
-            observations, self._rig, self._T_I_C,
+            observations, *rig,
             huber_sigmas=self.options.huber_sigmas, tilt_sigma_rad=tilt_sigma_rad,
         )  # fmt: skip
         self._used = used

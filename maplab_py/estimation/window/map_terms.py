@@ -163,7 +163,7 @@ class MapTerms:
             tilt, _ = self._tilt(states.T_G_M[0])
         square[-3:, -3:] += of_tilt.T @ of_tilt
         gradient[-3:] += of_tilt.T @ tilt
-        columns = _columns(len(states))
+        columns = _columns(len(states), len(states.calibration))
         system.gradient[columns] += gradient
         system.diagonal[columns] += np.diagonal(square)
         kept = None
@@ -259,13 +259,18 @@ class MapTerms:
             ],
             axis=2,
         )
-        return MapElimination(_columns(frames), square, coupling, gradient)
+        columns = _columns(frames, len(states.calibration))
+        return MapElimination(columns, square, coupling, gradient)
 
 
-def _columns(frames: int) -> I64:
-    """Return the columns (6 F + 6,) of the poses of all frames and of the base frame."""
+def _columns(frames: int, calibration: int) -> I64:
+    """Return the columns (6 F + 6,) of the poses of all frames and of the base frame.
+
+    Between them are those of the calibration, which observations of a map take for known.
+    """
     of_frames = FRAME_SIZE * np.arange(frames)[:, None] + np.arange(6)
-    return np.concatenate([of_frames.reshape(-1), FRAME_SIZE * frames + np.arange(6)])
+    of_base = FRAME_SIZE * frames + calibration + np.arange(6)
+    return np.concatenate([of_frames.reshape(-1), of_base])
 
 
 def _half_solved(kept: MapElimination) -> tuple[F64, F64]:

@@ -22,25 +22,44 @@ class WindowPrior:
     """The residual root (x - x0) + residual over F frames; x - x0 is the tangent from x0 to x.
 
     Frames it does not touch have zero columns. The linearisation point x0 of a fixed frame stays what it
-    was when a marginalisation first touched it. The columns of a base frame follow those of the frames.
+    was when a marginalisation first touched it. The columns of the calibration and then of a base frame
+    follow those of the frames; that of the calibration moves with it, as it is observable.
     """
 
-    root: F64  # (k, 15 F + 6 B)
+    root: F64  # (k, 15 F + K + 6 B)
     residual: F64  # (k,)
     T_M_I: F64  # (F, 7) x0
     motion: F64  # (F, 9) x0
     is_fixed: Mask  # (F,)
     T_G_M: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))  # (B, 7) x0
     is_base_fixed: bool = False
+    calibration: F64 = dataclasses.field(default_factory=lambda: np.zeros(0))  # (K,) x0
 
     @classmethod
-    def of_state(cls, T_M_I: F64, motion: F64, sigma: F64) -> WindowPrior:
-        """Return the prior of a first frame with standard deviations (15,), infinite = unknown."""
+    def of_state(
+        cls,
+        T_M_I: F64,
+        motion: F64,
+        sigma: F64,
+        calibration: tuple[F64, F64] = (np.zeros(0), np.zeros(0)),
+    ) -> WindowPrior:
+        """Return the prior of a first frame with standard deviations (15,), infinite = unknown.
+
+        Args:
+            T_M_I: Its pose (7,).
+            motion: Its motion (9,).
+            sigma: The deviations.
+            calibration: Mean (K,) and standard deviations (K,) of the calibration.
+        """
+        mean, of_calibration = calibration
+        sigma = np.concatenate([sigma, of_calibration])
         known = np.flatnonzero(np.isfinite(sigma))
-        root = np.zeros((len(known), FRAME_SIZE))
+        root = np.zeros((len(known), len(sigma)))
         root[np.arange(len(known)), known] = 1.0 / sigma[known]
         is_fixed = np.zeros(1, dtype=np.bool_)
-        return cls(root, np.zeros(len(known)), T_M_I[None], motion[None], is_fixed)
+        return cls(
+            root, np.zeros(len(known)), T_M_I[None], motion[None], is_fixed, calibration=mean
+        )
 
     @classmethod
     def of_information(
@@ -61,11 +80,14 @@ class WindowPrior:
         root[:, rows[order]] = factor * scale[order]
         right = (gradient[rows] / scale)[order][:rank]
         residual, _ = scipy.linalg.lapack.dtrtrs(factor[:, :rank], right, lower=0, trans=1)
-        return cls(root, residual, states.T_M_I, states.motion, is_fixed, states.T_G_M)
+        return cls(
+            root, residual, states.T_M_I, states.motion, is_fixed, states.T_G_M,
+            calibration=states.calibration,
+        )  # fmt: skip
 
     @cached_property
     def information(self) -> F64:
-        """root^T root, n x n with n = 15 F + 6 B."""
+        """root^T root, n x n with n = 15 F + K + 6 B."""
         return self.root.T @ self.root
 
     @cached_property
@@ -77,23 +99,27 @@ class WindowPrior:
     @cached_property
     def touches_base(self) -> bool:
         """Whether it has information about the base frame."""
-        return bool(np.any(self.root[:, self._frame_columns :]))
+        return bool(np.any(self.root[:, self._base_columns :]))
 
     @property
     def _frame_columns(self) -> int:
         return FRAME_SIZE * len(self.T_M_I)
+
+    @property
+    def _base_columns(self) -> int:
+        return self._frame_columns + len(self.calibration)
 
     @cached_property
     def _free(self) -> I64:
         """First column of the orientation of all that it touches and that is not fixed."""
         columns = FRAME_SIZE * np.flatnonzero(self.touched & ~self.is_fixed) + 3
         if self.touches_base and not self.is_base_fixed:
-            columns = np.append(columns, self._frame_columns + 3)
+            columns = np.append(columns, self._base_columns + 3)
         return columns
 
     def offsets(self, states: WindowStates) -> F64:
         """Return the tangent vectors from x0 to some states."""
-        return states.offsets(self.T_M_I, self.motion, self.T_G_M)
+        return states.offsets(self.T_M_I, self.motion, self.T_G_M, self.calibration)
 
     def linearization_point(self, states: WindowStates) -> WindowStates:
         """Return the states at x0 where that is fixed, as they are elsewhere."""
@@ -101,14 +127,14 @@ class WindowPrior:
         fixed = self.is_fixed
         T_M_I[fixed], motion[fixed] = self.T_M_I[fixed], self.motion[fixed]
         T_G_M = self.T_G_M if self.is_base_fixed else states.T_G_M
-        return WindowStates(T_M_I, motion, states.h, T_G_M, states.p_G)
+        return dataclasses.replace(states, T_M_I=T_M_I, motion=motion, T_G_M=T_G_M)
 
     def evaluate(self, states: WindowStates) -> F64:
         """Return the residual (k,) at some states."""
         return np.asarray(self.root @ self.offsets(states) + self.residual)
 
     def linearized(self, states: WindowStates) -> tuple[F64, F64, F64]:
-        """Return residual (k,), its Jacobian's square (n, n), and gradient (n,), n = 15 F + 6 B.
+        """Return residual (k,), its Jacobian's square (n, n), and gradient (n,), n = 15 F + K + 6 B.
 
         The Jacobian of a fixed frame is that at x0; of the others the exact one, which differs by
         the right Jacobian of the rotation from x0.
@@ -153,8 +179,8 @@ class WindowPrior:
         """Return the prior of the frames: what it says of the base frame is marginalised."""
         if not len(self.T_G_M):
             return self
-        x0 = WindowStates(self.T_M_I, self.motion, np.zeros((0, 3)))
-        return self._without(self._frame_columns + np.arange(6), x0, self.is_fixed)
+        x0 = WindowStates(self.T_M_I, self.motion, np.zeros((0, 3)), calibration=self.calibration)
+        return self._without(self._base_columns + np.arange(6), x0, self.is_fixed)
 
     def without_frame(self, frame: int) -> WindowPrior:
         """Return the prior of all other frames: what it says of this frame is marginalised."""
@@ -164,6 +190,7 @@ class WindowPrior:
             np.delete(self.motion, frame, axis=0),
             np.zeros((0, 3)),
             self.T_G_M,
+            calibration=self.calibration,
         )
         return self._without(columns, x0, np.delete(self.is_fixed, frame))
 
@@ -172,7 +199,9 @@ class WindowPrior:
         is_base_fixed = self.is_base_fixed and len(x0.T_G_M) > 0
         if not self.root[:, columns].any():
             root = np.delete(self.root, columns, axis=1)
-            result = WindowPrior(root, self.residual, x0.T_M_I, x0.motion, is_fixed, x0.T_G_M)
+            result = dataclasses.replace(
+                self, root=root, T_M_I=x0.T_M_I, motion=x0.motion, is_fixed=is_fixed, T_G_M=x0.T_G_M
+            )
         else:
             information, gradient = schur_complement(
                 self.information, self.root.T @ self.residual, columns

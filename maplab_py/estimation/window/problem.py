@@ -20,7 +20,7 @@ from maplab_py.estimation.kernels.window_arguments import (
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.protocol import Step
-from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.factors import EVERY, FrameFactors, Part
 from maplab_py.estimation.window.map_terms import MapElimination, MapTerms
 from maplab_py.estimation.window.prior import WindowPrior
@@ -49,27 +49,30 @@ class WindowProblem:
         self,
         kernels: ModuleType,
         data: WindowData,
-        cameras: Cameras,
+        calibration: WindowCalibration,
         factors: FrameFactors,
         prior: WindowPrior,
         *,
         loss: Loss = Loss.HUBER,
         keep_first_estimates: bool = True,
         map_terms: MapTerms | None = None,
+        times: FrameTimes | None = None,
     ) -> None:
         """Join what was measured.
 
         Args:
             kernels: Compiled from the template `window` for the cameras' models.
             data: Observations, grouped by landmark.
-            cameras: As the observations count them.
+            calibration: Of the cameras, as the observations count them.
             factors: Of the frames.
             prior: From what has left the window.
             loss: Robust loss of reprojection errors.
             keep_first_estimates: Evaluate Jacobians of frames in the prior where they entered it.
             map_terms: Observations of a map, for states with a base frame; None = there are none.
+            times: When images were taken; None = all rows at the times of the frames.
         """
-        self._kernels, self._data, self._cameras = kernels, data, cameras
+        self._kernels, self._data, self._calibration = kernels, data, calibration
+        self._times = times
         self._factors, self._prior, self._loss = factors, prior, loss
         self._keeps_first_estimates = keep_first_estimates
         self._map_terms = map_terms
@@ -154,7 +157,7 @@ class WindowProblem:
         return self.linearize(states, _LANDMARK_DAMPING)
 
     def covariance_of_frames(self, linear: WindowLinearization) -> F64:
-        """Return the joint covariance (15 F, 15 F) of all frames, each [p, theta, v, b_g, b_a].
+        """Return the joint covariance (n, n), which begins with all frames, each [p, theta, v, b_g, b_a].
 
         Raises:
             NotPositiveDefinite: The measurements do not determine the frames.
@@ -171,6 +174,15 @@ class WindowProblem:
         """
         return self._covariance(linear, FRAME_SIZE * frame + np.arange(FRAME_SIZE))
 
+    def covariance_of_calibration(self, linear: WindowLinearization) -> F64:
+        """Return the covariance (K, K) of the calibration.
+
+        Raises:
+            NotPositiveDefinite: The measurements do not determine the states.
+        """
+        first = FRAME_SIZE * linear.kept.Y.shape[1]
+        return self._covariance(linear, first + np.arange(len(self._calibration)))
+
     def _covariance(self, linear: WindowLinearization, rows: I64) -> F64:
         matrix = linear.system.matrix.copy()
         columns = np.zeros((len(matrix), len(rows)))
@@ -180,8 +192,9 @@ class WindowProblem:
 
     def _linearize(self, states: WindowStates, damping: float, part: Part) -> WindowLinearization:
         frames, landmarks = len(states), len(states.h)
-        system = DenseSystem.zeros(FRAME_SIZE * frames + 6 * len(states.T_G_M))
-        kept = Elimination.empty(landmarks, frames)
+        count = len(states.calibration)
+        system = DenseSystem.zeros(FRAME_SIZE * frames + count + 6 * len(states.T_G_M))
+        kept = Elimination.empty(landmarks, frames, count)
         at, is_elsewhere = states, np.zeros(frames, dtype=np.bool_)
         fixed = self._prior.is_fixed
         if self._keeps_first_estimates and (fixed.any() or self._prior.is_base_fixed):
@@ -202,7 +215,9 @@ class WindowProblem:
         return WindowLinearization(system, kept, rule, costs, of_map)
 
     def _point(self, states: WindowStates) -> WindowPoint:
-        return WindowPoint(states.T_M_I, states.h, self._cameras.T_I_C, self._cameras.parameters)
+        twist = np.zeros((0, 7)) if self._times is None else self._times.twist(states)
+        cameras = self._calibration.of_kernels(states.calibration)
+        return WindowPoint(states.T_M_I, states.h, cameras, twist)
 
     @staticmethod
     def _solved(factor: F64, right: F64) -> F64:

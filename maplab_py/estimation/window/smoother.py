@@ -17,11 +17,12 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, WindowPoint
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, SolverSummary, optimize_states
 from maplab_py.estimation.symbolic import sources
-from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
@@ -58,18 +59,32 @@ class FixedLagSmoother:
     """
 
     def __init__(
-        self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu, options: WindowOptions
+        self,
+        cameras: tuple[Camera, ...],
+        T_I_C: F64,
+        imu: Imu,
+        options: WindowOptions,
+        calibration: WindowCalibration | None = None,
     ) -> None:
-        """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU."""
-        self._cameras = Cameras.of(cameras, T_I_C)
+        """Prepare kernels.
+
+        Args:
+            cameras: The cameras.
+            T_I_C: Their poses (C, 7).
+            imu: The IMU.
+            options: See there.
+            calibration: Of the same cameras, with what of it is estimated; None = nothing.
+        """
+        self.calibration = calibration or WindowCalibration.of(cameras, T_I_C)
+        self._cameras = self.calibration.of_kernels(self.calibration.mean)
         self.options = options
         self._keyframes_kept = options.keyframes_kept(len(cameras))
         self._kernels = window_kernels()
-        self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
+        self._back_projection = BackProjection(self._kernels, self.calibration)
         self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
         still = residual_kernel("relative_pose", sources.relative_pose)
         self._standstill = Standstill(still, options.standstill)
-        self._triangulator = Triangulator(self._kernels, self._cameras, options)
+        self._triangulator = Triangulator(self._kernels, options)
         self.tracks = Tracks()
         self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
         self.newest_covariance: F64 = np.full((15, 15), np.inf)  # order [p, theta, v, b_g, b_a]
@@ -77,6 +92,8 @@ class FixedLagSmoother:
         self._is_keyframe: Mask = np.zeros(0, dtype=np.bool_)
         self._is_resting: Mask = np.zeros(0, dtype=np.bool_)  # or surely turns on the spot
         self._is_turning: Mask = np.zeros(0, dtype=np.bool_)
+        self._rate_I: F64 = np.zeros((0, 3))  # as measured
+        self._delay_s: F64 = np.zeros(0)
         self._states = WindowStates(np.zeros((0, 7)), np.zeros((0, 9)), np.zeros((0, 3)))
         self._stage_ms: dict[str, float] = {}
         self._released: list[tuple[int, F64, F64]] = []
@@ -91,8 +108,13 @@ class FixedLagSmoother:
             raise EstimationError("the smoother has been started already: make a new one")
         motion = np.concatenate([state.v_M, state.gyro_bias, state.accel_bias])
         T_M_I = np.array(state.T_M_I, dtype=np.float64)
-        self._prior = WindowPrior.of_state(T_M_I, motion, np.asarray(state.sigma))
-        self._states = WindowStates(T_M_I[None], motion[None], np.zeros((0, 3)))
+        mean = self.calibration.mean
+        self._prior = WindowPrior.of_state(
+            T_M_I, motion, np.asarray(state.sigma), (mean, self.calibration.sigma)
+        )
+        none = np.zeros((0, 3))
+        self._states = WindowStates(T_M_I[None], motion[None], none, calibration=mean)
+        self._take_calibration()
         self._append_frame(frame, is_keyframe=True)
         self._see(frame)
 
@@ -120,6 +142,7 @@ class FixedLagSmoother:
                     problem, self._states, self._solver_options(), SILENT
                 )
                 self.tracks.h[rows] = self._states.h
+                self._take_calibration()
                 self._take_map_states()
             with self._stage("covariance"):
                 covariance = self._covariance(problem)
@@ -172,9 +195,23 @@ class FixedLagSmoother:
         problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
         try:
             linear = problem.undamped_near(self._states)
-            return scale_sigma(self._states.T_M_I[:, 4:], problem.covariance_of_frames(linear))
+            covariance = problem.covariance_of_frames(linear)
         except NotPositiveDefinite:
             return float("inf")
+        size = FRAME_SIZE * len(self._states)
+        return scale_sigma(self._states.T_M_I[:, 4:], covariance[:size, :size])
+
+    def calibration_sigma(self) -> F64:
+        """Return the standard deviations (K,) of the calibration; infinite = unknown."""
+        if not len(self.calibration) or not len(self._states):
+            return self.calibration.sigma
+        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
+        try:
+            linear = problem.undamped_near(self._states)
+            covariance = problem.covariance_of_calibration(linear)
+        except NotPositiveDefinite:
+            return np.full(len(self.calibration), np.inf)
+        return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
 
     def problem(self) -> tuple[WindowProblem, WindowStates]:
         """Return the least-squares problem of the window as it is now, and its states."""
@@ -227,10 +264,16 @@ class FixedLagSmoother:
         self._is_keyframe = np.append(self._is_keyframe, is_keyframe)
         self._is_resting = np.append(self._is_resting, frame.motion is Motion.RESTING or is_sure)
         self._is_turning = np.append(self._is_turning, turns)
+        rate_I = frame.accel_gyro[-1:, 3:] if len(frame.accel_gyro) else np.zeros((1, 3))
+        self._rate_I = np.concatenate([self._rate_I, rate_I])
+        self._delay_s = np.append(self._delay_s, frame.delay_s)
 
     def _see(self, frame: WindowFrame) -> None:
         """Add the observations of the newest frame."""
         rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
+        if self.calibration.has_lateness:
+            rate_I = self._rate_I[-1] - self._states.gyro_bias[-1]
+            rays = self.calibration.rays_at_frame(frame, rays, self._cameras, rate_I)
         nothing = np.zeros(len(rays), dtype=np.int64)
         seen = Observations(
             nothing, nothing.astype(np.int32), frame.camera.astype(np.int32),
@@ -269,7 +312,7 @@ class FixedLagSmoother:
         order = np.lexsort((-counts[candidates], ~tracks.is_active[candidates]))
         candidates = candidates[order]
         narrow = self._triangulator.add_landmarks(
-            tracks, candidates, self._states.T_M_I,
+            tracks, candidates, self._point(),
             only_stereo=motion is not Motion.MOVING, num_best=num_best,
         )  # fmt: skip
         if not options.follows_thesis:
@@ -297,11 +340,29 @@ class FixedLagSmoother:
         data, order = self.tracks.data(rows, self.options.huber_sigmas)
         factors = FrameFactors(self._chain, self._standstill, self._is_resting, self._is_turning)
         problem = WindowProblem(
-            self._kernels, data, self._cameras, factors, self._prior,
+            self._kernels, data, self.calibration, factors, self._prior,
             keep_first_estimates=self.options.keep_first_estimates, map_terms=map_terms,
+            times=self._times(),
         )  # fmt: skip
         self._states = dataclasses.replace(self._states, h=self.tracks.h[rows])
         return problem, rows, order
+
+    def _times(self) -> FrameTimes | None:
+        if not self.calibration.has_lateness:
+            return None
+        return FrameTimes(self._rate_I, self._delay_s)
+
+    def _point(self) -> WindowPoint:
+        """Return frames and cameras as kernels read them."""
+        times = self._times()
+        twist = np.zeros((0, 7)) if times is None else times.twist(self._states)
+        return WindowPoint(self._states.T_M_I, self._states.h, self._cameras, twist)
+
+    def _take_calibration(self) -> None:
+        """Use the present calibration from now on."""
+        if len(self.calibration):
+            self._cameras = self.calibration.of_kernels(self._states.calibration)
+            self._back_projection.parameters = self._cameras.parameters
 
     def _solver_options(self) -> SolverOptions:
         return SolverOptions(
@@ -443,8 +504,10 @@ class FixedLagSmoother:
 
     def _forget_frame(self, frame: int) -> None:
         self._states = self._states.without_frame(frame)
-        for name in ("_time_ns", "_is_keyframe", "_is_resting", "_is_turning"):
-            setattr(self, name, np.delete(getattr(self, name), frame))
+        for name in (
+            "_time_ns", "_is_keyframe", "_is_resting", "_is_turning", "_rate_I", "_delay_s",
+        ):  # fmt: skip
+            setattr(self, name, np.delete(getattr(self, name), frame, axis=0))
 
     def _poses(self) -> CameraPoses:
         return CameraPoses.of(self._states.T_M_I, self._cameras.T_I_C)

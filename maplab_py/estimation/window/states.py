@@ -24,6 +24,7 @@ class WindowStates:
     h: F64  # (L, 3) [x/z, y/z, 1/z]
     T_G_M: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))  # (B, 7), B = 0 or 1
     p_G: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))  # (A, 3)
+    calibration: F64 = dataclasses.field(default_factory=lambda: np.zeros(0))  # (K,) of the cameras
 
     def __len__(self) -> int:
         return len(self.T_M_I)
@@ -39,21 +40,33 @@ class WindowStates:
         return self.motion[:, 6:9]
 
     def moved(self, step: F64, h: F64) -> WindowStates:
-        """Apply tangent vectors (15 F + 6 B,) and take landmarks h; those of the map stay.
+        """Apply tangent vectors (15 F + K + 6 B,) and take landmarks h; those of the map stay.
 
-        Tangents are, by frame, [p, theta, v, b_g, b_a] and, of the base frame, [p, theta].
+        Tangents are, by frame, [p, theta, v, b_g, b_a], then those of the calibration and, of the base
+        frame, [p, theta].
         """
         T_M_I, motion = np.empty_like(self.T_M_I), np.empty_like(self.motion)
         kernels.retract(self.T_M_I, self.motion, step, T_M_I, motion)
-        return WindowStates(T_M_I, motion, h, self._moved_base(step), self.p_G)
+        first = FRAME_SIZE * len(self)
+        calibration = self.calibration + step[first : first + len(self.calibration)]
+        return WindowStates(T_M_I, motion, h, self._moved_base(step), self.p_G, calibration)
 
-    def offsets(self, T_M_I: F64, motion: F64, T_G_M: F64 | None = None) -> F64:
-        """Return the tangent vectors (15 F + 6 B,) from other states to these.
+    def offsets(
+        self,
+        T_M_I: F64,
+        motion: F64,
+        T_G_M: F64 | None = None,
+        calibration: F64 | None = None,
+    ) -> F64:
+        """Return the tangent vectors (15 F + K + 6 B,) from other states to these.
 
-        Without a T_G_M (B, 7) the base frame has an offset of zero.
+        Without a T_G_M (B, 7) or calibration (K,) these have an offset of zero.
         """
-        result = np.zeros(FRAME_SIZE * len(self) + 6 * len(self.T_G_M))
+        of_frames, count = FRAME_SIZE * len(self), len(self.calibration)
+        result = np.zeros(of_frames + count + 6 * len(self.T_G_M))
         kernels.offsets(self.T_M_I, self.motion, T_M_I, motion, result)
+        if calibration is not None and count:
+            result[of_frames : of_frames + count] = self.calibration - calibration
         if T_G_M is not None and len(T_G_M):
             result[-6:] = se3.local(T_G_M[0], self.T_G_M[0])
         return result
@@ -65,12 +78,10 @@ class WindowStates:
 
     def with_frame(self, T_M_I: F64, motion: F64) -> WindowStates:
         """Return the states with a later frame (7,), (9,)."""
-        return WindowStates(
-            np.concatenate([self.T_M_I, T_M_I[None]]),
-            np.concatenate([self.motion, motion[None]]),
-            self.h,
-            self.T_G_M,
-            self.p_G,
+        return dataclasses.replace(
+            self,
+            T_M_I=np.concatenate([self.T_M_I, T_M_I[None]]),
+            motion=np.concatenate([self.motion, motion[None]]),
         )
 
     def without_frame(self, frame: int) -> WindowStates:
@@ -83,7 +94,7 @@ class WindowStates:
 
     def size(self) -> float:
         """Return the norm of all values, for the relative size of a step."""
-        parts = (self.T_M_I, self.motion, self.h, self.T_G_M, self.p_G)
+        parts = (self.T_M_I, self.motion, self.h, self.T_G_M, self.p_G, self.calibration)
         return float(np.sqrt(sum(np.vdot(part, part) for part in parts)))
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import WindowPoint
-from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.tracks import Tracks
@@ -18,15 +17,15 @@ from maplab_py.estimation.window.tracks import Tracks
 class Triangulator:
     """Turns tracks into landmarks."""
 
-    def __init__(self, kernels: ModuleType, cameras: Cameras, options: WindowOptions) -> None:
-        """Take the kernels of the template `window` for the cameras."""
-        self._kernels, self._cameras, self._options = kernels, cameras, options
+    def __init__(self, kernels: ModuleType, options: WindowOptions) -> None:
+        """Take the kernels of the template `window`."""
+        self._kernels, self._options = kernels, options
 
     def add_landmarks(
         self,
         tracks: Tracks,
         candidates: I64,
-        T_M_I: F64,
+        at: WindowPoint,
         *,
         only_stereo: bool,
         num_best: int | None = None,
@@ -36,7 +35,7 @@ class Triangulator:
         Args:
             tracks: All tracks; changed.
             candidates: Rows without an estimate, the most wanted first.
-            T_M_I: Poses (F, 7) of the frames.
+            at: Frames and cameras; whatever landmarks.
             only_stereo: The body only turned: rays from the same frame count alone.
             num_best: Take so many with the best score, parallax over distance; None = the first.
 
@@ -47,7 +46,7 @@ class Triangulator:
         room = options.max_landmarks - tracks.num_active_landmarks
         if room <= 0 or not len(candidates):
             return candidates[:0]
-        poses = CameraPoses.of(T_M_I, self._cameras.T_I_C)
+        poses = CameraPoses.of(at.T_M_I, at.cameras.T_I_C)
         order, start = tracks.grouped(candidates)
         seen = tracks.observations.take(order)
         rays_M = poses.rays(seen.frame, seen.camera, seen.ray_C)
@@ -62,7 +61,7 @@ class Triangulator:
         p_M, ok = _triangulated(tracks, rows, poses)
         rows, p_M, parallax = rows[ok], p_M[ok], parallax[ok]
         tracks.make_landmarks(rows, p_M, poses)
-        tracks.is_landmark[rows] &= self._is_good(tracks, rows, T_M_I)
+        tracks.is_landmark[rows] &= self._is_good(tracks, rows, at)
         if num_best is not None:
             score = np.where(tracks.is_landmark[rows], parallax * tracks.h[rows, 2], 0.0)
             tracks.is_landmark[rows[np.argsort(-score, kind="stable")[num_best:]]] = False
@@ -81,14 +80,12 @@ class Triangulator:
         result[filled] = np.maximum.reduceat(angle, start[:-1][filled])
         return np.degrees(result)
 
-    def _is_good(self, tracks: Tracks, rows: I64, T_M_I: F64) -> Mask:
+    def _is_good(self, tracks: Tracks, rows: I64, at: WindowPoint) -> Mask:
         """Tell which landmarks (R,) have depths and errors within their limits."""
         options = self._options
         data, _ = tracks.data(rows, options.huber_sigmas)
-        camera = self._cameras
-        at = WindowPoint(T_M_I, tracks.h[rows], camera.T_I_C, camera.parameters)
         error_depth = np.empty((len(data.frame), 2))
-        self._kernels.evaluate(data, at, error_depth)
+        self._kernels.evaluate(data, at._replace(h=tracks.h[rows]), error_depth)
         error, depth = error_depth.T
         fits = (error * data.inverse_sigma) ** 2 <= options.gate_chi2
         fits &= (depth >= options.min_depth_m) & (depth <= options.max_depth_m)

@@ -18,7 +18,7 @@ from maplab_py.estimation.kernels.window_arguments import (
     WindowRule,
 )
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
@@ -48,7 +48,7 @@ def _camera() -> Camera:
 
 def _run_landmarks() -> None:
     camera = _camera()
-    table = Cameras.of((camera,), se3.identity(1))
+    calibration = WindowCalibration.of((camera,), se3.identity(1))
     module, states = window_kernels(), _states()
     frame, row = np.array([0, 1], dtype=np.int32), np.zeros(2, dtype=np.int32)
     uv = np.array([[60.0, 50.0], [50.0, 50.0]])
@@ -63,14 +63,15 @@ def _run_landmarks() -> None:
         row[:1],
         np.zeros((1, 2)),
     )
-    at = WindowPoint(states.T_M_I, states.h, table.T_I_C, table.parameters)
+    twist = FrameTimes(np.zeros((2, 3)), np.zeros(2)).twist(states)
+    at = WindowPoint(states.T_M_I, states.h, calibration.of_kernels(np.zeros(0)), twist)
     rule = WindowRule(int(Loss.HUBER), 1e-5, states.T_M_I, np.array([True, False]))
     system, kept = DenseSystem.zeros(2 * FRAME_SIZE), Elimination.empty(1, 2)
     module.eliminate(data, at, rule, system, kept)
     new = at._replace(h=np.empty_like(states.h))
     module.substitute(data, at, rule, kept, np.zeros(2 * FRAME_SIZE), new)
     module.evaluate(data, at, np.empty((2, 2)))
-    BackProjection(module, (camera,), table).rays(row, uv)
+    BackProjection(module, calibration).rays(row, uv)
 
 
 def _run_map() -> None:

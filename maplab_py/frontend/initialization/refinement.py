@@ -8,12 +8,12 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
-from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, WindowPoint
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
-from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
@@ -133,9 +133,9 @@ class Refinement:
             data_sheet: The IMU with the least noise that it can have.
         """
         self._rig = Rig(cameras, T_I_C)
-        self._cameras = Cameras.of(cameras, T_I_C)
+        self._calibration = WindowCalibration.of(cameras, T_I_C)
         self._kernels = window_kernels()
-        self._back_projection = BackProjection(self._kernels, cameras, self._cameras)
+        self._back_projection = BackProjection(self._kernels, self._calibration)
         self._inertial = residual_kernel("inertial", sources.inertial)
         options = WindowOptions(max_landmarks=_MAX_LANDMARKS, gate_chi2=_GATE_CHI2)
         self._standstill = Standstill(
@@ -216,7 +216,7 @@ class Refinement:
         data, order = tracks.data(rows, self._options.huber_sigmas)
         prior = self._prior(states)
         problem = WindowProblem(
-            self._kernels, data, self._cameras, factors, prior, loss=round_.loss
+            self._kernels, data, self._calibration, factors, prior, loss=round_.loss
         )
         start = WindowStates(states.T_M_I, states.motion, tracks.h[rows])
         solver = SolverOptions(num_iterations=round_.iterations, function_tolerance=_TOLERANCE)
@@ -302,8 +302,10 @@ class Refinement:
         candidates = np.flatnonzero(counts >= 2)
         candidates = candidates[np.argsort(-counts[candidates], kind="stable")]
         options = dataclasses.replace(self._options, gate_chi2=gate_chi2)
-        Triangulator(self._kernels, self._cameras, options).add_landmarks(
-            tracks, candidates, states.T_M_I, only_stereo=False
+        cameras = self._calibration.of_kernels(states.calibration)
+        at = WindowPoint(states.T_M_I, tracks.h, cameras, np.zeros((0, 7)))
+        Triangulator(self._kernels, options).add_landmarks(
+            tracks, candidates, at, only_stereo=False
         )
         return tracks, min(len(candidates), options.max_landmarks)
 

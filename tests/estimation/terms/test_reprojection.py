@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -19,6 +21,7 @@ from maplab_py.estimation.kernels.window_arguments import (
 )
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.calibration import KINDS, WindowCalibration
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.sensors.projection import project
@@ -83,7 +86,7 @@ def test_anchored_reprojection_agrees_with_the_sensor_model_and_with_differences
     T_I_CA = se3.make(so3.exp([-0.1, 0.3, 1.2]), [0.05, 0.02, -0.1])
     T_I_C = se3.retract(T_I_CA, [0.1, 0.0, 0.02, 0.02, -0.01, 0.03])
     h, uv = np.array([0.2, -0.1, inverse_depth]), np.array([300.0, 200.0])
-    cameras = Cameras.of([model, model], np.stack([T_I_CA, T_I_C]))
+    calibration = WindowCalibration.of((model, model), np.stack([T_I_CA, T_I_C]))
     poses = np.stack([T_M_A, T_M_I])
 
     def ray_C(delta: F64) -> F64:
@@ -103,7 +106,7 @@ def test_anchored_reprojection_agrees_with_the_sensor_model_and_with_differences
             START, second, second, uv[None], ONE, ONE, FIRST_ROW, FIRST_ROW, np.zeros((1, 2))
         )
 
-    at = WindowPoint(poses, h[None], cameras.T_I_C, cameras.parameters)
+    at = WindowPoint(poses, h[None], calibration.of_kernels(np.zeros(0)), np.zeros((0, 7)))
 
     def gradient(uv: F64) -> F64:
         system, kept = DenseSystem.zeros(2 * FRAME_SIZE), Elimination.empty(1, 2)
@@ -120,6 +123,75 @@ def test_anchored_reprojection_agrees_with_the_sensor_model_and_with_differences
     jacobian = np.stack([gradient(uv - shift) - gradient(uv) for shift in SHIFTS])
     np.testing.assert_allclose(jacobian[:, :3], -jacobian[:, 6:9], atol=1e-9)
     assert_relative(jacobian, differences(residual, 15))
+
+
+@pytest.mark.parametrize(("projection", "distortion"), EVERY_MODEL)
+@pytest.mark.parametrize("is_same_frame", [False, True])
+@pytest.mark.parametrize("lateness_s", [0.0, 0.02])
+def test_window_jacobians_by_the_calibration_and_of_late_rows_are_those_of_differences(
+    projection: Projection, distortion: Distortion, is_same_frame: bool, lateness_s: float
+) -> None:
+    model = make_camera(projection, distortion)
+    T_I_C = se3.make(
+        so3.exp([[-0.1, 0.3, 1.2], [-0.08, 0.3, 1.22]]), [[0.05, 0.02, -0.1], [0.1, 0, 0]]
+    )
+    calibration = WindowCalibration.of((model, model), T_I_C, KINDS)
+    values = 0.3 * calibration.sigma * np.cos(np.arange(len(calibration)))
+    poses = np.stack([se3.identity(), se3.exp([0.05, -0.1, 0.08, 0.1, -0.05, 0.15])])
+    twist = np.array([[0.3, -0.2, 0.1, 0.5, -0.4, 0.8, 0.0], [0.2, 0.1, -0.3, -0.6, 0.2, 0.5, 0.0]])
+    twist[:, 6] = -lateness_s
+    h, uv = np.array([0.2, -0.1, 0.4]), np.array([300.0, 200.0])
+    frame = 0 if is_same_frame else 1
+    size, seen = 12 + 3, np.array([frame], dtype=np.int32)
+
+    def residual(delta: F64) -> F64:
+        cameras = calibration.of_kernels(values + calibration.sigma * delta[size:])
+        (x, y, w), body = h + delta[12:size], se3.retract(poses, delta[:12].reshape(2, 6))
+        p_A = se3.transform(cameras.T_I_C[0], np.array([x, y, 1.0]) / w)
+        p_I = se3.transform(se3.relative(body[frame], body[0]), p_A)
+        late_s = cameras.timing_s[1] @ [1.0, uv[1]] - twist[frame, 6]
+        turn = so3.skew(late_s * twist[frame, 3:6])
+        p_I = (np.eye(3) - turn + 0.5 * turn @ turn) @ (p_I - late_s * twist[frame, :3])
+        count, numbers = len(model.intrinsics), cameras.parameters[1, 1:]
+        camera = dataclasses.replace(
+            model,
+            intrinsics=numbers[:count],
+            distortion_parameters=numbers[count:][: len(model.distortion_parameters)],
+        )
+        return (
+            np.asarray(project(camera, se3.transform(se3.inverse(cameras.T_I_C[1]), p_I))[0]) - uv
+        )
+
+    one = np.ones(1, dtype=np.int32)
+    first = np.zeros(1, dtype=np.int32)
+
+    def gradient(shift: F64) -> F64:
+        count = len(calibration)
+        system, kept = DenseSystem.zeros(2 * FRAME_SIZE + count), Elimination.empty(1, 2, count)
+        rule = WindowRule(int(Loss.NONE), 1e-5, poses, np.array([False, False]))
+        data = WindowData(
+            START, seen, one, (uv + shift)[None], ONE, ONE, first, first, np.zeros((1, 2))
+        )
+        row = (
+            data.uv_px[0, 1] - uv[1]
+        )  # the row of the image moves with the measurement: not its time
+        late = twist.copy()
+        late[:, 6] += row * cameras.timing_s[1, 1]
+        at = WindowPoint(poses, h[None], cameras, late)
+        window_kernels().eliminate(data, at, rule, system, kept)
+        frames = system.gradient[: 2 * FRAME_SIZE].reshape(2, FRAME_SIZE)[:, :6]
+        line = calibration.rows("line_delay")
+        of_calibration = system.gradient[2 * FRAME_SIZE :].copy()
+        of_calibration[line] *= uv[1] / data.uv_px[0, 1]
+        return np.concatenate([frames.reshape(-1), kept.gradient[0], of_calibration])
+
+    cameras = calibration.of_kernels(values)
+    jacobian = np.stack([gradient(-shift) - gradient(np.zeros(2)) for shift in SHIFTS])
+    jacobian[:, size:] *= calibration.sigma
+    expected = differences(residual, size + len(calibration))
+    if is_same_frame:
+        expected[:, :12] = 0.0  # the landmark moves with its anchor
+    assert_relative(jacobian, expected)
 
 
 def test_cameras_of_several_models_are_chosen_by_their_rows() -> None:

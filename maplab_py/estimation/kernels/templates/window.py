@@ -18,6 +18,11 @@ with its anchor, so position and yaw of all frames together stay unobservable wh
 A landmark of which no parallax has been seen has an expected inverse depth with a deviation. Without it the
 noise of its rays would decide, and what is known of a translation is proportional to the inverse depth.
 
+An image may be later than its frame, and its rows one after the other: a point is moved back by the frame's
+velocity and turn over that time, to second order in the turn. That time, and all else of the cameras, may
+have columns in the system behind those of the frames, given by `columns`. They are estimated from all
+observations, so a landmark has one dense row of them, whichever frames see it.
+
 A landmark behind a camera counts as an outlier of a fixed size, without a Jacobian: no step gains by
 moving a landmark there.
 
@@ -49,25 +54,73 @@ def anchored_ray(poses, a, k, axes, d, h, n):
 
 
 @compiled(fastmath={"contract", "nsz"}, forceinline=True)
-def reproject(poses, rows, cameras, h, n, uv, o, out):
-    """Write residual, depth times 1 / z, and Jacobians by frame k, anchor a and h to `out`."""
-    (a, d, k, c), (axes, parameters) = (
+def turned(twist, k, t, x, y, z):
+    """Return exp(-t omega_k) (x, y, z) to second order."""
+    r0, r1, r2 = t * twist[k, 3], t * twist[k, 4], t * twist[k, 5]
+    a0, a1, a2 = cross(r0, r1, r2, x, y, z)
+    b0, b1, b2 = cross(r0, r1, r2, a0, a1, a2)
+    return x - a0 + 0.5 * b0, y - a1 + 0.5 * b1, z - a2 + 0.5 * b2
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def moved(twist, k, w, t, x, y, z):
+    """Return a point times 1 / z, given in the body k, as the body sees it t later."""
+    s = w * t
+    return turned(twist, k, t, x - s * twist[k, 0], y - s * twist[k, 1], z - s * twist[k, 2])
+
+
+@compiled(fastmath={"contract", "nsz"})
+def by_turn(twist, k, w, t, b, s):
+    """Return the rate at which a point of the body k, times 1 / z, moves along s by the turn alone."""
+    v, omega = w * t, twist[k, 3:6]
+    x, y, z = b[0] - v * twist[k, 0], b[1] - v * twist[k, 1], b[2] - v * twist[k, 2]
+    r0, r1, r2 = cross(omega[0], omega[1], omega[2], x, y, z)
+    x, y, z = x - t * r0, y - t * r1, z - t * r2
+    r0, r1, r2 = cross(omega[0], omega[1], omega[2], x, y, z)
+    return s[0] * r0 + s[1] * r1 + s[2] * r2
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def lateness(timing, twist, k, c, row):
+    """Return how much later than its frame k a row of an image of camera c was taken."""
+    if len(twist) == 0:
+        return 0.0
+    return timing[c, 0] + timing[c, 1] * row - twist[k, 6]
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def reproject(poses, rows, cameras, h, n, uv, o, out, J):
+    """Write residual, depth times 1 / z, and Jacobians by frame k, anchor a and h to `out`.
+
+    The Jacobian (2, K) by the calibration is written to J.
+    """
+    (a, d, k, c), (axes, parameters, timing, slope, columns, twist) = (
         rows,
         cameras,
     )  # frame and camera of the anchor, and those that see
-    w = h[n, 2]
+    w, t = h[n, 2], lateness(timing, twist, k, c, uv[o, 1])
     a0, a1, a2, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
     A, R = rotation(poses, a), rotation(poses, k)
     b0 = R[0] * x + R[3] * y + R[6] * z
     b1 = R[1] * x + R[4] * y + R[7] * z
     b2 = R[2] * x + R[5] * y + R[8] * z
-    c0, c1, c2 = from_axes(axes, c, b0 - w * axes[c, 9], b1 - w * axes[c, 10], b2 - w * axes[c, 11])
+    e0, e1, e2 = b0, b1, b2
+    if t != 0.0:
+        e0, e1, e2 = moved(twist, k, w, t, b0, b1, b2)
+    c0, c1, c2 = from_axes(axes, c, e0 - w * axes[c, 9], e1 - w * axes[c, 10], e2 - w * axes[c, 11])
     u, v, u0, u1, u2, v0, v1, v2 = project(parameters, c, c0, c1, c2)
     out[0], out[1], out[2] = u - uv[o, 0], v - uv[o, 1], c2
+    is_calibrating = J.shape[1] > 0
+    if is_calibrating:
+        J[:, :] = 0.0
+        add_intrinsics(J, columns, parameters, c, c0, c1, c2)
     for i in range(2):
         if i == 1:
             u0, u1, u2 = v0, v1, v2
-        p0, p1, p2 = to_axes(axes, c, u0, u1, u2)
+        s0, s1, s2 = to_axes(axes, c, u0, u1, u2)  # by the point as the moved body sees it
+        p0, p1, p2 = s0, s1, s2
+        if t != 0.0:
+            p0, p1, p2 = turned(twist, k, -t, s0, s1, s2)
         m0 = R[0] * p0 + R[1] * p1 + R[2] * p2
         m1 = R[3] * p0 + R[4] * p1 + R[5] * p2
         m2 = R[6] * p0 + R[7] * p1 + R[8] * p2
@@ -77,30 +130,90 @@ def reproject(poses, rows, cameras, h, n, uv, o, out):
         write_row(out, POSE + 6 + i, t0, t1, t2)
         by_w = m0 * (poses[a, 4] - poses[k, 4]) + m1 * (poses[a, 5] - poses[k, 5])
         by_w += m2 * (poses[a, 6] - poses[k, 6])
-        by_w -= p0 * axes[c, 9] + p1 * axes[c, 10] + p2 * axes[c, 11]
+        by_w -= s0 * axes[c, 9] + s1 * axes[c, 10] + s2 * axes[c, 11]
+        along = 0.0
+        if len(twist) > 0:
+            along = p0 * twist[k, 0] + p1 * twist[k, 1] + p2 * twist[k, 2]
+            by_w -= t * along
         q0 = A[0] * m0 + A[3] * m1 + A[6] * m2
         q1 = A[1] * m0 + A[4] * m1 + A[7] * m2
         q2 = A[2] * m0 + A[5] * m1 + A[8] * m2
         by_w += q0 * axes[d, 9] + q1 * axes[d, 10] + q2 * axes[d, 11]
         t0, t1, t2 = cross(a0, a1, a2, q0, q1, q2)
         write_row(out, ANCHOR + 6 + i, t0, t1, t2)
-        t0, t1, _ = from_axes(axes, d, q0, q1, q2)
-        write_row(out, LANDMARK + i, t0, t1, by_w)
+        r0, r1, r2 = from_axes(axes, d, q0, q1, q2)
+        write_row(out, LANDMARK + i, r0, r1, by_w)
+        if not is_calibrating:
+            continue
+        add_columns(J, i, columns, c, 0, -w * s0, -w * s1, -w * s2)
+        add_columns(J, i, columns, d, 0, w * q0, w * q1, w * q2)
+        t0, t1, t2 = cross(u0, u1, u2, c0, c1, c2)
+        add_rotation(J, i, columns, slope, c, t0, t1, t2)
+        t0, t1, t2 = cross(h[n, 0], h[n, 1], 1.0, r0, r1, r2)
+        add_rotation(J, i, columns, slope, d, t0, t1, t2)
+        if len(twist) > 0:
+            rate = -by_turn(twist, k, w, t, (b0, b1, b2), (s0, s1, s2)) - w * along
+            if columns[c, DELAY] >= 0:
+                J[i, columns[c, DELAY]] += rate
+            if columns[c, DELAY + 1] >= 0:
+                J[i, columns[c, DELAY + 1]] += rate * uv[o, 1]
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def add_columns(J, i, columns, c, first, x, y, z):
+    """Add three numbers to row i of J at the columns of camera c from `first` on."""
+    k0, k1, k2 = columns[c, first], columns[c, first + 1], columns[c, first + 2]
+    if k0 >= 0:
+        J[i, k0] += x
+    if k1 >= 0:
+        J[i, k1] += y
+    if k2 >= 0:
+        J[i, k2] += z
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def add_rotation(J, i, columns, slope, c, x, y, z):
+    """Add a row by a right perturbation of R_I_C, of which the states are the rotation vector."""
+    add_columns(
+        J, i, columns, c, 3,
+        x * slope[c, 0, 0] + y * slope[c, 1, 0] + z * slope[c, 2, 0],
+        x * slope[c, 0, 1] + y * slope[c, 1, 1] + z * slope[c, 2, 1],
+        x * slope[c, 0, 2] + y * slope[c, 1, 2] + z * slope[c, 2, 2],
+    )  # fmt: skip
+
+
+@compiled(fastmath={"contract", "nsz"})
+def add_intrinsics(J, columns, parameters, c, x, y, z):
+    """Add what a pixel of camera c depends on its intrinsic parameters to J."""
+    count, any_free = parameters.shape[1] - 1, False
+    for i in range(count):
+        any_free = any_free or columns[c, INTRINSICS + i] >= 0
+    if not any_free:
+        return
+    by_parameters = np.empty(2 * count)
+    project_by_parameters(parameters, c, x, y, z, by_parameters, 0)
+    for i in range(count):
+        k = columns[c, INTRINSICS + i]
+        if k >= 0:
+            J[0, k] += by_parameters[2 * i]
+            J[1, k] += by_parameters[2 * i + 1]
 
 
 @compiled(fastmath={"contract", "nsz"}, forceinline=True)
 def reproject_only(poses, rows, cameras, h, n, uv, o, out):
     """Write residual, and depth times 1 / z, to `out`."""
-    (a, d, k, c), (axes, parameters) = (
+    (a, d, k, c), (axes, parameters, timing, _, _, twist) = (
         rows,
         cameras,
     )  # frame and camera of the anchor, and those that see
-    w, R = h[n, 2], rotation(poses, k)
+    w, R, t = h[n, 2], rotation(poses, k), lateness(timing, twist, k, c, uv[o, 1])
     _, _, _, x, y, z = anchored_ray(poses, a, k, axes, d, h, n)
-    b0 = R[0] * x + R[3] * y + R[6] * z - w * axes[c, 9]
-    b1 = R[1] * x + R[4] * y + R[7] * z - w * axes[c, 10]
-    b2 = R[2] * x + R[5] * y + R[8] * z - w * axes[c, 11]
-    c0, c1, c2 = from_axes(axes, c, b0, b1, b2)
+    b0 = R[0] * x + R[3] * y + R[6] * z
+    b1 = R[1] * x + R[4] * y + R[7] * z
+    b2 = R[2] * x + R[5] * y + R[8] * z
+    if t != 0.0:
+        b0, b1, b2 = moved(twist, k, w, t, b0, b1, b2)
+    c0, c1, c2 = from_axes(axes, c, b0 - w * axes[c, 9], b1 - w * axes[c, 10], b2 - w * axes[c, 11])
     pixel = project(parameters, c, c0, c1, c2)
     out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
 
@@ -177,35 +290,96 @@ def subtract_slots(landmark, count, slots, Y, f, g, matrix, reduced_gradient):
 
 
 @compiled(fastmath={"contract", "nsz"})
+def add_calibration(out, J, factor, rows, n, Y, matrix, gradient, diagonal):
+    """Add one observation's W, J'J, J'P, J'A and J'r of the calibration; J is not whitened yet."""
+    a, k, first = rows
+    r, s = out[0], out[1]
+    for j in range(J.shape[1]):
+        x, y = factor * J[0, j], factor * J[1, j]
+        J[0, j], J[1, j] = x, y
+        if x == 0.0 and y == 0.0:
+            continue
+        row = first + j
+        gradient[row] += x * r + y * s
+        diagonal[row] += x * x + y * y
+        for i in range(3):
+            Y[n, i, j] += x * out[LANDMARK + 2 * i] + y * out[LANDMARK + 2 * i + 1]
+        for e in range(j + 1):
+            matrix[row, first + e] += x * J[0, e] + y * J[1, e]
+        if k == a:
+            continue
+        for c in range(6):
+            matrix[row, 15 * a + c] += x * out[ANCHOR + 2 * c] + y * out[ANCHOR + 2 * c + 1]
+            matrix[row, 15 * k + c] += x * out[POSE + 2 * c] + y * out[POSE + 2 * c + 1]
+
+
+@compiled(fastmath={"contract", "nsz"})
+def subtract_calibration(n, count, slots, first, Y_frames, Y, f, g, matrix, reduced_gradient):
+    """Turn W of the calibration into Y = L^-1 W; subtract its products with everything and Y'z."""
+    z0 = g[0] * f[0]
+    z1 = (g[1] - f[1] * z0) * f[2]
+    z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
+    for j in range(Y.shape[2]):
+        y0 = Y[n, 0, j] * f[0]
+        y1 = (Y[n, 1, j] - f[1] * y0) * f[2]
+        y2 = (Y[n, 2, j] - f[3] * y0 - f[4] * y1) * f[5]
+        Y[n, 0, j], Y[n, 1, j], Y[n, 2, j] = y0, y1, y2
+        row = first + j
+        reduced_gradient[row] -= y0 * z0 + y1 * z1 + y2 * z2
+        for e in range(j + 1):
+            matrix[row, first + e] -= y0 * Y[n, 0, e] + y1 * Y[n, 1, e] + y2 * Y[n, 2, e]
+        for s in range(count):
+            k = 15 * slots[n, s]
+            for c in range(6):
+                p, q, r = Y_frames[n, s, 0, c], Y_frames[n, s, 1, c], Y_frames[n, s, 2, c]
+                matrix[row, k + c] -= y0 * p + y1 * q + y2 * r
+
+
+@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+def prepared(cameras, twist):
+    """Return cameras as `reproject` takes them: their axes in place of their poses."""
+    extrinsics, parameters, timing, slope, columns = cameras
+    return camera_axes(extrinsics), parameters, timing, slope, columns, twist
+
+
+@compiled(fastmath={"contract", "nsz"})
 def eliminate(data, at, rule, system, kept):
     """Add all landmarks to the system, themselves eliminated; return the sum of rho.
 
     The reduced gradient gets only what the landmarks subtract; the gradient is added by the caller.
     """
     start, frame, camera, uv, inverse_sigma, scale2, anchor_frame, anchor_camera, expected = data
-    poses, points, extrinsics, parameters = at
-    axes = camera_axes(extrinsics)
+    poses, points, calibration, twist = at
+    cameras = prepared(calibration, twist)
     loss, damping, poses_0, is_elsewhere = rule
     matrix, reduced_gradient, full_gradient, diagonal = system
-    num_slots, slots, Y, factor, square, gradient = kept
+    num_slots, slots, Y, Y_calibration, factor, square, gradient = kept
+    J, first = np.empty((2, Y_calibration.shape[2])), 15 * len(poses)
     out, now, h, f, g = np.empty(NUM_OUT), np.empty(3), np.empty(6), np.empty(6), np.empty(3)
     total = 0.0
     for n in range(len(start) - 1):
         a, d, count = anchor_frame[n], anchor_camera[n], 0
         h[:], g[:] = 0.0, 0.0
+        Y_calibration[n] = 0.0
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
             if is_elsewhere[a] or is_elsewhere[k]:
-                reproject_only(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, now)
-                reproject(poses_0, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
+                reproject_only(poses, (a, d, k, c), cameras, points, n, uv, o, now)
+                reproject(poses_0, (a, d, k, c), cameras, points, n, uv, o, out, J)
                 out[0], out[1], out[2] = now[0], now[1], now[2]
             else:
-                reproject(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
+                reproject(poses, (a, d, k, c), cameras, points, n, uv, o, out, J)
             if not out[2] > 0.0:
                 total += rho_and_weight(loss, BEHIND, scale2[o])[0]
                 continue
-            total += weighted(out, inverse_sigma[o], loss, scale2[o])[0]
+            rho, whitening = weighted(out, inverse_sigma[o], loss, scale2[o])
+            total += rho
             add_landmark_sums(out, h, g)
+            if len(J[0]) > 0:
+                add_calibration(
+                    out, J, whitening, (a, k, first), n, Y_calibration, matrix, full_gradient,
+                    diagonal,
+                )  # fmt: skip
             if k == a:
                 continue
             if count == 0:
@@ -225,6 +399,10 @@ def eliminate(data, at, rule, system, kept):
         total += r * r
         factor_3x3(h, damping, f)
         subtract_slots(n, count, slots, Y, f, g, matrix, reduced_gradient)
+        if len(J[0]) > 0:
+            subtract_calibration(
+                n, count, slots, first, Y, Y_calibration, f, g, matrix, reduced_gradient
+            )
         num_slots[n] = count
         for i in range(6):
             factor[n, i], square[n, i] = f[i], h[i]
@@ -242,9 +420,9 @@ def substitute(data, at, rule, kept, step, new):
     """
     start, frame, camera, uv, inverse_sigma, scale2, anchor_frame, anchor_camera, expected = data
     points, damping, loss = at.h, rule.damping, rule.loss
-    poses, new_points, extrinsics, parameters = new
-    axes = camera_axes(extrinsics)
-    num_slots, slots, Y, factor, square, gradient = kept
+    poses, new_points, calibration, twist = new
+    cameras, first = prepared(calibration, twist), 15 * len(poses)
+    num_slots, slots, Y, Y_calibration, factor, square, gradient = kept
     f, g, dh, out = np.empty(6), np.empty(3), np.empty(3), np.empty(NUM_OUT)
     promised, norm2, total = 0.0, 0.0, 0.0
     for n in range(len(start) - 1):
@@ -261,6 +439,10 @@ def substitute(data, at, rule, kept, step, new):
                 z0 += Y[n, s, 0, c] * step[row + c]
                 z1 += Y[n, s, 1, c] * step[row + c]
                 z2 += Y[n, s, 2, c] * step[row + c]
+        for j in range(Y_calibration.shape[2]):
+            z0 += Y_calibration[n, 0, j] * step[first + j]
+            z1 += Y_calibration[n, 1, j] * step[first + j]
+            z2 += Y_calibration[n, 2, j] * step[first + j]
         dh[2] = -z2 * f[5]
         dh[1] = (-z1 - f[4] * dh[2]) * f[2]
         dh[0] = (-z0 - f[1] * dh[1] - f[3] * dh[2]) * f[0]
@@ -274,7 +456,7 @@ def substitute(data, at, rule, kept, step, new):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, (a, d, k, c), (axes, parameters), new_points, n, uv, o, out)
+            reproject_only(poses, (a, d, k, c), cameras, new_points, n, uv, o, out)
             e2 = (out[0] * out[0] + out[1] * out[1]) * inverse_sigma[o] * inverse_sigma[o]
             total += rho_and_weight(loss, e2 if out[2] > 0.0 else BEHIND, scale2[o])[0]
         r = expected[n, 1] * (new_points[n, 2] - expected[n, 0])
@@ -286,14 +468,13 @@ def substitute(data, at, rule, kept, step, new):
 def evaluate(data, at, error_depth):
     """Write every observation's reprojection error [px] and depth [m] to error_depth (O, 2)."""
     start, frame, camera, uv, _, _, anchor_frame, anchor_camera, _ = data
-    poses, points, extrinsics, parameters = at
-    axes = camera_axes(extrinsics)
-    out = np.empty(NUM_OUT)
+    poses, points, calibration, twist = at
+    cameras, out = prepared(calibration, twist), np.empty(NUM_OUT)
     for n in range(len(start) - 1):
         a, d = anchor_frame[n], anchor_camera[n]
         for o in range(start[n], start[n + 1]):
             k, c = frame[o], camera[o]
-            reproject_only(poses, (a, d, k, c), (axes, parameters), points, n, uv, o, out)
+            reproject_only(poses, (a, d, k, c), cameras, points, n, uv, o, out)
             error_depth[o, 0] = math.sqrt(out[0] * out[0] + out[1] * out[1])
             error_depth[o, 1] = out[2] / points[n, 2]
 

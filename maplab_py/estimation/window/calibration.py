@@ -1,0 +1,280 @@
+"""The calibration of the cameras as states of a window: changes from a reference.
+
+Source of the states and of their priors' sizes: Geneva et al., OpenVINS: A Research Platform for
+Visual-Inertial Estimation, ICRA 2020, which has no line delay.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64
+from maplab_py.estimation.codegen.kernels import CAMERA_DELAY_COLUMN, CAMERA_INTRINSICS_COLUMN
+from maplab_py.estimation.kernels.window_arguments import WindowCameras
+from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.estimation.window.states import WindowStates
+from maplab_py.geometry import se3, so3
+from maplab_py.sensors import Camera
+from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
+
+KINDS = ("extrinsics", "time_offset", "intrinsics", "line_delay")
+"""Groups of numbers that can be estimated."""
+_ROTATION, _NUMBERS = 3, ("position x", "position y", "position z")
+_ANGLES = ("rotation x", "rotation y", "rotation z")
+
+
+_SIGNIFICANT_SIGMAS = 3.0
+_UNITS = {
+    "position": (1e3, "mm"),
+    "rotation": (180.0 / np.pi, "deg"),
+    "image delay": (1e3, "ms"),
+    "line delay": (1e6, "us"),
+    " fu": (1.0, "px"),
+    " fv": (1.0, "px"),
+    " cu": (1.0, "px"),
+    " cv": (1.0, "px"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationSigmas:
+    """Standard deviations of the numbers of a calibration before anything is seen."""
+
+    position_m: float = 0.02
+    rotation_rad: float = 0.06
+    delay_s: float = 0.01
+    readout_s: float = 0.015  # of all rows of an image
+    focal: float = 0.01  # as a share
+    centre_px: float = 5.0
+    distortion: float = 0.01
+    mirror: float = 0.01
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowCalibration:
+    """Reference of C cameras, and the K numbers of them that are estimated, as changes from it.
+
+    `columns` (C, D) has the state of each number of a camera: position and rotation, delay of the images,
+    line delay, one of padding, intrinsics; -1 = it is known. Cameras share delay and line delay.
+    """
+
+    cameras: tuple[Camera, ...]
+    T_I_C: F64  # (C, 7)
+    columns: I64  # (C, D)
+    mean: F64  # (K,) to begin with
+    sigma: F64  # (K,) of it
+    table: F64  # (C, 1 + widest) parameters of the reference, as kernels read them
+    direction: float = 1.0  # of time; -1 = frames are read backwards
+
+    @classmethod
+    def of(
+        cls,
+        cameras: tuple[Camera, ...],
+        T_I_C: F64,
+        kinds: tuple[str, ...] = (),
+        sigmas: CalibrationSigmas | None = None,
+    ) -> WindowCalibration:
+        """Return the calibration of cameras with poses (C, 7), of which some kinds are estimated."""
+        sigmas = sigmas or CalibrationSigmas()
+        table = Cameras.of(cameras, T_I_C)
+        width = CAMERA_INTRINSICS_COLUMN + table.parameters.shape[1] - 1
+        columns = np.full((len(cameras), width), -1, dtype=np.int64)
+        sigma: list[float] = []
+        for row, camera in enumerate(cameras):
+            of_row = _sigmas_of(camera, sigmas, kinds, is_first=row == 0)
+            places = np.array(list(of_row), dtype=np.int64)
+            columns[row, places] = len(sigma) + np.arange(len(places))
+            sigma += of_row.values()
+            timing = slice(CAMERA_DELAY_COLUMN, CAMERA_DELAY_COLUMN + 2)
+            columns[row, timing] = columns[0, timing]
+        values = np.array(sigma, dtype=np.float64)
+        poses = np.ascontiguousarray(T_I_C, dtype=np.float64)
+        return cls(cameras, poses, columns, np.zeros(len(values)), values, table.parameters)
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    @property
+    def has_lateness(self) -> bool:
+        """Whether rows of images may be of other times than their frames."""
+        timing = self.columns[:, CAMERA_DELAY_COLUMN : CAMERA_DELAY_COLUMN + 2]
+        return bool((timing >= 0).any()) or any(camera.is_moving for camera in self.cameras)
+
+    def changes(self, values: F64) -> F64:
+        """Return the changes (C, D) of all numbers of the cameras."""
+        if not len(self):
+            return np.zeros(self.columns.shape)
+        return np.where(self.columns >= 0, values[self.columns], 0.0)
+
+    def of_kernels(self, values: F64) -> WindowCameras:
+        """Return the cameras with some values (K,) of the states."""
+        changes = self.changes(values)
+        turn = changes[:, _ROTATION : _ROTATION + 3]
+        T_I_C, slope = self.T_I_C, np.tile(np.eye(3), (len(self.cameras), 1, 1))
+        if len(self):
+            turned = so3.multiply(T_I_C[:, :4], so3.exp(turn))
+            T_I_C = se3.make(turned, T_I_C[:, 4:] + changes[:, :3])
+            slope = np.ascontiguousarray(so3.right_jacobian(turn))
+        known = [(camera.image_delay_s, 1e-9 * camera.line_delay_ns) for camera in self.cameras]
+        timing = changes[:, CAMERA_DELAY_COLUMN : CAMERA_DELAY_COLUMN + 2] + np.array(known)
+        timing *= self.direction
+        parameters = self.table.copy()
+        parameters[:, 1:] += changes[:, CAMERA_INTRINSICS_COLUMN:]
+        return WindowCameras(
+            np.ascontiguousarray(T_I_C),
+            parameters,
+            np.ascontiguousarray(timing),
+            slope,
+            self.columns,
+        )
+
+    def calibrated(self, values: F64, delay_s: float = 0.0) -> tuple[tuple[Camera, ...], F64]:
+        """Return cameras and poses (C, 7) with some values (K,), of images whose frames are so late."""
+        found = self.of_kernels(values)
+        cameras = []
+        for row, camera in enumerate(self.cameras):
+            size, count = len(camera.intrinsics), len(camera.distortion_parameters)
+            numbers = found.parameters[row, 1 : 1 + size + count]
+            lateness_s = float(found.timing_s[row, 0]) - delay_s
+            line_delay_ns = camera.line_delay_ns
+            if self.columns[row, CAMERA_DELAY_COLUMN + 1] >= 0:
+                line_delay_ns = round(1e9 * float(found.timing_s[row, 1]))
+            cameras.append(
+                dataclasses.replace(
+                    camera,
+                    intrinsics=numbers[:size].copy(),
+                    distortion_parameters=numbers[size:].copy(),
+                    image_delay_s=lateness_s,
+                    line_delay_ns=line_delay_ns,
+                )
+            )
+        return tuple(cameras), found.T_I_C
+
+    def reversed_at(self, values: F64) -> WindowCalibration:
+        """Return the calibration with some values (K,), all known, for frames read backwards."""
+        return dataclasses.replace(WindowCalibration.of(*self.calibrated(values)), direction=-1.0)
+
+    def rays_at_frame(
+        self, frame: WindowFrame, rays_C: F64, now: WindowCameras, rate_I: F64
+    ) -> F64:
+        """Return rays (N, 3) as their cameras would have seen them at the frame's time.
+
+        Only the turn is considered.
+
+        Args:
+            frame: The frame that sees them.
+            rays_C: As seen.
+            now: The cameras.
+            rate_I: Angular velocity (3,) of the body.
+        """
+        timing_s, q_I_C = now.timing_s[frame.camera], now.T_I_C[frame.camera, :4]
+        late_s = timing_s[:, 0] + timing_s[:, 1] * frame.uv_px[:, 1] - frame.delay_s
+        turn = so3.exp(late_s[:, None] * rate_I)
+        return so3.rotate(so3.inverse(q_I_C), so3.rotate(turn, so3.rotate(q_I_C, rays_C)))
+
+    def rows(self, kind: str) -> I64:
+        """Return the states (k,) of a kind."""
+        first, last = {
+            "extrinsics": (0, CAMERA_DELAY_COLUMN),
+            "time_offset": (CAMERA_DELAY_COLUMN, CAMERA_DELAY_COLUMN + 1),
+            "line_delay": (CAMERA_DELAY_COLUMN + 1, CAMERA_DELAY_COLUMN + 2),
+            "intrinsics": (CAMERA_INTRINSICS_COLUMN, self.columns.shape[1]),
+        }[kind]
+        found = np.unique(self.columns[:, first:last])
+        return found[found >= 0]
+
+    def units(self) -> list[tuple[float, str]]:
+        """Return by what each of the states (K) is multiplied to be shown, and its unit."""
+        return [_unit_of(name) for name in self.names()]
+
+    def names(self) -> list[str]:
+        """Return the names (K,) of the states."""
+        names = [""] * len(self)
+        for row in range(len(self.cameras) - 1, -1, -1):
+            projection, distortion = self.cameras[row].projection, self.cameras[row].distortion
+            pinhole = ("fu", "fv", "cu", "cv")
+            labels = [*_NUMBERS, *_ANGLES, "image delay", "line delay", ""]
+            labels += [*MIRROR_NAMES[projection], *pinhole, *DISTORTION_NAMES[distortion]]
+            for label, column in zip(labels, self.columns[row], strict=False):
+                if column >= 0:
+                    is_shared = label.endswith("delay")
+                    names[column] = label if is_shared else f"camera {row} {label}"
+        return names
+
+
+def _unit_of(name: str) -> tuple[float, str]:
+    """Return by what a number is multiplied to be shown, and its unit."""
+    for word, unit in _UNITS.items():
+        if word in name:
+            return unit
+    return 1.0, ""
+
+
+def _sigmas_of(
+    camera: Camera, sigmas: CalibrationSigmas, kinds: tuple[str, ...], *, is_first: bool
+) -> dict[int, float]:
+    """Return the standard deviation of each number of a camera that is estimated, by its column."""
+    result: dict[int, float] = {}
+    if "extrinsics" in kinds:
+        result |= dict.fromkeys(range(3), sigmas.position_m)
+        result |= dict.fromkeys(range(3, 6), sigmas.rotation_rad)
+    if "time_offset" in kinds and is_first:
+        result[CAMERA_DELAY_COLUMN] = sigmas.delay_s
+    if "line_delay" in kinds and is_first:
+        result[CAMERA_DELAY_COLUMN + 1] = sigmas.readout_s / camera.height_px
+    if "intrinsics" in kinds:
+        mirrors = len(camera.intrinsics) - 4
+        of_all = [sigmas.mirror] * mirrors
+        of_all += (sigmas.focal * np.abs(camera.intrinsics[-4:-2])).tolist()
+        of_all += [sigmas.centre_px] * 2
+        of_all += [sigmas.distortion] * len(camera.distortion_parameters)
+        first = CAMERA_INTRINSICS_COLUMN
+        result |= {first + k: sigma for k, sigma in enumerate(of_all)}
+    return result
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FoundCalibration:
+    """What a window has said of the calibration."""
+
+    calibration: WindowCalibration
+    values: F64  # (K,) changes
+    sigma: F64  # (K,)
+    delay_s: float  # of the frames' times against the stamps of images
+
+    @property
+    def differs(self) -> tuple[int, ...]:
+        """States whose change exceeds three standard deviations."""
+        off = np.abs(self.values) > _SIGNIFICANT_SIGMAS * self.sigma
+        return tuple(np.flatnonzero(off).tolist())
+
+    def cameras(self) -> tuple[tuple[Camera, ...], F64]:
+        """Return cameras and poses (C, 7), for vertices that have the times of the frames."""
+        return self.calibration.calibrated(self.values, self.delay_s)
+
+    def words(self) -> list[str]:
+        """Return every change with its standard deviation, and whether it is significant."""
+        names, units = self.calibration.names(), self.calibration.units()
+        return [
+            f"{name} {size * value:+.3g} +- {size * sigma:.2g} {unit}".rstrip()
+            for name, (size, unit), value, sigma in zip(
+                names, units, self.values, self.sigma, strict=True
+            )
+        ]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrameTimes:
+    """When the images of F frames were taken, and how fast the body turned."""
+
+    rate_I: F64  # (F, 3) angular velocity as measured [rad/s]
+    delay_s: F64  # (F,) by which the frame's time differs from the stamps of its images
+
+    def twist(self, states: WindowStates) -> F64:
+        """Return velocity and angular velocity in I, and the delays, as kernels read them (F, 7)."""
+        v_I = so3.rotate(so3.inverse(states.T_M_I[:, :4]), states.motion[:, :3])
+        rate = self.rate_I - states.gyro_bias
+        return np.ascontiguousarray(np.concatenate([v_I, rate, self.delay_s[:, None]], axis=1))
