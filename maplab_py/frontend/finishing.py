@@ -65,12 +65,13 @@ def finish(
     notes = [*mapping.statistics.notes, *_calibration_notes(mapping), *_stream_notes(mapping)]
     notes += _localization_notes(mapping)
     vi_map: VIMap | None = None
+    doubts: tuple[str, ...] = ()
     disk_copy: DiskCopy | None = None
     saved_folder: Path | None = None
     try:
         if mapping.builder is not None:
             vi_map, _ = mapping.builder.finish(progress=progress)
-            notes += scale_doubts(vi_map)
+            doubts = scale_doubts(vi_map)
             if output.optimize_map_to_localization_map:
                 try:
                     vi_map = localization_map(
@@ -98,6 +99,9 @@ def finish(
         if vi_map is None:
             raise
         problems.append(f"{error} (the map is in memory as '{map_key}': save it)")
+    odometry, first_ns = mapping.odometry, mapping.statistics.first_ns
+    since_s = None if odometry.trusted_ns is None else (odometry.trusted_ns - first_ns) * 1e-9
+    notes += scale_verdict(odometry.scale_sigma, since_s, doubts)
     report = _report(mapping, recording_name, vi_map, notes, "; ".join(problems))
     report = dataclasses.replace(report, map_key=map_key, map_folder=saved_folder)
     return FinishedRun(report, vi_map, disk_copy)
@@ -191,7 +195,7 @@ def _stream_notes(mapping: Mapping) -> list[str]:
 
 
 def _calibration_notes(mapping: Mapping) -> list[str]:
-    """Return what of the calibration was doubted, and since when the scale is known."""
+    """Return what of the calibration was doubted, and what was found in its place."""
     odometry = mapping.odometry
     notes, delays = list(odometry.notes), odometry.delays
     if delays is not None and delays.applied_s:
@@ -212,17 +216,25 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
                 else "the map keeps the file's"
             )
             notes.append(f"it differs from the file's by more than three deviations: {of_map}")
-    if odometry.scale_sigma > 0.0:
-        first_ns = mapping.statistics.first_ns
-        since_ns = odometry.trusted_ns
-        notes.append(
-            f"the scale is not known to better than {100 * odometry.scale_sigma:.0f} %: change speed and "
-            "direction more"
-            if since_ns is None
-            else f"started before the scale was known: it can be trusted from "
-            f"{(since_ns - first_ns) * 1e-9:.1f} s on"
-        )
     return notes
+
+
+def scale_verdict(sigma: float, since_s: float | None, doubts: tuple[str, ...]) -> list[str]:
+    """Return one verdict on the scale: the map's accelerations count more than the odometry's account.
+
+    Args:
+        sigma: Standard deviation by the odometry, as a share; 0 = it was known at the start.
+        since_s: Since when the odometry knows it; None = not yet.
+        doubts: What the map's accelerations say against it.
+    """
+    if doubts:
+        return list(doubts)
+    if sigma <= 0.0:
+        return []
+    if since_s is None:
+        percent = f"{100 * sigma:.0f} %"
+        return [f"the scale is not known to better than {percent}: change speed and direction more"]
+    return [f"started before the scale was known: it can be trusted from {since_s:.1f} s on"]
 
 
 def _offset_ns(mapping: Mapping, delay_s: float) -> int:

@@ -13,7 +13,7 @@ import pytest
 
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
-from maplab_py.frontend.finishing import finish
+from maplab_py.frontend.finishing import finish, scale_verdict
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
@@ -339,3 +339,20 @@ def test_wrong_options(options: RunOptions, message: str) -> None:
     recording, _ = recording_of()
     with pytest.raises(FlagError, match=message):
         Mapping(recording, options)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "since_s", "doubts", "words"),
+    [
+        (0.0, None, (), ""),
+        (0.04, 4.2, (), "it can be trusted from 4.2 s on"),
+        (0.2, None, (), "not known to better than 20 %"),
+        (0.04, 4.2, ("lengths are 0.59 times",), "lengths are 0.59 times"),
+    ],
+)
+def test_there_is_one_verdict_on_the_scale(
+    sigma: float, since_s: float | None, doubts: tuple[str, ...], words: str
+) -> None:
+    notes = scale_verdict(sigma, since_s, doubts)
+    assert len(notes) == bool(words)
+    assert all(words in note for note in notes)
