@@ -141,16 +141,9 @@ def _mh_01() -> Figures:
 def _v1_01() -> Figures:
     session = Session(load_registry())
     maps = shared_data_folder() / "maplab_maps" / "euroc_v1_01"
-    session.run("load_merge_all_maps", maps_folder=str(maps))
-    for command in (
-        "optvi",
-        "set_mission_baseframe_to_known",
-        "anchor_all_missions",
-        "relax",
-        "lc",
-    ):
+    session.run("load_merge_all_submaps", maps_folder=str(maps))
+    for command in ("optvi", "lc", "optvi"):
         session.run(command)
-    session.run("optvi")
     truth = shared_data_folder() / "ground_truth" / "V1_01_easy.csv"
     report: Any = session.run("evaluate_trajectory", ground_truth=str(truth))
     return {"V1_01_map_ate_m": report.ape_m.rmse}
