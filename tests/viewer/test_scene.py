@@ -10,10 +10,14 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
+from maplab_py.sensors import Distortion, Projection
+from maplab_py.sensors.camera import CAMERA_MODELS
+from maplab_py.sensors.projection import project
 from maplab_py.storage.mission_names import named
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.drawing import make_drawing
+from maplab_py.viewer.layers.cameras import frustum_points
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.landmarks import landmark_colours
 from maplab_py.viewer.layers.references import MarkedSegments
@@ -22,6 +26,7 @@ from maplab_py.viewer.scene import Axes, Mesh, Points, Scene, Segments
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.merge import merge_maps
+from tests.support.scene import make_camera
 from tests.vimap.builders import walk_map
 
 
@@ -147,6 +152,20 @@ def test_base_frames_and_absolute_poses(two_missions: VIMap) -> None:
     ends, _, rows = _segments(scene, "absolute_poses")
     assert scene.layer("absolute_poses").total == 4
     np.testing.assert_allclose(ends[:, 0], two_missions.absolute_poses.T_G_S[rows, 4:], atol=1e-5)
+
+
+@pytest.mark.parametrize("model", CAMERA_MODELS, ids=lambda m: "-".join(x.value for x in m))
+def test_corners_of_every_camera_are_seen_in_the_corners(
+    model: tuple[Projection, Distortion],
+) -> None:
+    camera = make_camera(*model)
+    centre, *corners = frustum_points(camera, 0.5)
+    np.testing.assert_array_equal(centre, 0.0)
+    uv, visible = project(camera, np.array(corners))
+    assert visible.all()
+    off = (uv - [320.0, 240.0]) / [320.0, 240.0]
+    np.testing.assert_array_equal(np.sign(off), [[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    assert np.abs(off).min() > 0.15
 
 
 def test_frusta_begin_at_the_cameras(two_missions: VIMap) -> None:
