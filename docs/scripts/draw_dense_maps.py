@@ -19,7 +19,7 @@ from maplab_py.geometry import se3
 from maplab_py.simulation.raw_data import write_maps
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.viewer import colours
-from maplab_py.viewer.vertex_images import VertexImages
+from maplab_py.viewer.resource_clouds import VertexImages
 
 TARGET = Path(__file__).resolve().parents[1] / "images" / "dense_maps.png"
 WIDTH_PX, HEIGHT_PX = 564, 360

@@ -19,7 +19,7 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import align_yaw_position
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MergingOptions
-from maplab_py.server.simulated_robots import timed_submaps
+from maplab_py.server.submap_sources import timed_submaps
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth

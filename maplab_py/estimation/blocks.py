@@ -18,7 +18,7 @@ from maplab_py.geometry import se3, so3
 
 
 class Manifold(Enum):
-    """What a parameter is, and so how a step moves it."""
+    """Kind of a parameter, which decides how a step moves it."""
 
     VECTOR = "vector"  # x + d
     POSE = "pose"  # [q p] (7); nodes position and orientation, as of vertices

@@ -1,4 +1,4 @@
-"""How fast keypoints move, when they also have noise.
+"""Speed of keypoints in the presence of noise.
 
 Keypoints at rest differ from image to image by their noise, whatever the time between the images; moving
 ones differ the more, the longer that is. Two baselines tell one from the other: with noise n and rate r the

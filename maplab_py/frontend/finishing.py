@@ -30,7 +30,7 @@ from maplab_py.vimap import LandmarkQuality, VIMap
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """What came of a run."""
+    """Outcome of a run."""
 
     report: MappingReport
     vi_map: VIMap | None  # None without a map builder, and if there are too few vertices

@@ -41,7 +41,7 @@ class DelayMonitor:
 
     @property
     def delay_s(self) -> float:
-        """What is known of the delay."""
+        """Estimate of the delay."""
         return self._mean_s
 
     @property

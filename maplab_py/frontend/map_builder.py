@@ -15,7 +15,7 @@ from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.progress import SILENT, Progress
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.stacking import stack
 

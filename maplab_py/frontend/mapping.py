@@ -171,7 +171,7 @@ class Mapping:
 
     @property
     def recording_notes(self) -> tuple[str, ...]:
-        """What the reader of the recording has to say."""
+        """Notes of the reader of the recording."""
         return self._recording.notes
 
     def trajectory(self) -> Trajectory:

@@ -50,7 +50,7 @@ _NOISE_TIME_NS = 900_000_000
 
 @dataclasses.dataclass(eq=False)
 class OdometryCounts:
-    """What the odometry has counted."""
+    """Counts of the odometry."""
 
     frames: int = 0
     frames_before_imu: int = 0

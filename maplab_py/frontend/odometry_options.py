@@ -17,7 +17,7 @@ from maplab_py.vision.tracking.options import TrackingOptions
 
 @dataclasses.dataclass(frozen=True)
 class RestOptions:
-    """When the device counts as standing still: all conditions must hold."""
+    """Conditions of standstill: all must hold."""
 
     flag_prefix: ClassVar[str] = "vio_rest_"
 
@@ -56,7 +56,7 @@ class RestOptions:
 
 @dataclasses.dataclass(frozen=True)
 class HealthOptions:
-    """When an estimate counts as diverged, so that the estimator starts again."""
+    """Criteria of divergence, after which the estimator starts again."""
 
     flag_prefix: ClassVar[str] = "vio_health_"
 

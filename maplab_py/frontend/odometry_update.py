@@ -1,4 +1,4 @@
-"""What odometry says after each frame."""
+"""Result of the odometry after each frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OdometryStatus(Enum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WindowSummary:
-    """What the smoother says about its window."""
+    """State of the smoother's window."""
 
     covariance: F64  # (15, 15) of the newest state, order [p, theta, v, b_g, b_a]
     is_keyframe: bool

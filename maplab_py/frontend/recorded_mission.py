@@ -10,7 +10,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.frontend.body_states import BodyStates
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.ids import from_hex, random_ids

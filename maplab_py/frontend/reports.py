@@ -29,7 +29,7 @@ class EstimatorStart:
 
 @dataclasses.dataclass(frozen=True)
 class MappingReport(Report):
-    """What was estimated from a recording."""
+    """Estimates from a recording."""
 
     recording: str
     duration_s: float  # from the first to the last frame

@@ -20,7 +20,7 @@ DATA_SOURCES = ("auto", "euroc", "rosbag", "map", *TRANSPORTS)
 
 @dataclasses.dataclass(frozen=True)
 class DataSourceOptions:
-    """Which recording is read."""
+    """Recording to read."""
 
     flag_prefix: ClassVar[str] = "datasource_"
 
@@ -39,7 +39,7 @@ class DataSourceOptions:
 
 @dataclasses.dataclass(frozen=True)
 class MapBuilderOptions:
-    """Which frames become vertices, and what they keep."""
+    """Choice of the frames that become vertices, and their content."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -70,7 +70,7 @@ class MapBuilderOptions:
 
 @dataclasses.dataclass(frozen=True)
 class OutputOptions:
-    """What is made of the recording, and where it goes."""
+    """Outputs of a run, and their places."""
 
     flag_prefix: ClassVar[str] = ""
 

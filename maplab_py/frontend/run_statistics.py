@@ -1,4 +1,4 @@
-"""What a run over a recording has counted and timed."""
+"""Counts and times of a run over a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What finds the state with which odometry starts."""
+"""Search for the state with which odometry starts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Starter(Protocol):
 
     @property
     def reason(self) -> str:
-        """Why there is no state so far, in plain words."""
+        """Reason why there is no state so far, in plain words."""
 
     def push(self, frame: WindowFrame) -> Start | None:
         """Take the next frame; return a start whose last frame it is, None while there is none."""

@@ -48,7 +48,7 @@ from maplab_py.interop.calibrations.single_cameras import (
     read_dso_camera,
 )
 from maplab_py.interop.calibrations.vins import is_vins, read_vins
-from maplab_py.interop.colmap.calibration import is_colmap, read_cameras
+from maplab_py.interop.colmap.reading import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
 from maplab_py.sensors.sensor_set import Sensor
@@ -70,7 +70,7 @@ _ODD_SCALE = 0.1
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibrationFile(RecordedSensors):
-    """What a calibration file has: a camera rig, an IMU, or both."""
+    """Content of a calibration file: a camera rig, an IMU, or both."""
 
     source: Path = Path()
     format: str = ""  # for people: "kalibr", "EuRoC", "OpenVINS", "Basalt", "COLMAP", "maplab", ...
@@ -432,4 +432,4 @@ _FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] =
     (is_svo, read_svo),
     (is_camera_info, read_camera_info),
 )
-"""How a file is recognised, and its reader."""
+"""Signature of a kind of file, and its reader."""

@@ -52,7 +52,7 @@ _ROWS_AT_ONCE = 1 << 15
 
 
 class DescriptorProjector(Protocol):
-    """What projects binary descriptors to few real numbers."""
+    """Projection of binary descriptors to few real numbers."""
 
     @property
     def descriptor_size(self) -> int:

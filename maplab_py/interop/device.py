@@ -65,7 +65,7 @@ class RecordedSensors:
 
 @dataclasses.dataclass(frozen=True)
 class DeviceOptions:
-    """Which sensors of a sensors.yaml make up the device, where it has several of a kind."""
+    """Choice of the sensors of the device from a sensors.yaml that has several of a kind."""
 
     flag_prefix: ClassVar[str] = "selected_"
 

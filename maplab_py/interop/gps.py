@@ -196,7 +196,7 @@ def _columns(table: TextTable) -> list[int]:
 
 
 class _Sentence(NamedTuple):
-    """What a sentence tells."""
+    """Content of a sentence."""
 
     clock_ns: int | None  # time of day
     day_ns: int | None = None  # of RMC

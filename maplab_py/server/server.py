@@ -33,15 +33,16 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.server.journal import Journal, MergedSubmap, recover, write_journal
 from maplab_py.server.merging import Merger, stretches_of
 from maplab_py.server.options import (
+    DeletedMissions,
     IncrementalOptions,
     MapServerOptions,
+    ServeReport,
+    ServerStatus,
     ServiceOptions,
 )
 from maplab_py.server.preparation import Intake, Item, Preparation
 from maplab_py.server.publishing import Display, Publisher, pause_s
-from maplab_py.server.reports import DeletedMissions, ServeReport, ServerStatus
-from maplab_py.server.requests import answers
-from maplab_py.server.service import Service
+from maplab_py.server.service import Service, answers
 from maplab_py.server.spool import Spool, locked_spool
 from maplab_py.server.status import Events, status_of
 from maplab_py.vimap import VIMap

@@ -34,7 +34,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.pipeline.fingerprint import folder_hash
 from maplab_py.storage import checksums
 from maplab_py.storage.native import is_map_folder
-from maplab_py.storage.resources import MAP_FOLDER
+from maplab_py.storage.resources.store import MAP_FOLDER
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.stacking import resource_folder_name
 

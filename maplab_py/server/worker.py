@@ -77,7 +77,7 @@ def prepare(order: SubmapOrder) -> str:
     from maplab_py.algorithms.vi_optimization.optimization import optimize
     from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
     from maplab_py.storage.native import load_map, save_map
-    from maplab_py.storage.resource_files import with_file_checks
+    from maplab_py.storage.resources.files import with_file_checks
     from maplab_py.vimap.consistency import check_consistency
 
     vi_map, _ = load_map(order.submap)

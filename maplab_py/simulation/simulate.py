@@ -20,7 +20,7 @@ from maplab_py.simulation.sensors import Device, make_device
 from maplab_py.simulation.session import session_map
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 

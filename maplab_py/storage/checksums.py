@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
-from maplab_py.storage.map_files import METADATA, RESOURCE_INFO, VI_MAP_FOLDER
-from maplab_py.storage.threads import map_in_threads
+from maplab_py.storage.protobuf.map_files import METADATA, RESOURCE_INFO, VI_MAP_FOLDER
 
 FILE_NAME = "checksums.sha256"
 _FINGERPRINT_DIGITS = 16
@@ -106,3 +108,23 @@ def listing(folder: Path, known: Mapping[str, str] | None = None) -> str:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+Result = TypeVar("Result")
+
+
+def map_in_threads(function: Callable[..., Result], *values: Iterable[Any]) -> list[Result]:
+    """Return what a function returns for each value, in their order.
+
+    Where memory does not suffice for the stack of a thread, this thread calls the function.
+
+    Args:
+        function: Releases Python's lock; raises no RuntimeError.
+        values: One iterable for each argument, all of the same length.
+    """
+    arguments = list(zip(*values, strict=True))
+    try:
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            return list(pool.map(lambda each: function(*each), arguments))
+    except RuntimeError:
+        return [function(*each) for each in arguments]

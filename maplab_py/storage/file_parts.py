@@ -11,11 +11,11 @@ import numpy as np
 from maplab_py.array_types import I64, U64
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.load_checks import FileFacts, check_file
-from maplab_py.storage.map_files import FileKind, parse_message
-from maplab_py.storage.message_ids import ids_of, ids_of_parts
-from maplab_py.storage.message_scan import MemoryBudget
-from maplab_py.storage.tables_from_messages import Content
-from maplab_py.storage.vertex_parts import LISTED_EDGES, VertexPart, read_part
+from maplab_py.storage.protobuf.ids import ids_of, ids_of_parts
+from maplab_py.storage.protobuf.map_files import FileKind, parse_message
+from maplab_py.storage.protobuf.scan import MemoryBudget
+from maplab_py.storage.protobuf.tables_from_messages import Content
+from maplab_py.storage.protobuf.vertex_parts import LISTED_EDGES, VertexPart, read_part
 from maplab_py.vimap.table import starts_of_counts
 
 _ENTITIES = {
@@ -29,7 +29,7 @@ _NO_IDS = np.zeros((0, 2), dtype=np.uint64)
 
 
 class FileParts:
-    """What the files of a map hold, as far as it has been read."""
+    """Content of the files of a map, as far as it has been read."""
 
     def __init__(self) -> None:
         """Start without files."""

@@ -19,9 +19,15 @@ from maplab_py.storage.extension_fields import (
     packed_size,
     read_extension,
 )
-from maplab_py.storage.map_files import COPY_AGAIN, METADATA, RESOURCE_INFO, SENSORS, FileKind
-from maplab_py.storage.message_ids import ids_of, unknown_bytes
-from maplab_py.storage.tables_from_messages import Content
+from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
+from maplab_py.storage.protobuf.map_files import (
+    COPY_AGAIN,
+    METADATA,
+    RESOURCE_INFO,
+    SENSORS,
+    FileKind,
+)
+from maplab_py.storage.protobuf.tables_from_messages import Content
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import Violation, check_loaded, check_saved
 from maplab_py.vimap.ids import IdIndex, to_hex
@@ -46,7 +52,7 @@ _NAMED = 3
 
 @dataclasses.dataclass(frozen=True)
 class FileFacts:
-    """What the check of all files needs to know of one."""
+    """Facts about a file for the check of all files."""
 
     kind: FileKind
     path: Path

@@ -7,6 +7,7 @@ import dataclasses
 import gc
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,7 @@ from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
-from maplab_py.storage import (
-    frames_from_messages,
-    message_numbers,
-    resources_from_messages,
-    tables_from_messages,
-)
+from maplab_py.storage.cache.map_cache import CachedMap
 from maplab_py.storage.checksums import verify
 from maplab_py.storage.file_parts import FileParts
 from maplab_py.storage.load_checks import (
@@ -35,26 +31,26 @@ from maplab_py.storage.load_checks import (
     consistency_notes,
     edge_kinds,
 )
-from maplab_py.storage.map_cache import CachedMap
-from maplab_py.storage.map_files import (
+from maplab_py.storage.mission_names import with_names
+from maplab_py.storage.protobuf import (
+    frames_from_messages,
+    message_numbers,
+    resources_from_messages,
+    tables_from_messages,
+)
+from maplab_py.storage.protobuf.ids import ids_of
+from maplab_py.storage.protobuf.map_files import (
     SENSORS,
     VI_MAP_FOLDER,
     FileKind,
     listed_files,
     read_unpacked,
 )
-from maplab_py.storage.message_ids import ids_of
-from maplab_py.storage.message_numbers import Name
-from maplab_py.storage.message_scan import MemoryBudget
-from maplab_py.storage.mission_names import with_names
-from maplab_py.storage.reading_ahead import read_ahead
+from maplab_py.storage.protobuf.message_numbers import Name
+from maplab_py.storage.protobuf.scan import MemoryBudget
+from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
+from maplab_py.storage.protobuf.vertex_parts import NO_TIME, JoinedParts, VertexPart
 from maplab_py.storage.reading_processes import parts_ahead
-from maplab_py.storage.tables_from_messages import Content, required_rows, unique_index
-from maplab_py.storage.vertex_parts import (
-    NO_TIME,
-    JoinedParts,
-    VertexPart,
-)
 from maplab_py.vimap import TransformationKind, VIMap
 from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
 from maplab_py.vimap.number_repair import without_bad_numbers
@@ -70,7 +66,7 @@ _TRANSFORMATIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class LoadReport(Report):
-    """What was loaded."""
+    """Result of loading a map."""
 
     folder: str
     files: int
@@ -417,3 +413,46 @@ def _check_landmark_index(
             "load with --repair to use the vertices"
         )
     return [f"{wrong} entries of the landmark index repaired"]
+
+
+# Read and unpack files in another thread, one ahead of the file that is being converted.
+#
+# Reading and unpacking release Python's lock, so they take place beside the conversion. With more
+# files ahead there would only be more bytes in memory.
+
+
+class FilesAhead:
+    """The unpacked contents of files, in their order."""
+
+    def __init__(self, pool: ThreadPoolExecutor, paths: Sequence[Path], max_bytes: int) -> None:
+        """Start with the first file."""
+        self._pool, self._max_bytes = pool, max_bytes
+        self._left = iter(paths)
+        self._next = self._start()
+
+    def take(self) -> bytes | bytearray:
+        """Return the next content and start with the one after it.
+
+        Raises:
+            MapError: The file cannot be read; see `map_files.read_unpacked`.
+            MemoryError: The file, or the thread that reads the next one, does not fit into memory.
+        """
+        content = self._next.result()
+        self._next = self._start()
+        return content
+
+    def _start(self) -> Future[bytes | bytearray]:
+        path = next(self._left, None)
+        if path is None:
+            return Future()
+        try:
+            return self._pool.submit(read_unpacked, path, self._max_bytes)
+        except RuntimeError as error:  # there is no space for the stack of the thread
+            raise MemoryError(str(error)) from error
+
+
+@contextlib.contextmanager
+def read_ahead(paths: Sequence[Path], max_bytes: int) -> Iterator[FilesAhead]:
+    """Yield the contents of files; none may unpack to more than a bound."""
+    with ThreadPoolExecutor(1) as pool:
+        yield FilesAhead(pool, paths, max_bytes)

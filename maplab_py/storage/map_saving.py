@@ -21,11 +21,12 @@ from maplab_py.report import Report
 from maplab_py.sensors import CameraRig, Distortion
 from maplab_py.sensors.camera import is_known_to_maplab
 from maplab_py.sensors.sensors_yaml import write_sensors
-from maplab_py.storage import checksums, mission_names, tables_to_messages
+from maplab_py.storage import checksums, mission_names
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.descriptor_layout import LayoutChoice, with_layout
 from maplab_py.storage.load_checks import check_loadable
-from maplab_py.storage.map_files import (
+from maplab_py.storage.protobuf import tables_to_messages
+from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice, with_layout
+from maplab_py.storage.protobuf.map_files import (
     METADATA,
     MISSIONS,
     RESOURCE_INFO,
@@ -35,8 +36,8 @@ from maplab_py.storage.map_files import (
     FileKind,
     is_map_folder,
 )
-from maplab_py.storage.new_resources import copied_files, with_staged_in_place
-from maplab_py.storage.tables_to_messages import Partition
+from maplab_py.storage.protobuf.tables_to_messages import Partition
+from maplab_py.storage.resources.new import copied_files, with_staged_in_place
 from maplab_py.storage.written_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.number_repair import without_bad_numbers
@@ -47,7 +48,7 @@ _GZIP_LEVEL = 1
 
 @dataclasses.dataclass(frozen=True)
 class SaveReport(Report):
-    """What was saved."""
+    """Result of saving a map."""
 
     folder: str
     files: int

@@ -10,10 +10,10 @@ from maplab_py.atomic import recover
 from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage import checksums, map_loading
-from maplab_py.storage.map_cache import MapCache
-from maplab_py.storage.map_files import is_map_folder
+from maplab_py.storage.cache.map_cache import MapCache
 from maplab_py.storage.map_loading import LoadReport
 from maplab_py.storage.map_saving import SaveReport, check_parent, check_target, save_map
+from maplab_py.storage.protobuf.map_files import is_map_folder
 from maplab_py.vimap import VIMap
 
 __all__ = [

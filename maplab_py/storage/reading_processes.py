@@ -23,8 +23,8 @@ from typing import IO, Any
 
 from maplab_py.errors import MapError
 from maplab_py.storage.file_parts import FileParts
-from maplab_py.storage.map_files import FileKind, read_unpacked
-from maplab_py.storage.message_scan import MemoryBudget
+from maplab_py.storage.protobuf.map_files import FileKind, read_unpacked
+from maplab_py.storage.protobuf.scan import MemoryBudget
 
 _WORTH_PROCESSES = 100_000_000
 """Bytes of the files of vertices from which processes save more time than their start takes."""
@@ -32,7 +32,7 @@ _MOST_PROCESSES = 8
 _LENGTH = struct.Struct("<Q")
 
 Answer = FileParts | MapError | MemoryError | None
-"""What a file holds, or why it cannot be read; None = the process that asked has to read it itself."""
+"""Content of a file, or why it cannot be read; None = the process that asked has to read it itself."""
 
 
 class _Reader:

@@ -21,8 +21,8 @@ from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.map_files import COPY_AGAIN, read_message
-from maplab_py.storage.message_scan import MemoryBudget
+from maplab_py.storage.protobuf.map_files import COPY_AGAIN, read_message
+from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.vimap.descriptors import DescriptorDepth
 
 FILE_NAME = "localization_summary_map"

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from maplab_py.atomic import link_or_copy
 from maplab_py.storage import checksums
-from maplab_py.storage.column_digests import ColumnDigests
-from maplab_py.storage.file_contents import FileContent
-from maplab_py.storage.tables_to_messages import Partition
+from maplab_py.storage.protobuf.file_contents import ColumnDigests, FileContent
+from maplab_py.storage.protobuf.tables_to_messages import Partition
 
 STABLE = Partition(vertices=50, edges=200, is_stable=True)
 """Few files change when a mission grows or a part of a map is optimised."""
@@ -30,7 +29,7 @@ class _File:
 
 
 class WrittenFiles:
-    """What the files of a folder said when it was saved last.
+    """Content of the files of a folder when it was saved last.
 
     Attributes:
         partition: Which entities come into one file.

@@ -19,12 +19,11 @@ from maplab_py.viewer.layers import (
     comparison,
     covariances,
     landmarks,
-    localization,
     paths,
     references,
 )
 from maplab_py.viewer.layers.clouds import Cloud
-from maplab_py.viewer.layers.localization import LocalizedRun
+from maplab_py.viewer.layers.paths import LocalizedRun
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Extent, Layer, MissionEntry, Scene
@@ -102,7 +101,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
         layers.append(cameras.landmark_observers(drawing, rows, _MAX_RAYS))
     layers += clouds.layers_of_clouds(drawing, subject.clouds)
     if subject.localized is not None:
-        layers += localization.localized_layers(drawing, subject.localized)
+        layers += paths.localized_layers(drawing, subject.localized)
     if subject.truth is not None:
         layers += references.ground_truth(drawing, subject.truth)
     if subject.other is not None and subject.side_by_side:

@@ -1,4 +1,4 @@
-"""Which resources belong to which missions, sensors and frames."""
+"""Resources of missions, sensors and frames."""
 
 from __future__ import annotations
 

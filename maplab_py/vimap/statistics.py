@@ -95,7 +95,7 @@ class MissionLine:
 
 @dataclasses.dataclass(frozen=True)
 class MissionTable:
-    """What is shown of the statistics."""
+    """Summary of the statistics."""
 
     missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
     summary: str = dataclasses.field(metadata={"is_prose": True})
@@ -186,7 +186,7 @@ class CoobservabilityLine:
 
 @dataclasses.dataclass(frozen=True)
 class CoobservabilityTable:
-    """What is shown of the landmarks that missions share."""
+    """Summary of the landmarks that missions share."""
 
     missions: tuple[CoobservabilityLine, ...] = dataclasses.field(metadata={"title": ""})
 

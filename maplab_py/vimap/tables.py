@@ -52,7 +52,7 @@ class LandmarkQuality(IntEnum):
 
 
 class TransformationKind(IntEnum):
-    """Which of the format's three relative-pose edges a row is (proto field numbers)."""
+    """Kind of a row among the format's three relative-pose edges (proto field numbers)."""
 
     ODOMETRY = 2
     TRANSFORMATION = 4

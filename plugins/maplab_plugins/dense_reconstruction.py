@@ -288,6 +288,6 @@ def _check_cloud(path: Path, *, overwrite: bool) -> None:
 
 def _depth_type(given: str) -> int | None:
     """Return the number of the resource type of depth that a user names, None for none."""
-    from maplab_py.storage.resource_types import resource_type_of
+    from maplab_py.storage.resources.types import resource_type_of
 
     return resource_type_of(given, "--dense_depth_resource_input_type").number if given else None

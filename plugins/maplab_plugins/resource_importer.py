@@ -76,7 +76,7 @@ def export_images(
         overwrite: Replace files that exist.
     """
     from maplab_py.interop.resources.images import export_images as write
-    from maplab_py.storage.resource_types import resource_type_of
+    from maplab_py.storage.resources.types import resource_type_of
 
     return write(
         context.vi_map,

@@ -89,7 +89,7 @@ def rovioli(
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping
-    from maplab_py.server.recorded_submaps import SubmapWriter
+    from maplab_py.server.submap_sources import SubmapWriter
 
     run.check()
     _check_output(run.output)
@@ -205,7 +205,7 @@ class _Pictures:
         """Take the landmarks of a frame, and show everything when it is time."""
         from maplab_py.frontend.live_map import live_map, picture_of_tracks
         from maplab_py.viewer.building import Subject
-        from maplab_py.viewer.layers.localization import LocalizedRun
+        from maplab_py.viewer.layers.paths import LocalizedRun
 
         if update.mission != self._mission:
             self._mission = update.mission

@@ -20,7 +20,7 @@ from maplab_py.server.options import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from maplab_py.server.reports import (
+    from maplab_py.server.options import (
         DeletedMissions,
         DenseMapReport,
         LookupReport,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         ServeReport,
         ServerStatus,
     )
-    from maplab_py.server.simulated_robots import RecordedSession
+    from maplab_py.server.submap_sources import RecordedSession
     from maplab_py.vimap import VIMap
 
 _SERVER = MapServerOptions()
@@ -113,7 +113,7 @@ def push(
         name: Name in the spool; empty = that of the folder.
     """
     from maplab_py.server import spool as spools
-    from maplab_py.server.reports import PushReport
+    from maplab_py.server.options import PushReport
 
     with lasting_effect():
         return PushReport(spools.push(spools.Spool(spool), robot_name, map_folder, name))
@@ -133,7 +133,7 @@ def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -
         wait_s: Wait up to so long [s] until a server has merged all that can be merged.
     """
     from maplab_py.server.client import NotRunning, ask
-    from maplab_py.server.reports import EventLine, RobotLine, ServerStatus
+    from maplab_py.server.options import EventLine, RobotLine, ServerStatus
     from maplab_py.server.spool import Spool
     from maplab_py.server.status import status_without_server
 
@@ -250,7 +250,7 @@ def map_lookup(
         p_S: Point in the frame of the sensor, "x y z" in metres.
     """
     from maplab_py.server.client import ask
-    from maplab_py.server.reports import LookupReport
+    from maplab_py.server.options import LookupReport
     from maplab_py.server.spool import Spool
 
     content = ask(
@@ -297,7 +297,7 @@ def get_dense_map_in_range(
 
     from maplab_py.interop.ply import PlyCloud, write_ply
     from maplab_py.server.client import ask
-    from maplab_py.server.reports import DenseMapReport
+    from maplab_py.server.options import DenseMapReport
     from maplab_py.server.spool import Spool
 
     given = {"center_G": center_G, "radius_m": repr(radius_m)}
@@ -336,10 +336,10 @@ def simulate_robots(
         maps_folder: Play the maps below this folder instead, as rovioli makes them of recordings; each
             mission is a robot, named after it or after the folder of its map.
     """
-    from maplab_py.server.reports import PlayedRobots
-    from maplab_py.server.simulated_robots import play as play_submaps
-    from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
+    from maplab_py.server.options import PlayedRobots
     from maplab_py.server.spool import Spool
+    from maplab_py.server.submap_sources import play as play_submaps
+    from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
 
     folder = Spool(spool)
     truth = folder.root / "truth.npz" if maps_folder is None else None
@@ -391,7 +391,7 @@ def _shown(context: CommandContext) -> tuple[Callable[[VIMap], None], str]:
 
 def _delete(spool: Path, name: str, **parameters: str) -> DeletedMissions:
     from maplab_py.server.client import order
-    from maplab_py.server.reports import DeletedMissions
+    from maplab_py.server.options import DeletedMissions
     from maplab_py.server.spool import Spool
 
     content = order(Spool(spool), name, **parameters)

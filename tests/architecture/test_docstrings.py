@@ -13,18 +13,6 @@ from tests.architecture.test_layers import SOURCES
 from tests.support.data import REPOSITORY
 
 QUESTION = re.compile(r"(What|Which|Where|How|Who|Whose|Why|When)\b")
-STILL_TO_DO = (
-    "maplab_py/algorithms/evaluation",
-    "maplab_py/algorithms/external_poses",
-    "maplab_py/algorithms/self_calibration/estimation",
-    "maplab_py/algorithms/vi_optimization",
-    "maplab_py/estimation",
-    "maplab_py/frontend",
-    "maplab_py/interop",
-    "maplab_py/storage",
-    "maplab_py/vimap",
-)
-"""Rooms whose docstrings still open with questions."""
 
 
 def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
@@ -37,10 +25,7 @@ def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
                 yield statement.lineno, value.value.strip()
 
 
-CLEAN = [path for path in SOURCES if not str(path.relative_to(REPOSITORY)).startswith(STILL_TO_DO)]
-
-
-@pytest.mark.parametrize("path", CLEAN, ids=lambda path: str(path.relative_to(REPOSITORY)))
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_docstrings_open_with_a_noun_or_a_verb(path: Path) -> None:
     questions = [
         f"{path.name}:{line} {text.splitlines()[0]}"

@@ -105,7 +105,7 @@ MAY_WRITE = (
     "maplab_py/atomic/",
     "maplab_py/storage/map_saving.py",  # into the folder that `replaced_folder` gives
     "maplab_py/storage/checksums.py",
-    "plugins/maplab_plugins/console/new_plugin.py",
+    "plugins/maplab_plugins/console/session.py",
     "maplab_py/console/commands/plugin_template.py",  # text of a test
     "maplab_py/console/terminal/output.py",  # a transcript is appended to
     "maplab_py/interop/colmap/child.py",  # databases and models in a temporary folder

@@ -18,10 +18,10 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap.exporting import export_colmap
+from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions
-from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.resources.images import import_images
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.summary_map import read_summary_map
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.queries import mission_sensor_id

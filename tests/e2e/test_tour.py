@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from maplab_plugins.tour.steps import tour_steps
+from maplab_plugins.tour import tour_steps
 
 from tests.e2e.support import Console, run_program
 

@@ -20,7 +20,7 @@ from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency

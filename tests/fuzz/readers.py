@@ -30,12 +30,11 @@ from maplab_py.algorithms.self_calibration.segments.database import (
 from maplab_py.errors import MaplabError
 from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.calibration_import import import_calibration
-from maplab_py.interop.colmap.calibration import read_cameras
 from maplab_py.interop.colmap.exporting import export_colmap
 from maplab_py.interop.colmap.features import ColmapDatabase
 from maplab_py.interop.colmap.importing import read_times
 from maplab_py.interop.colmap.options import ColmapExportOptions
-from maplab_py.interop.colmap.reading import read_model
+from maplab_py.interop.colmap.reading import read_cameras, read_model
 from maplab_py.interop.external_closures import read_external_closures
 from maplab_py.interop.g2o import read_g2o
 from maplab_py.interop.gps import read_gps
@@ -49,8 +48,8 @@ from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.interop.wheel_odometry import read_wheel_odometry
 from maplab_py.sensors.sensors_yaml import read_sensors, write_sensors
 from maplab_py.server.options import MapServerOptions
-from maplab_py.server.requests import answers
-from maplab_py.storage.column_file import UnusableColumns, read_columns, write_columns
+from maplab_py.server.service import answers
+from maplab_py.storage.cache.column_file import UnusableColumns, read_columns, write_columns
 from maplab_py.storage.native import load_map, save_map
 from tests.fuzz.messages import message_seeds, read_message
 from tests.interop import test_pcd

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from maplab_plugins.tour.guide import Guide
-from maplab_plugins.tour.steps import Step, tour_steps
+from maplab_plugins.tour import Guide, Step, tour_steps
 
 import maplab_py
 from maplab_py.console.commands.lines import split_commands

@@ -16,8 +16,8 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
 from maplab_py.interop.trajectories import Trajectory, write_tum
-from maplab_py.storage.resource_types import RESOURCE_TYPES
-from maplab_py.storage.resources import relative_path
+from maplab_py.storage.resources.store import relative_path
+from maplab_py.storage.resources.types import RESOURCE_TYPES
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.vimap import ResourceOwner, Resources, VIMap
 from maplab_py.vimap.ids import random_ids, to_hex

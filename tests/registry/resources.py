@@ -12,8 +12,8 @@ from maplab_py.interop.ply import PlyCloud, write_ply
 from maplab_py.interop.recordings.bag_writing import BagFormat, BagMessage, Channel, write_bag
 from maplab_py.interop.resources.matching import camera_frames, mission_rig
 from maplab_py.storage.native import save_map
-from maplab_py.storage.resource_types import RESOURCE_TYPES
-from maplab_py.storage.resources import relative_path
+from maplab_py.storage.resources.store import relative_path
+from maplab_py.storage.resources.types import RESOURCE_TYPES
 from maplab_py.vimap import ResourceOwner, Resources, VIMap
 from maplab_py.vimap.ids import random_ids
 

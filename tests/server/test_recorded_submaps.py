@@ -15,7 +15,7 @@ from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.server.options import SubmapOutput
-from maplab_py.server.recorded_submaps import SubmapWriter
+from maplab_py.server.submap_sources import SubmapWriter
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.submaps import append_submaps

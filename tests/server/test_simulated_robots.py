@@ -12,12 +12,12 @@ import pytest
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, write_ply
-from maplab_py.server.requests import dense_points_in_range, map_lookup
-from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
+from maplab_py.server.service import dense_points_in_range, map_lookup
+from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import find_maps, save_map
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resources import existing_files
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import existing_files
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.merge import merge_maps

@@ -15,7 +15,7 @@ from maplab_py.simulation.scenario_file import check_scenario
 from maplab_py.simulation.simulate import Lidar, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner
 from maplab_py.vimap.ids import from_hex
 from tests.simulation.small import SMALL

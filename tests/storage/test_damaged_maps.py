@@ -16,9 +16,9 @@ from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status, status_of
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.message_scan import MemoryBudget, estimate, quick_estimate
-from maplab_py.storage.message_scan_kernel import count_parts
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.protobuf.scan import MemoryBudget, estimate, quick_estimate
+from maplab_py.storage.protobuf.scan_kernel import count_parts
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.warmup import jobs
 from tests.e2e.support import run_program

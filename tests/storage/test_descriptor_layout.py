@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.storage.descriptor_layout import read_blocks
 from maplab_py.storage.native import find_maps, load_map, save_map
+from maplab_py.storage.protobuf.descriptor_layout import read_blocks
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import DescriptorBlock

@@ -5,7 +5,7 @@ import pytest
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.extension_fields import read_extension, with_extension
-from maplab_py.storage.message_ids import unknown_bytes
+from maplab_py.storage.protobuf.ids import unknown_bytes
 
 
 @pytest.mark.parametrize("size", [0, 1, 127, 128, 70_000])

@@ -11,8 +11,8 @@ import pytest
 
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.map_files import read_unpacked
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.protobuf.map_files import read_unpacked
 from tests.vimap.builders import walk_map
 
 

@@ -14,8 +14,8 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError
 from maplab_py.storage import native
-from maplab_py.storage.cache_options import CacheOptions
-from maplab_py.storage.column_file import mapped_bytes
+from maplab_py.storage.cache.column_file import mapped_bytes
+from maplab_py.storage.cache.options import CacheOptions
 from maplab_py.storage.native import LoadReport, MapCache, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same

@@ -15,8 +15,8 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_missions

@@ -10,9 +10,9 @@ import pytest
 
 from maplab_py.errors import MapError
 from maplab_py.storage import reading_processes
-from maplab_py.storage.map_files import listed_files
-from maplab_py.storage.message_scan import MemoryBudget
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.protobuf.map_files import listed_files
+from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.reading_processes import parts_ahead
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same

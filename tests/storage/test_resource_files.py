@@ -11,17 +11,16 @@ import pytest
 from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_cache import ResourceCache
-from maplab_py.storage.resource_files import (
+from maplab_py.storage.resources.files import (
     missing_files,
     orphaned_files,
     remove_files,
     with_file_checks,
     with_merged_folders,
 )
-from maplab_py.storage.resource_types import RESOURCE_TYPES, resource_type_of
-from maplab_py.storage.resources import resource_path
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceCache, resource_path
+from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type_of
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.resource_queries import resource_missions, resources_of, without_resources

@@ -11,8 +11,8 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.resource_types import RESOURCE_TYPES, resource_type
-from maplab_py.storage.resources import ResourceStore, relative_path, resource_path
+from maplab_py.storage.resources.store import ResourceStore, relative_path, resource_path
+from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import random_ids
 from maplab_py.vimap.tables import Resources

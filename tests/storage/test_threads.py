@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from maplab_py.storage.threads import map_in_threads
+from maplab_py.storage.checksums import map_in_threads
 
 
 def test_results_are_in_the_order_of_the_values() -> None:

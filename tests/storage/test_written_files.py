@@ -16,12 +16,10 @@ import pytest
 from maplab_py.array_types import U64
 from maplab_py.errors import UserError
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.column_digests import ColumnDigests, digest_of
-from maplab_py.storage.file_contents import FileContent
-from maplab_py.storage.id_messages import id_fields, tag_of
-from maplab_py.storage.landmark_index import index_to_bytes
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.tables_to_messages import Partition, contents
+from maplab_py.storage.protobuf.file_contents import ColumnDigests, FileContent, digest_of
+from maplab_py.storage.protobuf.tables_to_messages import Partition, contents, index_to_bytes
+from maplab_py.storage.protobuf.vertices_to_messages import id_fields, tag_of
 from maplab_py.storage.written_files import WrittenFiles
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
@@ -137,7 +135,7 @@ def test_equal_measurements_are_hashed_once() -> None:
     assert digest != before.of(b"c", [columns[0].reshape(4, 3), *columns[1:]])
     assert digest != before.of(b"d", columns[1:])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("maplab_py.storage.column_digests.digest_of", lambda _: b"hashed")
+        patch.setattr("maplab_py.storage.protobuf.file_contents.digest_of", lambda _: b"hashed")
         after = ColumnDigests(before)
         assert after.of(b"a", [values.copy() for values in columns]) == digest
         assert after.of(b"a", [columns[0] + 1.0, *columns[1:]]) == b"hashed"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.viewer.display.selection import closure_picture, matches_of_frames
-from maplab_py.viewer.vertex_images import VertexImages
+from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import binary_blocks, no_blocks
 from tests.vimap.builders import walk_map

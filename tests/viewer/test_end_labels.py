@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.viewer.building import Subject, build_scene
-from maplab_py.viewer.end_labels import PATH_ENDS, with_end_labels
+from maplab_py.viewer.drawing import PATH_ENDS, with_end_labels
 from maplab_py.viewer.scene import Points, Scene
 from tests.vimap.builders import walk_map
 

@@ -9,7 +9,7 @@ import pytest
 
 from maplab_py.algorithms.dense.field import FIELD_TYPE, DistanceField, encode_field
 from maplab_py.errors import UserError
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.viewer import colours
 from maplab_py.viewer.mesh_sources import field_slice
 from maplab_py.vimap import ResourceOwner, VIMap

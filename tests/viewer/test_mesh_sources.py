@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.viewer import colours
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.mesh_sources import coloured_mesh
-from maplab_py.viewer.vertex_images import VertexImages, depth_picture
+from maplab_py.viewer.resource_clouds import VertexImages, depth_picture
 from tests.vimap.builders import walk_map
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 2.0]])

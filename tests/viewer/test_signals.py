@@ -12,7 +12,7 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import SensorSet
 from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.options import VisualizationOptions
-from maplab_py.viewer.signals import observation_signals, vertex_signals
+from maplab_py.viewer.playback import observation_signals, vertex_signals
 from maplab_py.vimap import VIMap
 from tests.vimap.builders import walk_map
 

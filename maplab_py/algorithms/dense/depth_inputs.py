@@ -17,7 +17,7 @@ from maplab_py.geometry import se3
 from maplab_py.interop.ply import parse_ply
 from maplab_py.progress import Progress
 from maplab_py.report import counted
-from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.resource_queries import resources_of

@@ -28,9 +28,9 @@ from maplab_py.interop.ply import PlyCloud, write_ply
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceStore
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.resource_queries import resources_of, without_resources

@@ -31,9 +31,9 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceStore
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import as_keys, to_hex
 from maplab_py.vimap.resource_queries import resources_of, without_resources

@@ -29,8 +29,8 @@ from maplab_py.interop.ply import encode_ply
 from maplab_py.interop.resources.depth_maps import encoded_depth
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.resource_queries import resources_of, without_resources

@@ -1,4 +1,4 @@
-"""How two maps differ: rows by their ids, then poses, landmarks, keypoints, observations."""
+"""Differences of two maps: rows by their ids, then poses, landmarks, keypoints, observations."""
 
 from __future__ import annotations
 

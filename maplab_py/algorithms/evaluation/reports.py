@@ -68,7 +68,7 @@ class MissionLine:
 
 @dataclasses.dataclass(frozen=True)
 class ErrorTable:
-    """What is shown of an evaluation."""
+    """Summary of an evaluation."""
 
     errors: tuple[ErrorLine, ...] = dataclasses.field(metadata={"title": ""})
     missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
@@ -215,7 +215,7 @@ class Difference:
 
 @dataclasses.dataclass(frozen=True)
 class MapComparisonReport(Report):
-    """How two maps differ. `is_identical`: every number of every table and all sensors are equal."""
+    """Differences of two maps. `is_identical`: every number of every table and all sensors are equal."""
 
     rows: tuple[RowCounts, ...] = dataclasses.field(metadata={"title": "rows"})
     position_m: Difference  # of vertices in G

@@ -19,7 +19,7 @@ _LEAST_ERROR_M = 1e-3
 
 
 class Movement(NamedTuple):
-    """What an alignment did to the base frame of a mission."""
+    """Change of a mission's base frame by an alignment."""
 
     moved_m: float  # at the first vertex
     turned_deg: float  # about the vertical

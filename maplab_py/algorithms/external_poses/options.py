@@ -21,7 +21,7 @@ _UNIT_TOLERANCE = 1e-2
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryOptions:
-    """What a trajectory becomes, and how far it is trusted."""
+    """Use of a trajectory, and its uncertainty."""
 
     kind: str = option(
         "absolute",
@@ -72,7 +72,7 @@ class TrajectoryOptions:
 
 @dataclasses.dataclass(frozen=True)
 class GpsOptions:
-    """How positions of a satellite receiver are used."""
+    """Use of the positions of a satellite receiver."""
 
     flag_prefix: ClassVar[str] = "gps_"
 
@@ -138,7 +138,7 @@ class GpsOptions:
 
 @dataclasses.dataclass(frozen=True)
 class WheelOptions:
-    """How far wheel odometry is trusted, and where its sensor is."""
+    """Uncertainty of wheel odometry, and the pose of its sensor."""
 
     flag_prefix: ClassVar[str] = "wheel_"
 

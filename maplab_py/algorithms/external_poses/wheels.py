@@ -28,7 +28,7 @@ from maplab_py.vimap.tables import TransformationEdges
 _COVARIANCE = "T_St_Stp1_fixed_covariance"
 """Key of maplab: the covariance (6 x 6), position first, of every edge of the sensor."""
 _STANDSTILL_M, _TURNING_ARM_M = 0.01, 0.25
-"""What standing still, and a turn by one radian, add to the distance that uncertainty grows with."""
+"""Addition of standing still, and of a turn by one radian, to the distance that uncertainty grows with."""
 _MIN_DISTANCE_M, _MIN_TURN_RAD = 1.0, 0.5
 _MAX_DISTANCE_RATIO, _MAX_TURN_RATIO = 2.0, 5.0
 """Wheels that differ more from what the map says have other units, or are those of another mission."""

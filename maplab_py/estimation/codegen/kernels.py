@@ -58,7 +58,7 @@ def pose_graph_kernels(error: PoseError, progress: Progress = SILENT) -> ModuleT
 
 
 _POSE, _LANDMARK, _CAMERA = 3, 15, 21
-"""Where the Jacobian's columns begin in `out`, after residual (2) and depth; two entries a column."""
+"""Beginnings of the Jacobian's columns in `out`, after residual (2) and depth; two entries a column."""
 CAMERA_DELAY_COLUMN = 6
 CAMERA_INTRINSICS_COLUMN = 9
 """Columns of a camera: position 3, orientation 3, image delay, line delay, 1 of padding, then this."""

@@ -28,7 +28,7 @@ _SMALLEST_PIVOT = 1e-14
 
 
 class Structure(NamedTuple):
-    """Which poses see which landmarks, and how the landmarks are shared out."""
+    """Visibility of landmarks from poses, and the division of the landmarks among threads."""
 
     start: I64  # (L + 1,) offsets of the landmarks' observations
     vertex: I32  # (O,) ascending within a landmark
@@ -37,7 +37,7 @@ class Structure(NamedTuple):
 
 
 class KeptSystem(NamedTuple):
-    """What is kept of the visual terms between evaluation and products."""
+    """Parts of the visual terms that are kept between evaluation and products."""
 
     jacobian: F32  # (O, 12) rows u and v, [Q R] each
     landmark_square: F64  # (L, 6) lower triangle of Q'Q by rows, with the prior

@@ -1,4 +1,4 @@
-"""What the generated visual kernels are called with; each group is one argument.
+"""Arguments of the generated visual kernels; each group is one argument.
 
 O observations of L landmarks by V vertices and C cameras; W columns of a camera, 0 where cameras are
 not estimated. Sums are kept apart by chunks of landmarks (see `terms.visual_structure`).
@@ -14,7 +14,7 @@ from maplab_py.array_types import F64, I32, I64
 
 
 class VisualData(NamedTuple):
-    """What was measured."""
+    """Measurements."""
 
     start: I64  # (L + 1,) offsets by landmark
     vertex: I32  # (O,)
@@ -26,7 +26,7 @@ class VisualData(NamedTuple):
 
 
 class VisualStates(NamedTuple):
-    """Where residuals are evaluated."""
+    """States at which residuals are evaluated."""
 
     T_G_I: F64  # (V, 7)
     T_I_C: F64  # (C, 7)
@@ -36,7 +36,7 @@ class VisualStates(NamedTuple):
 
 
 class VisualRule(NamedTuple):
-    """How residuals are weighed and landmarks are eliminated."""
+    """Weights of residuals, and elimination of landmarks."""
 
     loss: int
     damping: float
@@ -44,7 +44,7 @@ class VisualRule(NamedTuple):
 
 
 class VisualTarget(NamedTuple):
-    """Where the blocks of the poses are summed; see `linear.block_storage`."""
+    """Storage in which the blocks of the poses are summed; see `linear.block_storage`."""
 
     nodes_per_vertex: int
     places: I32  # (4 B,) of the parts of the plan's blocks, see `terms.visual.node_blocks`

@@ -1,4 +1,4 @@
-"""What the generated kernels of the window are called with; each group is one argument.
+"""Arguments of the generated kernels of the window; each group is one argument.
 
 O observations of L landmarks by F frames with C cameras. Rows of a frame in the dense system begin at
 15 frame: position, orientation, velocity, gyroscope and accelerometer bias. Columns of what belongs
@@ -19,7 +19,7 @@ FRAME_SIZE = 15
 
 
 class WindowData(NamedTuple):
-    """What was seen. The anchor of a landmark is the earliest frame among its observations."""
+    """Observations. The anchor of a landmark is the earliest frame among its observations."""
 
     start: I64  # (L + 1,) offsets by landmark
     frame: I32  # (O,) ascending within a landmark
@@ -45,7 +45,7 @@ class WindowCameras(NamedTuple):
 
 
 class WindowPoint(NamedTuple):
-    """Where residuals are evaluated."""
+    """States at which residuals are evaluated."""
 
     T_M_I: F64  # (F, 7)
     h: F64  # (L, 3) [x/z, y/z, 1/z] in the camera of the anchor
@@ -57,7 +57,7 @@ class WindowPoint(NamedTuple):
 
 
 class WindowRule(NamedTuple):
-    """How residuals are weighed and differentiated, and landmarks eliminated."""
+    """Weights and derivatives of residuals, and elimination of landmarks."""
 
     loss: int
     damping: float
@@ -98,7 +98,7 @@ class DenseSystem(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """What is kept of every landmark, to step it when the frames' steps are known."""
+    """Quantities kept of every landmark, to step it when the frames' steps are known."""
 
     num_slots: I64  # (L,) frames that the landmark touches
     slots: I32  # (L, F) those frames

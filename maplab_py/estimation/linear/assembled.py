@@ -1,4 +1,4 @@
-"""What the optimiser expects of a solver in whose storage a matrix is summed."""
+"""Interface of a solver in whose storage a matrix is summed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from maplab_py.estimation.linear.protocol import FactorStatistics
 
 
 class BlockSums(Protocol):
-    """Where the blocks of a matrix are summed."""
+    """Storage in which the blocks of a matrix are summed."""
 
     layout: BlockLayout
     numbers: F64  # the storage; see `block_storage`

@@ -1,4 +1,4 @@
-"""Where the blocks of a symmetric matrix are summed: straight in the storage that is factorised.
+"""Storage of the blocks of a symmetric matrix: they are summed in the storage that is factorised.
 
 A block (row, col) of d x d numbers lies in the columns of the node that is eliminated first, transposed
 where that is its row. Columns follow each other, `leading` numbers apart, so that the block's number
@@ -18,7 +18,7 @@ from maplab_py.estimation.linear.symbolic import FrontPlan
 
 
 class BlockLayout(NamedTuple):
-    """How the columns of n nodes are laid out."""
+    """Layout of the columns of n nodes."""
 
     node_size: int
     position: I64  # (n,) place in the elimination order

@@ -1,4 +1,4 @@
-"""What the optimiser expects of a solver of symmetric positive definite block systems."""
+"""Interface of a solver of symmetric positive definite block systems."""
 
 from __future__ import annotations
 

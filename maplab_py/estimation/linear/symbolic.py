@@ -33,7 +33,7 @@ from maplab_py.estimation.linear.quotient_graph import inverse_order
 
 
 class FrontPlan(NamedTuple):
-    """What the numeric kernels need to know. S supernodes in postorder.
+    """Data of the numeric kernels. S supernodes in postorder.
 
     A node's position is its place in the elimination order. The front of supernode s are its own nodes
     (positions `first_node[s]` .. `first_node[s + 1] - 1`) followed by the nodes below,

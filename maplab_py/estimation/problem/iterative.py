@@ -38,7 +38,7 @@ _SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 
 @dataclasses.dataclass(frozen=True)
 class IterativeOptions:
-    """How exactly steps are computed, and when to return to the direct solver."""
+    """Accuracy of steps, and conditions for a return to the direct solver."""
 
     forcing: float = 0.01  # share of the preconditioned residual that a step may leave
     tightening: float = 0.01  # of the forcing, for the step that ends a run

@@ -33,7 +33,7 @@ _UNHELD = 1e-12
 
 
 class EdgeWeights(NamedTuple):
-    """Which edges count, and how."""
+    """Choice and weights of edges."""
 
     is_active: Mask  # (E,)
     first_robust: int  # edges from here on have the loss

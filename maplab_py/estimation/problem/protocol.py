@@ -1,4 +1,4 @@
-"""What the solver expects of a least-squares problem."""
+"""Interface of a least-squares problem."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _RECENT_STEPS = 10
 
 @dataclasses.dataclass(frozen=True)
 class SolverOptions:
-    """When to stop, and how bold to be."""
+    """Convergence criteria, and settings of the trust region."""
 
     num_iterations: int = 30
     max_time_seconds: float = 1e6
@@ -48,7 +48,7 @@ class SolverOptions:
 
 @dataclasses.dataclass(frozen=True)
 class SolverSummary:
-    """How an optimisation went."""
+    """Course of an optimisation."""
 
     initial_costs: dict[str, float]
     final_costs: dict[str, float]

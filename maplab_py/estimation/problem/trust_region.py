@@ -1,4 +1,4 @@
-"""How far to trust the quadratic model: radius schedules, and which steps are good enough.
+"""Trust region of the quadratic model: radius schedules, and acceptance of steps.
 
 Damping is 1 / radius times the clamped diagonal of the normal equations (Levenberg-Marquardt).
 """
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Schedule(Enum):
-    """How the radius follows the gain, the share of the promised decrease that came true."""
+    """Schedule by which the radius follows the gain, the share of the promised decrease that came true."""
 
     CERES = "ceres"  # radius / max(1/3, 1 - (2 gain - 1)^3); rejected: / 2, 4, 8 ...
     STEP_QUALITY = "step_quality"  # the same, but bolder after nearly perfect steps

@@ -8,7 +8,7 @@ from typing import Any
 
 
 class PoseError(Enum):
-    """What the residual of an edge of a pose graph is."""
+    """Kind of residual of an edge of a pose graph."""
 
     SPLIT = (
         "split"  # [p_A_B - p_measured, Log(R_measured^T R_A_B)], as covariances of maps are meant

@@ -48,7 +48,7 @@ _VECTORS = {"velocity": VELOCITY, "gyro_bias": GYRO_BIAS, "accel_bias": ACCEL_BI
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResidualRows:
-    """What a residual is evaluated on: N measurements."""
+    """Input of a residual: N measurements."""
 
     vertices: I64  # (N,) rows of the map's vertices, or (N, 2) for states of two vertices
     data: F64  # (N, data_size)

@@ -27,7 +27,7 @@ FLOOR = np.diag([1e-6**2] * 3 + [1e-7**2] * 3 + [1e-6**2] * 3)
 
 TURNED_RAD = 2e-4
 SPEEDED_MPS = 2e-3
-"""What a change of bias may make of an edge in all before the first-order correction is replaced by
+"""Largest change of an edge by its biases in all before the first-order correction is replaced by
 a new integration. The second order is lost until then: 1 nm, 1 nrad and 20 nm/s of a lively 0.2 s."""
 _CONVERGED_SHARE = 0.2
 _REINTEGRATION_SHARE = 0.1

@@ -41,7 +41,7 @@ def switch_block(switches: F64) -> ParameterBlock:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mounting:
-    """Where the extrinsics of measurements are kept: rows (N,) of a block of the states."""
+    """Places of the extrinsics of measurements: rows (N,) of a block of the states."""
 
     block: str
     row: I64

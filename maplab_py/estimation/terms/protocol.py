@@ -15,7 +15,7 @@ from maplab_py.estimation.states import States
 
 
 class FactorTerm(Protocol):
-    """What the solver needs of a term; a plugin may bring its own."""
+    """Interface of a term; a plugin may bring its own."""
 
     @property
     def name(self) -> str:

@@ -76,7 +76,7 @@ class Observations:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VisualPlaces:
-    """Where the blocks of the visual terms lie in a solver's storage."""
+    """Places of the blocks of the visual terms in a solver's storage."""
 
     target: VisualTarget
     border: BlockPlaces | None  # of cameras that are estimated
@@ -199,7 +199,7 @@ class VisualTerms:
 
     @property
     def num_chunks(self) -> int:
-        """How many sums are kept apart, whatever the number of threads."""
+        """Number of sums that are kept apart, whatever the number of threads."""
         return len(self.chunk_start) - 1
 
     @property

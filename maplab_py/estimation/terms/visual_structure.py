@@ -1,4 +1,4 @@
-"""Which blocks of the reduced system the landmarks fill, and in which order they are eliminated.
+"""Blocks of the reduced system that the landmarks fill, and the order of their elimination.
 
 Eliminating a landmark with n observations touches one block for each of its n (n + 1) / 2 pairs of
 observations. There are some ten times as many pairs as observations and a hundred times as many as

@@ -1,4 +1,4 @@
-"""Where the cameras of all frames are, as matrices."""
+"""Poses of the cameras of all frames, as matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the smoother is told of a frame, and the state it starts from."""
+"""Input of the smoother for a frame, and the state it starts from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from maplab_py.errors import UserError
 
 
 class Motion(Enum):
-    """What is known of the motion on the way to a frame."""
+    """Knowledge of the motion on the way to a frame."""
 
     MOVING = "moving"
     TURNING = "turning"  # explained by rotation only

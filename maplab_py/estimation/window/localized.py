@@ -31,7 +31,7 @@ _LANDMARK_CHI2 = 16.3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapEstimate:
-    """Where the newest frame is in the map."""
+    """Pose of the newest frame in the map."""
 
     T_G_M: F64  # (7,)
     T_G_I: F64  # (7,)

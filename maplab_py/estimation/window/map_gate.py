@@ -1,4 +1,4 @@
-"""Which associations with a map are contradicted by observations of their tracks.
+"""Test of associations with a map against the observations of their tracks.
 
 A track may leave its point for another one, before or after it was matched with a landmark of the map:
 then a single observation can be off by hundreds of pixels. The Huber loss bounds the residual of such an

@@ -1,4 +1,4 @@
-"""How a window weighs observations of a map."""
+"""Weights of a window's observations of a map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class MapRule:
-    """How observations of the map are weighed."""
+    """Weights of observations of the map."""
 
     sigma_px: float = 1.0  # of a keypoint (Paper I)
     tilt_sigma_rad: float = float(np.radians(0.5))

@@ -67,7 +67,7 @@ class MapResiduals:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapElimination:
-    """What it takes to step the map's landmarks when the other states' steps are known."""
+    """Data to step the map's landmarks when the other states' steps are known."""
 
     columns: I64  # (N,) of the dense system that the landmarks touch
     square: F64  # (A, 3, 3)

@@ -1,4 +1,4 @@
-"""Which tracks of a window observe landmarks of a map."""
+"""Tracks of a window that observe landmarks of a map."""
 
 from __future__ import annotations
 

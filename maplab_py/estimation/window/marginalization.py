@@ -1,4 +1,4 @@
-"""What leaves the window becomes a prior on what stays."""
+"""Marginalization: states that leave the window become a prior on those that stay."""
 
 from __future__ import annotations
 

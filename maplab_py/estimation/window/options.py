@@ -111,7 +111,7 @@ class WindowOptions:
 
     @property
     def standstill(self) -> StandstillSigmas:
-        """How still a body is that is at rest."""
+        """Largest motion of a body at rest."""
         return StandstillSigmas(
             self.rest_sigma_m, self.rest_sigma_rad, self.rest_sigma_mps, self.turning_sigma_mps
         )

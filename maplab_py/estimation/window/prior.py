@@ -1,4 +1,4 @@
-"""What frames that have left the window said about those that are still there."""
+"""Marginalization prior of the sliding window."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class WindowPrior:
 
     @cached_property
     def touched(self) -> Mask:
-        """Which frames (F,) it has information about."""
+        """Frames (F,) that it has information about."""
         columns: Mask = np.any(self.root[:, : self._frame_columns] != 0.0, axis=0)
         return np.asarray(columns.reshape(-1, FRAME_SIZE).any(axis=1))
 

@@ -172,7 +172,7 @@ class FixedLagSmoother:
 
     @property
     def prior(self) -> WindowPrior:
-        """What frames that have left say about those in the window."""
+        """Marginalization prior on the frames in the window."""
         return self._prior
 
     @property
@@ -182,7 +182,7 @@ class FixedLagSmoother:
 
     @property
     def is_keyframe(self) -> Mask:
-        """Which frames (F,) are, or will become, keyframes."""
+        """Frames (F,) that are, or will become, keyframes."""
         return self._is_keyframe
 
     @property

@@ -1,4 +1,4 @@
-"""What is known without looking: a body at rest does not move, one that only turns has no velocity."""
+"""Motion constraints without images: a body at rest does not move, one that only turns has no velocity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _POSE, _VELOCITY = 6, 6
 
 @dataclasses.dataclass(frozen=True)
 class StandstillSigmas:
-    """How still a body is that is at rest."""
+    """Largest motion of a body at rest."""
 
     position_m: float  # over an edge
     rotation_rad: float

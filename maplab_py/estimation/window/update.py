@@ -1,4 +1,4 @@
-"""What an update of the smoother says."""
+"""Result of a smoother update."""
 
 from __future__ import annotations
 

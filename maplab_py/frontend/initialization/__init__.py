@@ -1,1 +1,1 @@
-"""Where the estimator starts: at rest, or in motion with one camera or several."""
+"""Initialization of the estimator: at rest, or in motion with one camera or several."""

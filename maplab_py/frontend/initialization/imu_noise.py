@@ -1,4 +1,4 @@
-"""How noisy the samples of an IMU are, by their residuals: data sheets leave out vibrations."""
+"""Noise of the samples of an IMU, by their residuals: data sheets leave out vibrations."""
 
 from __future__ import annotations
 

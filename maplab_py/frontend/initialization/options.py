@@ -11,7 +11,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class InitializationOptions:
-    """When the estimator may start."""
+    """Conditions for the start of the estimator."""
 
     flag_prefix: ClassVar[str] = "vio_initialization_"
 

@@ -89,7 +89,7 @@ class Refined:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Round:
-    """How a segment is solved once."""
+    """Settings of one solution of a segment."""
 
     segment: Segment
     observed: tuple[I64, Observations]  # rows of the segment's observations that have rays
@@ -101,7 +101,7 @@ class _Round:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Solved:
-    """What a round has found."""
+    """Result of a round."""
 
     problem: WindowProblem
     chain: InertialChain

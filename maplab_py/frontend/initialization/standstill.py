@@ -27,7 +27,7 @@ _LEAST_GYRO_SIGMA_RADPS = 2e-4
 
 @dataclasses.dataclass(frozen=True)
 class Motionlessness:
-    """What speaks for rest over some time; NaN where nothing can be said."""
+    """Evidence for rest over some time; NaN where nothing can be said."""
 
     disparity_px: float  # largest median in 0.1 s
     rate_px: float  # over longer times, noise removed: per 0.1 s

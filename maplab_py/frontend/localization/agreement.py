@@ -1,4 +1,4 @@
-"""When T_G_M is set, and when it is set again: never because of a single answer.
+"""Decision to set T_G_M, and to set it again: never because of a single answer.
 
 Where the map looks like another place, wrong answers agree with each other for a while. A localised odometry
 knows where it is but for its drift since it last observed the map; answers that contradict it by more are
@@ -18,7 +18,7 @@ from maplab_py.frontend.localization.matcher import Answer
 from maplab_py.geometry import se3
 
 _POSITION_M, _YAW_DEG = 0.5, 5.0
-"""How near two answers must be to each other to agree; drift of the odometry between them is small."""
+"""Largest difference of two answers that agree; drift of the odometry between them is small."""
 _SHARE_OF_TRAVEL = 0.02
 """Drift of the odometry that is allowed between two answers."""
 _OLDEST_S = 30.0
@@ -35,7 +35,7 @@ map that was moved, an answer has dozens.
 
 
 class Verdict(Enum):
-    """What to do with an answer."""
+    """Use of an answer."""
 
     WAIT = "wait"  # it does not count yet, or disagrees
     START = "start"  # set T_G_M at this answer

@@ -27,7 +27,7 @@ from maplab_py.interop.recordings.protocol import RecordedSensors
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapPose:
-    """Where the newest frame is in the map."""
+    """Pose of the newest frame in the map."""
 
     T_G_M: F64  # (7,)
     T_G_I: F64  # (7,)
@@ -91,7 +91,7 @@ class TightEstimator:
 
 
 class _LooseEstimator:
-    """What the estimators share that do not change the odometry."""
+    """Common parts of the estimators that do not change the odometry."""
 
     def __init__(self) -> None:
         """Begin without a map."""

@@ -25,7 +25,7 @@ _DISTANCE_FACTOR = 1.3
 
 
 class Source(Enum):
-    """How an answer was found."""
+    """Method by which an answer was found."""
 
     INDEX = "index"
     TRACKING = "map tracking"

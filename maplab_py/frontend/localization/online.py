@@ -41,7 +41,7 @@ class LocalizationState(Enum):
 
 @dataclasses.dataclass(eq=False)
 class LocalizationCounts:
-    """What a run has counted."""
+    """Counts of a run."""
 
     frames: int = 0
     localized_frames: int = 0
@@ -58,7 +58,7 @@ class LocalizationCounts:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalizedFrame:
-    """What localisation says of a frame."""
+    """Localisation of a frame."""
 
     time_ns: int
     state: LocalizationState
@@ -69,7 +69,7 @@ class LocalizedFrame:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapEvent:
-    """What an estimator was told after a frame: to start at a pose, or an answer to use."""
+    """Message to an estimator after a frame: to start at a pose, or an answer to use."""
 
     time_ns: int
     answers: tuple[Answer, ...]
@@ -78,7 +78,7 @@ class MapEvent:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Remembered:
-    """Where a frame was when it was estimated."""
+    """Pose of a frame when it was estimated."""
 
     T_M_I: F64  # (7,)
     T_G_I: F64 | None  # (7,)

@@ -19,7 +19,7 @@ LANDMARK_UNCERTAINTIES = ("none", "map")
 
 @dataclasses.dataclass(frozen=True)
 class OnlineLocalizationOptions:
-    """How the odometry is localised in a map."""
+    """Localisation of the odometry in a map."""
 
     flag_prefix: ClassVar[str] = "localization_"
 
@@ -135,7 +135,7 @@ class OnlineLocalizationOptions:
 
     @property
     def rule(self) -> MapRule:
-        """How the estimator weighs observations of the map."""
+        """Weights of the estimator's observations of the map."""
         return MapRule(
             sigma_px=self.keypoint_sigma_px,
             tilt_sigma_rad=float(np.radians(self.tilt_sigma_deg)),

@@ -1,4 +1,4 @@
-"""What localisation has said of all frames of a run, as a report and as a file."""
+"""Record of the localisation of all frames of a run, as a report and as a file."""
 
 from __future__ import annotations
 

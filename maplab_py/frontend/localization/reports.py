@@ -1,4 +1,4 @@
-"""What a report says about localisation in a map."""
+"""Localisation in a map, as part of a report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclasses.dataclass(frozen=True)
 class LocalizationSummary:
-    """How well the recording was localised."""
+    """Quality of the localisation of a recording."""
 
     map_name: str
     mode: str

@@ -41,7 +41,7 @@ from maplab_py.interop.recordings.bag_writing import (
 )
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
 from maplab_py.progress import SILENT, Progress
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_labels, mission_sensor_id

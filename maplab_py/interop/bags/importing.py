@@ -49,8 +49,8 @@ from maplab_py.interop.resources.point_clouds import (
 )
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import from_hex
 from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns

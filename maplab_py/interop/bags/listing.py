@@ -1,4 +1,4 @@
-"""What is in a bag, whatever its messages are."""
+"""Content of a bag, whatever its messages are."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class BagTopic:
 
 @dataclasses.dataclass(frozen=True)
 class BagImages:
-    """How the images of a topic are stored."""
+    """Storage of the images of a topic."""
 
     topic: str
     encoding: str  # or format, of the first image
@@ -38,7 +38,7 @@ class BagImages:
 
 @dataclasses.dataclass(frozen=True)
 class BagInfo(Report):
-    """What is in a bag."""
+    """Content of a bag."""
 
     bag: Path
     format: str

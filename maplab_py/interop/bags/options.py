@@ -15,7 +15,7 @@ _HIGHEST_RATE_HZ = 1e9
 
 @dataclasses.dataclass(frozen=True)
 class PoseToBagOptions:
-    """Which poses are added to a bag, and what their frames are called."""
+    """Poses to add to a bag, and the names of their frames."""
 
     flag_prefix: ClassVar[str] = "rosbag_plugin_pose_to_bag_"
 
@@ -41,7 +41,7 @@ class PoseToBagOptions:
 
 @dataclasses.dataclass(frozen=True)
 class BagExportOptions:
-    """What is written, and in which format."""
+    """Content to write, and its format."""
 
     flag_prefix: ClassVar[str] = "bag_"
 
@@ -75,7 +75,7 @@ class BagExportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class BagImportOptions:
-    """Which messages become resources."""
+    """Choice of the messages that become resources."""
 
     resource_topic: str = option("", help="Topic of images, depth images or point clouds")
     resource_time_offset_ns: int = option(

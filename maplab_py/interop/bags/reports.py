@@ -1,4 +1,4 @@
-"""What writing and reading bags reports."""
+"""Reports of writing and reading bags."""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,18 +12,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import F64, I64
+from maplab_py.distinct import distinct
 from maplab_py.errors import FlagError, UserError
+from maplab_py.geometry import se3
 from maplab_py.interop.colmap.binary import binary_files
 from maplab_py.interop.colmap.child import TEXT
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
-from maplab_py.interop.colmap.from_map import ExportedModel, model_of_map
-from maplab_py.interop.colmap.model import FILES, NO_POINT
+from maplab_py.interop.colmap.model import (
+    FILE_NAME,
+    FILES,
+    NO_POINT,
+    PIXEL_CENTRE,
+    ColmapCamera,
+    ColmapFrames,
+    ColmapImages,
+    ColmapModel,
+    ColmapPoints,
+    ColmapRig,
+    Sensor,
+    SensorType,
+    SideFile,
+    colmap_camera,
+)
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
-from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.colmap.undistortion import undistorted
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.vimap import VIMap
+from maplab_py.sensors import Camera
+from maplab_py.sensors.projection import project
+from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.descriptors import (
     DescriptorDepth,
     FeatureType,
@@ -29,8 +48,12 @@ from maplab_py.vimap.descriptors import (
     type_of_name,
     types_of,
 )
+from maplab_py.vimap.ids import from_hex, is_valid
 from maplab_py.vimap.keypoint_removal import remove_keypoints
-from maplab_py.vimap.table import starts_of_counts
+from maplab_py.vimap.queries import mission_labels, mission_sensor_id
+from maplab_py.vimap.scale_marks import is_metric
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap.tables import LandmarkQuality
 
 DATABASE = "database.db"
 _CHUNK_BYTES = 1 << 24
@@ -224,3 +247,229 @@ def matches_of_landmarks(exported: ExportedModel) -> tuple[I64, I64, NDArray[np.
     kept = count >= _MIN_MATCHES
     table = table[np.repeat(kept, count)]
     return images.id[pairs[kept]], starts_of_counts(count[kept]), table[:, 2:].astype(np.uint32)
+
+
+_GREY = 128
+_UNKNOWN_ERROR_PX = -1.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapRig:
+    """Cameras of some missions, all on the same IMU."""
+
+    id: str  # of the NCAMERA
+    cameras: tuple[Camera, ...]
+    T_I_C: F64  # (n, 7)
+    missions: I64  # rows
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedModel:
+    """A model with the rows of the map that it was made of."""
+
+    model: ColmapModel
+    side_file: SideFile
+    frames: I64  # (N,) rows of the images
+    keypoints: I64  # (K,) rows
+    landmarks: I64  # (L,) rows
+    observations: int
+    mean_error_px: float  # of observations in front of their cameras
+
+
+def model_of_map(
+    vi_map: VIMap, missions: I64 | None = None, *, quality: str = "not_bad"
+) -> ExportedModel:
+    """Return the COLMAP model of some missions (rows, None = all); W is the map's frame G.
+
+    Each vertex with images is a frame; R is the first camera of the rig. Landmarks that no chosen
+    frame observes are left out.
+
+    Raises:
+        UserError: There are no frames, or COLMAP lacks a camera model.
+    """
+    rows = np.arange(len(vi_map.missions)) if missions is None else missions
+    rigs = map_rigs(vi_map, rows)
+    frames = _exported_frames(vi_map, rows)
+    if not len(frames):
+        raise UserError("the missions have no images that COLMAP could use: choose others")
+    cameras, colmap_rigs = _sensors(rigs)
+    rig_of_mission = np.zeros(len(vi_map.missions), dtype=np.int64)
+    for row, rig in enumerate(rigs):
+        rig_of_mission[rig.missions] = row
+    of_frame = vi_map.frames.vertex[frames].astype(np.int64)
+    vertex, frame_row = np.unique(of_frame, return_inverse=True)
+    rig_row = rig_of_mission[vi_map.vertices.mission[vertex]]
+    T_I_R = np.array([rig.T_I_C[0] for rig in rigs])
+    T_W_R = se3.compose(vi_map.T_G_I[vertex], T_I_R[rig_row])
+    first_camera = np.cumsum([0, *(len(rig.cameras) for rig in rigs)])
+    index = vi_map.frames.camera_index[frames].astype(np.int64)
+    camera_row = first_camera[rig_row[frame_row]] + index
+    T_I_C = np.concatenate([rig.T_I_C for rig in rigs])[camera_row]
+    T_W_C = se3.compose(vi_map.T_G_I[vertex[frame_row]], T_I_C)
+    keypoints = ragged_rows(vi_map.keypoint_start, frames)
+    landmarks, point = _exported_landmarks(vi_map, keypoints, quality)
+    images = ColmapImages(
+        id=np.arange(1, len(frames) + 1),
+        camera=camera_row + 1,
+        T_C_W=se3.inverse(T_W_C),
+        name=image_names(vi_map, frames),
+        keypoint_count=vi_map.frames.keypoint_count[frames].astype(np.int64),
+        uv=vi_map.keypoints.uv_px[keypoints] + PIXEL_CENTRE,
+        point=point,
+    )
+    error, mean_error = _errors(vi_map, rigs, images, camera_row, landmarks)
+    model = ColmapModel(
+        cameras,
+        colmap_rigs,
+        ColmapFrames(
+            np.arange(1, len(vertex) + 1), rig_row + 1, se3.inverse(T_W_R), frame_row, images.id
+        ),
+        images,
+        ColmapPoints(
+            landmarks + 1,
+            vi_map.p_G[landmarks],
+            np.full((len(landmarks), 3), _GREY, dtype=np.uint8),
+            error,
+        ),
+    )
+    side_file = _side_file(vi_map, rigs, frames, vertex, images)
+    observations = int(np.count_nonzero(point != NO_POINT))
+    return ExportedModel(model, side_file, frames, keypoints, landmarks, observations, mean_error)
+
+
+def map_rigs(vi_map: VIMap, missions: I64) -> list[MapRig]:
+    """Return the camera rigs of missions (rows), each with the IMU that it is mounted on."""
+    pairs: dict[tuple[str, str], list[int]] = {}
+    for mission in missions.tolist():
+        rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+        if rig_id:
+            imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+            pairs.setdefault((rig_id, imu_id), []).append(mission)
+    sensors = vi_map.sensors
+    return [
+        MapRig(
+            rig_id,
+            sensors.camera_rig(rig_id).cameras,
+            sensors.T_I_C(imu_id, rig_id),
+            np.array(rows, dtype=np.int64),
+        )
+        for (rig_id, imu_id), rows in pairs.items()
+    ]
+
+
+def image_names(vi_map: VIMap, frames: I64) -> tuple[str, ...]:
+    """Return names <mission>/cam<index>/<time stamp in ns>.png of frames (rows), all different.
+
+    Stamps have 19 digits, so that nobody takes those of a clock that started at zero for us or ms.
+    """
+    labels = [re.sub(r"[^\w.-]", "_", label) for label in mission_labels(vi_map)]
+    folders = [
+        label if labels.count(label) == 1 else f"{label}_{row}" for row, label in enumerate(labels)
+    ]
+    table = vi_map.frames
+    names: list[str] = []
+    used: set[str] = set()
+    vertices = table.vertex[frames]
+    missions = vi_map.vertices.mission[vertices].tolist()
+    stamp_ns = table.timestamp_ns[frames]  # simulated frames may have none
+    stamps = np.where(stamp_ns > 0, stamp_ns, vi_map.vertices.timestamp_ns[vertices]).tolist()
+    indices = table.camera_index[frames].tolist()
+    for row, (mission, index, stamp) in enumerate(zip(missions, indices, stamps, strict=True)):
+        name = f"{folders[mission]}/cam{index}/{stamp:019d}.png"
+        if name in used:  # frames of equal times
+            name = f"{folders[mission]}/cam{index}/{row}_{stamp:019d}.png"
+        used.add(name)
+        names.append(name)
+    return tuple(names)
+
+
+def _exported_frames(vi_map: VIMap, missions: I64) -> I64:
+    """Return the rows of frames that have an image."""
+    table = vi_map.frames
+    with_rig = is_valid(vi_map.missions.sensor_id[:, MissionSensor.NCAMERA])
+    chosen = np.zeros(len(vi_map.missions), dtype=np.bool_)
+    chosen[missions] = True
+    of_mission = (chosen & with_rig)[vi_map.vertices.mission[table.vertex]]
+    return np.flatnonzero(of_mission & table.is_valid & is_valid(table.id))
+
+
+def _sensors(rigs: list[MapRig]) -> tuple[tuple[ColmapCamera, ...], tuple[ColmapRig, ...]]:
+    cameras: list[ColmapCamera] = []
+    result = []
+    for number, rig in enumerate(rigs, start=1):
+        sensors: list[Sensor] = []
+        for camera in rig.cameras:
+            cameras.append(colmap_camera(camera, len(cameras) + 1))
+            sensors.append((SensorType.CAMERA, len(cameras)))
+        T_S_R = se3.compose(se3.inverse(rig.T_I_C), rig.T_I_C[0])
+        result.append(ColmapRig(number, tuple(sensors), T_S_R))
+    return tuple(cameras), tuple(result)
+
+
+def _exported_landmarks(vi_map: VIMap, keypoints: I64, quality: str) -> tuple[I64, I64]:
+    """Return the rows of observed landmarks of a quality, and the point ids (K,) of keypoints."""
+    table = vi_map.landmarks
+    wanted = {
+        "good": table.quality == LandmarkQuality.GOOD,
+        "not_bad": table.quality != LandmarkQuality.BAD,
+        "all": np.ones(len(table), dtype=np.bool_),
+    }[quality]
+    landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
+    observed = landmark >= 0
+    observed[observed] = wanted[landmark[observed]]
+    point = np.where(observed, landmark + 1, NO_POINT)
+    return distinct(landmark[observed]), point
+
+
+def _errors(
+    vi_map: VIMap, rigs: list[MapRig], images: ColmapImages, camera_row: I64, landmarks: I64
+) -> tuple[F64, float]:
+    """Return the mean reprojection error (L,) of each landmark [px], and that of all observations."""
+    observing = np.flatnonzero(images.point != NO_POINT)
+    image = images.keypoint_image[observing]
+    landmark = images.point[observing] - 1
+    p_C = se3.transform(images.T_C_W[image], vi_map.p_G[landmark])
+    error, seen = np.zeros(len(observing)), np.zeros(len(observing), dtype=np.bool_)
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    for row, camera in enumerate(cameras):
+        mine = np.flatnonzero(camera_row[image] == row)
+        uv, seen[mine] = project(camera, p_C[mine])
+        error[mine] = np.linalg.norm(uv + PIXEL_CENTRE - images.uv[observing[mine]], axis=1)
+    place = np.searchsorted(landmarks, landmark[seen])
+    count = np.bincount(place, minlength=len(landmarks))
+    total = np.bincount(place, error[seen], minlength=len(landmarks))
+    mean = np.where(count > 0, total / np.maximum(count, 1), _UNKNOWN_ERROR_PX)
+    return mean, float(np.mean(error[seen])) if np.any(seen) else float("nan")
+
+
+def _side_file(
+    vi_map: VIMap, rigs: list[MapRig], frames: I64, vertex: I64, images: ColmapImages
+) -> SideFile:
+    cameras = [camera.id for rig in rigs for camera in rig.cameras]
+    used = np.unique(vi_map.vertices.mission[vertex])
+    order = np.flatnonzero(images.point != NO_POINT)
+    point, first = np.unique(images.point[order], return_index=True)
+    observing = order[first]
+    image = images.keypoint_image[observing]
+    return SideFile(
+        mission_id=vi_map.missions.id[used],
+        mission_name=np.array(vi_map.missions.name[used].tolist(), dtype=np.str_),
+        is_metric=np.array([is_metric(vi_map, row) for row in used.tolist()], dtype=np.int64),
+        vertex_id=vi_map.vertices.id[vertex],
+        vertex_mission=np.searchsorted(used, vi_map.vertices.mission[vertex]),
+        vertex_time_ns=vi_map.vertices.timestamp_ns[vertex],
+        image_name=np.array(images.name, dtype=np.str_),
+        image_vertex=np.searchsorted(vertex, vi_map.frames.vertex[frames]),
+        image_frame_id=vi_map.frames.id[frames],
+        image_time_ns=vi_map.frames.timestamp_ns[frames],
+        point=point,
+        point_image=image,
+        point_keypoint=observing - images.keypoint_start[image],
+        landmark_id=vi_map.landmarks.id[point - 1],
+        landmark_quality=vi_map.landmarks.quality[point - 1].astype(np.int64),
+        rig=np.arange(1, len(rigs) + 1),
+        rig_id=np.array([from_hex(rig.id) for rig in rigs]),
+        T_I_R=np.array([rig.T_I_C[0] for rig in rigs]),
+        camera=np.arange(1, len(cameras) + 1),
+        camera_id=np.array([from_hex(camera) for camera in cameras]),
+    )

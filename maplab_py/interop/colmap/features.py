@@ -14,7 +14,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, FeatureType
 from maplab_py.vimap.queries import mission_sensor_id

@@ -19,10 +19,9 @@ from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.input_files import read_text
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.features import with_features, with_images
-from maplab_py.interop.colmap.model import MODELS, ColmapModel, SensorType, has_model
+from maplab_py.interop.colmap.model import MODELS, ColmapModel, SensorType, SideFile, has_model
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
 from maplab_py.interop.colmap.reading import read_model
-from maplab_py.interop.colmap.side_file import SideFile
 from maplab_py.interop.colmap.to_map import BodyFrames, body_frames, map_of_model, side_images
 from maplab_py.interop.colmap.undistortion import perspective_model
 from maplab_py.interop.stamps import IMAGES, parse_stamps

@@ -16,7 +16,7 @@ TIME_SOURCES = ("name", "file", "order")
 
 @dataclasses.dataclass(frozen=True)
 class ColmapExportOptions:
-    """What is written of a map."""
+    """Parts of a map to write."""
 
     quality: str = option("not_bad", help="Landmarks to write, by their quality", choices=QUALITIES)
     colmap_feature_type: str = option(
@@ -41,7 +41,7 @@ class ColmapExportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ColmapExportReport(Report):
-    """What was written."""
+    """Written files."""
 
     folder: Path
     cameras: int
@@ -57,7 +57,7 @@ class ColmapExportReport(Report):
 
 @dataclasses.dataclass(frozen=True)
 class ColmapImportOptions:
-    """How a model becomes a map."""
+    """Conversion of a model to a map."""
 
     timestamps_from: str = option(
         "name",
@@ -116,7 +116,7 @@ class ColmapImportOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ColmapImportReport(Report):
-    """What was imported; the map is marked where scale or gravity are unknown."""
+    """Result of an import; the map is marked where scale or gravity are unknown."""
 
     map_key: str
     missions: tuple[str, ...]

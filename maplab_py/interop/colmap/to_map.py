@@ -16,9 +16,9 @@ from maplab_py.interop.colmap.model import (
     ColmapModel,
     ColmapRig,
     SensorType,
+    SideFile,
     map_camera,
 )
-from maplab_py.interop.colmap.side_file import SideFile
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
 from maplab_py.vimap import MissionSensor, VIMap

@@ -1,4 +1,4 @@
-"""What arrives from topics, written to a bag while it arrives."""
+"""Recording of topics to a bag while messages arrive."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MAX_WAITING_BYTES = 1 << 30
 
 @dataclasses.dataclass(frozen=True)
 class RecordingOptions:
-    """What is recorded, and for how long."""
+    """Topics and length of a recording."""
 
     flag_prefix: ClassVar[str] = "record_"
 
@@ -70,7 +70,7 @@ class RecordedTopic:
 
 @dataclasses.dataclass(frozen=True)
 class RecordedBag(Report):
-    """What was recorded."""
+    """Result of a recording."""
 
     source: str
     bag: Path

@@ -29,7 +29,7 @@ class LiveTopic:
 
 @dataclasses.dataclass(frozen=True)
 class LiveTopics(Report):
-    """What running robots publish."""
+    """Topics that running robots publish."""
 
     source: str
     topics: tuple[LiveTopic, ...]

@@ -16,7 +16,7 @@ _DEFAULT_MASTER = "http://127.0.0.1:11311"
 
 @dataclasses.dataclass(frozen=True)
 class NetworkOptions:
-    """Where the topics are."""
+    """Place of the topics."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -67,7 +67,7 @@ class NetworkOptions:
 
 @dataclasses.dataclass(frozen=True)
 class LiveOptions:
-    """How a live source is read, and what is published."""
+    """Reading of a live source, and publishing."""
 
     flag_prefix: ClassVar[str] = "live_"
 

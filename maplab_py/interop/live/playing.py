@@ -27,7 +27,7 @@ _DRAIN_S = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class PlayingOptions:
-    """How a recording is played."""
+    """Playback of a recording."""
 
     flag_prefix: ClassVar[str] = "play_"
 
@@ -51,7 +51,7 @@ class PlayingOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PlayedTopic:
-    """What was sent to one topic."""
+    """Messages sent to one topic."""
 
     topic: str
     type: str
@@ -61,7 +61,7 @@ class PlayedTopic:
 
 @dataclasses.dataclass(frozen=True)
 class PlayedRecording(Report):
-    """What was published."""
+    """Published messages."""
 
     recording: str
     target: str

@@ -1,4 +1,4 @@
-"""What arrives from topics until it is used: images put together to sets, and IMU samples.
+"""Queue of messages from topics until they are used: images put together to sets, and IMU samples.
 
 One thread receives and does nothing else; another takes. IMU samples are never left out; sets of
 images are, the oldest first, when they have waited too long.
@@ -94,7 +94,7 @@ class Message:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Arrivals:
-    """What has arrived: IMU messages, then a set of images if there is one."""
+    """Arrived messages: IMU messages, then a set of images if there is one."""
 
     imu: list[Message]
     images: tuple[Message, ...]  # by camera

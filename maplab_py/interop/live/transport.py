@@ -1,4 +1,4 @@
-"""What the ways to topics have in common."""
+"""Common interface of the ways to topics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """Where the topics are, as in "ROS 2 domain 0"."""
+        """Place of the topics, as in "ROS 2 domain 0"."""
 
     @property
     def is_ros_2(self) -> bool:
@@ -53,7 +53,7 @@ class Transport(Protocol):
 
     @property
     def problems(self) -> list[str]:
-        """What has gone wrong since the beginning, one line each."""
+        """Failures since the beginning, one line each."""
 
     def topics(self) -> dict[str, Topic]:
         """Return the topics that are published now, by name."""

@@ -21,7 +21,7 @@ _UNKNOWN = -1.0
 
 
 class MessageLayout:
-    """Where the fields of a message lie, when its texts are known."""
+    """Places of the fields of a message, when its texts are known."""
 
     def __init__(self, *, is_ros_2: bool) -> None:
         """Start with an empty message."""

@@ -60,7 +60,7 @@ _EXAMINED = 8
 _DEFAULT = ReadingOptions()
 _LARGEST_BATCH = 200
 _DELAY_MARGIN_NS = 1_000_000_000
-"""How much the delay between stamp and arrival may vary beyond that of the first messages."""
+"""Largest variation of the delay between stamp and arrival beyond that of the first messages."""
 _SEEK_MARGIN_NS = 5_000_000_000
 
 

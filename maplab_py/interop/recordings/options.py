@@ -14,7 +14,7 @@ from maplab_py.options import option
 
 @dataclasses.dataclass(frozen=True)
 class ReadingOptions:
-    """How stamps and images are read."""
+    """Reading of stamps and images."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -56,7 +56,7 @@ class ReadingOptions:
 
 @dataclasses.dataclass(frozen=True)
 class SourceOptions:
-    """How a recording is opened."""
+    """Opening of a recording."""
 
     flag_prefix: ClassVar[str] = ""
 
@@ -136,7 +136,7 @@ class SourceOptions:
 
 @dataclasses.dataclass(frozen=True)
 class StreamOptions:
-    """Which part of a recording is read, and how images are put together."""
+    """Part of a recording to read, and the grouping of its images."""
 
     flag_prefix: ClassVar[str] = "vio_"
 

@@ -1,4 +1,4 @@
-"""What every reader of recordings delivers.
+"""Interface of the readers of recordings.
 
 All times of items and events are nanoseconds of the IMU's clock: the stamp of an image plus
 the time offset of its camera (t_imu = t_camera + offset).
@@ -142,10 +142,10 @@ class PartSpan:
 
 
 Item = ImuBatch | CameraImage | TrackedFrameSet
-"""What readers yield, in the order of time."""
+"""Items that readers yield, in the order of time."""
 
 Event = ImuBatch | FrameSet | TrackedFrameSet
-"""What `EventStream` yields, in the order of time."""
+"""Items that `EventStream` yields, in the order of time."""
 
 
 class Recording(Protocol):
@@ -157,7 +157,7 @@ class Recording(Protocol):
 
     @property
     def kind(self) -> str:
-        """What is read, as in "EuRoC folder"."""
+        """Kind of the recording, as in "EuRoC folder"."""
 
     @property
     def device(self) -> RecordedSensors:
@@ -169,7 +169,7 @@ class Recording(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know: parts of the recording that are not read."""
+        """Notes for the user: parts of the recording that are not read."""
 
     def parts(self) -> tuple[PartSpan, ...]:
         """Return the parts into which restarts of the clock divide the recording."""

@@ -58,7 +58,7 @@ class Times:
 
 @dataclasses.dataclass
 class StreamStatistics:
-    """What a stream has delivered so far, and what it has left out."""
+    """Counts of the items that a stream has delivered and left out so far."""
 
     imu: Times = dataclasses.field(default_factory=Times)
     images: list[Times] = dataclasses.field(default_factory=list)  # by camera

@@ -1,4 +1,4 @@
-"""What is in a recording: rates, gaps, durations, and what a reader leaves out."""
+"""Content of a recording: rates, gaps, durations, and what a reader leaves out."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class CameraSummary:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingReport(Report):
-    """What is in a recording."""
+    """Content of a recording."""
 
     recording: str
     kind: str

@@ -28,8 +28,8 @@ from maplab_py.interop.resources.reports import ImportedResources
 from maplab_py.options import option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 
@@ -41,7 +41,7 @@ _MAX_FILE_BYTES = 200_000_000
 
 @dataclasses.dataclass(frozen=True)
 class DepthImportOptions:
-    """How files become depth maps."""
+    """Conversion of files to depth maps."""
 
     depth_scale: float = option(MM_PER_M, help="Value of a pixel at a depth of one metre")
     image_tolerance_ms: float = option(

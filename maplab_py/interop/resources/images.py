@@ -24,9 +24,9 @@ from maplab_py.interop.resources.reports import ExportedImages, ImportedResource
 from maplab_py.options import option
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resource_types import resource_type
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceStore
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.resource_queries import resources_of
@@ -37,7 +37,7 @@ RAW_GREY, RAW_COLOUR = 0, 4
 
 @dataclasses.dataclass(frozen=True)
 class ImageImportOptions:
-    """Which images of a recording become resources."""
+    """Choice of the images of a recording that become resources."""
 
     image_tolerance_ms: float = option(
         1.0, help="Largest difference between the times of image and frame", unit="ms"

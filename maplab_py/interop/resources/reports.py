@@ -1,4 +1,4 @@
-"""What imports and exports of resources report."""
+"""Reports of imports and exports of resources."""
 
 from __future__ import annotations
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
+from html import escape
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,13 +13,12 @@ import viser
 from numpy.typing import NDArray
 
 from maplab_py.viewer.colours import HIDDEN, from_hex
-from maplab_py.viewer.display import text
-from maplab_py.viewer.display.callbacks import by_user
-from maplab_py.viewer.display.camera import VIEWS
+from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.display.server import VIEWS
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
-from maplab_py.viewer.scene import MissionEntry, Scene
+from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
 
 MAX_SWITCHES = 24
 """Beyond this many missions the panel offers a list instead of a switch each."""
@@ -129,7 +129,7 @@ class Panel:
         colouring, only = options.landmark_colouring, options.color_only_missions.strip().lower()
         if self.colouring.value != colouring:
             self.colouring.value = colouring
-        self._mission_of_label = {text.mission_label(m): m.id for m in missions}
+        self._mission_of_label = {mission_label(m): m.id for m in missions}
         labels = (_ALL, *self._mission_of_label)
         if tuple(self.coloured_mission.options) != labels:
             self.coloured_mission.options = labels
@@ -143,7 +143,7 @@ class Panel:
     def _add_selection(self) -> None:
         with self._gui.add_folder("Selection", order=4):
             self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
-            self.facts = self._gui.add_html(text.hint(_HINT))
+            self.facts = self._gui.add_html(hint(_HINT))
             self.jump: Any = self._gui.add_text(
                 "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
             )
@@ -182,7 +182,7 @@ class Panel:
         entries = [
             entry for layer in scene.layers if layer.name in layers for entry in layer.legend
         ]
-        self.legend.content = text.legend(dict.fromkeys(entries))
+        self.legend.content = legend(dict.fromkeys(entries))
         signature = (scene.names, scene.missions)
         if signature != self._signature:
             self._signature = signature
@@ -190,22 +190,22 @@ class Panel:
             self._make_missions(scene, missions)
         for layer in scene.layers:
             box = self._checkboxes[layer.name]
-            if box.label != text.layer_label(layer):
-                box.label = text.layer_label(layer)
+            if box.label != layer_label(layer):
+                box.label = layer_label(layer)
             if box.value != (layer.name in layers):
                 box.value = layer.name in layers
 
     def _say_what_is_shown(self, scene: Scene) -> None:
         """Fill the header; a map's only mission is named there and needs no folder."""
         is_single = len(scene.missions) == 1
-        legend = text.mission_legend(scene.missions) if is_single else ""
-        self.header.content = text.header(scene) + legend
+        legend = mission_legend(scene.missions) if is_single else ""
+        self.header.content = header(scene) + legend
         if self._missions.visible == is_single:
             self._missions.visible = not is_single
 
     def say(self, message: str) -> None:
         """Show a message in the place of the header."""
-        self.header.content = text.hint(message)
+        self.header.content = hint(message)
 
     def _make_layers(self, scene: Scene, layers: set[str]) -> None:
         for box in self._checkboxes.values():
@@ -216,7 +216,7 @@ class Panel:
             is_extra = has_many and not layer.is_visible
             with self._more_layers if is_extra else self._layers:
                 box = self._gui.add_checkbox(
-                    text.layer_label(layer), layer.name in layers, hint=text.layer_hint(layer)
+                    layer_label(layer), layer.name in layers, hint=layer_hint(layer)
                 )
             self._bind(box, self._layer_action(layer.name))
             self._checkboxes[layer.name] = box
@@ -236,9 +236,9 @@ class Panel:
                 self._add_mission_switches(scene, missions)
                 return
             if len(scene.missions) > MAX_SWITCHES:
-                legend = text.mission_legend(scene.missions)
+                legend = mission_legend(scene.missions)
                 self._mission_widgets.append(self._gui.add_html(legend))
-                names = (_ALL, *(text.mission_label(m) for m in scene.missions))
+                names = (_ALL, *(mission_label(m) for m in scene.missions))
                 self._add_mission_list(scene, names)
 
     def _add_mission_list(self, scene: Scene, names: tuple[str, ...]) -> None:
@@ -262,7 +262,7 @@ class Panel:
 
         for mission in scene.missions:
             button: Any = self._gui.add_button(
-                text.mission_label(mission),
+                mission_label(mission),
                 color=_switch_colour(mission, is_shown=shown[mission.id]),
                 hint=f"show or hide mission {mission.id}",
             )
@@ -272,14 +272,14 @@ class Panel:
 
     def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
         """Show what was picked; without facts the hint."""
-        table = text.fact_table(facts) if facts else text.hint(_HINT)
-        self.facts.content = (text.hint(note) if note else "") + table
+        table = fact_table(facts) if facts else hint(_HINT)
+        self.facts.content = (hint(note) if note else "") + table
         self.clear.visible = bool(facts)
         self.show_image(image)
 
     def show_hint(self, message: str) -> None:
         """Say in the place of the facts why nothing was selected."""
-        self.facts.content = text.hint(message)
+        self.facts.content = hint(message)
 
     def show_image(self, image: NDArray[np.uint8] | None) -> None:
         """Show the image (H, W, 3) of a vertex, or none."""
@@ -293,3 +293,105 @@ def _switch_colour(mission: MissionEntry, *, is_shown: bool) -> tuple[int, int, 
     """Return the colour of a mission's button."""
     red, green, blue = (from_hex(mission.colour)[0] if is_shown else HIDDEN).tolist()
     return red, green, blue
+
+
+_SMALL = "font-size:0.78em;line-height:1.45;"
+_NAMES = "38%"
+"""Width of the names in a table of facts."""
+_PADDED = "padding:0.15em 0.9em 0.45em 0.9em;"
+
+
+def header(scene: Scene) -> str:
+    """Say what is shown."""
+    counts = [f"{len(scene.missions)} mission{'s' if len(scene.missions) != 1 else ''}"]
+    for name, word in (("vertices", "vertices"), ("landmarks", "landmarks")):
+        if name in scene.names:
+            counts.append(f"{scene.layer(name).total:,} {word}")
+    notes = "".join(f"<div style='opacity:0.6'>{escape(note)}</div>" for note in scene.notes)
+    return (
+        f"<div style='{_SMALL}{_PADDED}padding-top:0.6em'>"
+        f"<div style='font-weight:600;font-size:1.15em'>{escape(scene.title)}</div>"
+        f"<div style='opacity:0.75'>{' &middot; '.join(counts)}</div>{notes}</div>"
+    )
+
+
+def layer_label(layer: Layer) -> str:
+    """Return the words beside a layer's checkbox."""
+    return f"{layer.title} {short_count(layer.total)}"
+
+
+def layer_switches(layers: Iterable[Layer], visible: set[str]) -> str:
+    """Return a checkbox for each layer of an exported page."""
+    lines = "".join(
+        f"<label style='display:block;pointer-events:auto;cursor:pointer'>"
+        f"<input type='checkbox' data-layer='{escape(layer.name)}'"
+        f"{' checked' if layer.name in visible else ''}> {escape(layer_label(layer))}</label>"
+        for layer in layers
+    )
+    return f"<div style='{_SMALL}{_PADDED}'>{lines}</div>" if lines else ""
+
+
+def short_count(count: int) -> str:
+    """Return a count in at most five characters."""
+    if count < 10_000:
+        return str(count)
+    if count < 1_000_000:
+        return f"{count / 1e3:.1f}k" if count < 100_000 else f"{count / 1e3:.0f}k"
+    return f"{count / 1e6:.1f}M"
+
+
+def layer_hint(layer: Layer) -> str:
+    """Return what is shown while the pointer rests on a layer's checkbox."""
+    return ". ".join((f"{layer.title}: {layer.total:,} in the map", *layer.notes))
+
+
+def mission_label(mission: MissionEntry) -> str:
+    """Return the words beside a mission's checkbox."""
+    minutes, seconds = divmod(round(mission.duration_s), 60)
+    return f"{mission.name}  {mission.length_m:.0f} m  {minutes}:{seconds:02d}"
+
+
+def mission_legend(missions: Iterable[MissionEntry], limit: int = 24) -> str:
+    """Return the missions' colours."""
+    entries = [LegendEntry(mission_label(m), (m.colour,)) for m in missions]
+    more = f"<div style='opacity:0.6'>and {len(entries) - limit} more</div>"
+    return legend(entries[:limit], more if len(entries) > limit else "")
+
+
+def legend(entries: Iterable[LegendEntry], more: str = "") -> str:
+    """Return swatches and ramps; an empty text when there are none."""
+    lines = "".join(_legend_line(entry) for entry in entries)
+    return f"<div style='{_SMALL}{_PADDED}'>{lines}{more}</div>" if lines else ""
+
+
+def _legend_line(entry: LegendEntry) -> str:
+    if len(entry.colours) == 1:
+        swatch = (
+            "display:inline-block;width:0.75em;height:0.75em;border-radius:50%;"
+            f"margin-right:0.55em;background:{entry.colours[0]}"
+        )
+        return (
+            f"<div style='white-space:pre'><span style='{swatch}'></span>{escape(entry.text)}</div>"
+        )
+    ramp = f"linear-gradient(90deg,{','.join(entry.colours)})"
+    return (
+        f"<div style='margin-top:0.3em'>{escape(entry.text)}</div>"
+        f"<div style='height:0.5em;border-radius:0.25em;background:{ramp}'></div>"
+        "<div style='display:flex;justify-content:space-between;opacity:0.7'>"
+        f"<span>{escape(entry.low)}</span><span>{escape(entry.high)}</span></div>"
+    )
+
+
+def fact_table(facts: Facts) -> str:
+    """Return names and values as a table."""
+    rows = "".join(
+        f"<tr><td style='opacity:0.65;padding:0 0.8em 0 0;vertical-align:top;width:{_NAMES}'>"
+        f"{escape(name)}</td><td style='overflow-wrap:anywhere'>{escape(value)}</td></tr>"
+        for name, value in facts
+    )
+    return f"<div style='{_SMALL}{_PADDED}'><table style='border:0;width:100%'>{rows}</table></div>"
+
+
+def hint(text: str) -> str:
+    """Return a quiet line."""
+    return f"<div style='{_SMALL}{_PADDED}opacity:0.6'>{escape(text)}</div>"

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import logging
 import struct
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,8 +17,7 @@ import viser
 
 from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.viewer.colours import linear_light
-from maplab_py.viewer.drawing import axis_lines
-from maplab_py.viewer.end_labels import with_end_labels
+from maplab_py.viewer.drawing import axis_lines, with_end_labels
 from maplab_py.viewer.ground import Ground
 from maplab_py.viewer.scene import (
     WHOLE_MAP,
@@ -326,3 +327,25 @@ def is_coloured(mesh: Mesh) -> bool:
     """Tell whether the corners of a mesh have a colour each."""
     colour: U8 = mesh.colours
     return colour.ndim == 2
+
+
+logger = logging.getLogger(__name__)
+
+
+def by_user(
+    lock: threading.RLock, action: Callable[[Any], None], say: Callable[[str], None]
+) -> Callable[[Any], None]:
+    """Make a callback: only for what a page does, one at a time; errors are said and logged."""
+
+    def callback(event: Any) -> None:
+        if getattr(event, "client_id", None) is None:
+            return
+        try:
+            with lock:
+                action(event)
+        except Exception:
+            logger.exception("the viewer could not do what a page asked for")
+            with lock:
+                say("this could not be done: the log file has the reason")
+
+    return callback

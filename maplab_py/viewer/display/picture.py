@@ -21,10 +21,9 @@ from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.child_processes import kill, start
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes, write_text
-from maplab_py.viewer.display import text
-from maplab_py.viewer.display.camera import aim, aim_initially
+from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
-from maplab_py.viewer.display.server import page_script
+from maplab_py.viewer.display.server import aim, aim_initially, page_script
 from maplab_py.viewer.scene import Extent, Scene
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -198,10 +197,10 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
     overlay = _OVERLAY.format(
         ground="rgba(24,26,31,0.82)" if is_dark else "rgba(255,255,255,0.82)",
         ink="#d8dbe0" if is_dark else "#2a2d33",
-        header=text.header(scene),
-        missions=text.mission_legend(scene.missions),
-        switches=text.layer_switches(scene.layers, layers),
-        legend=text.legend(dict.fromkeys(entries)),
+        header=panel.header(scene),
+        missions=panel.mission_legend(scene.missions),
+        switches=panel.layer_switches(scene.layers, layers),
+        legend=panel.legend(dict.fromkeys(entries)),
     )
     end = page.rindex("</body>")
     page = f"{page[:end]}{overlay}{_SCRIPT}{page_script()}{page[end:]}"

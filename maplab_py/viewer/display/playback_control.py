@@ -17,14 +17,14 @@ import viser
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.colours import AXES, hex_codes
-from maplab_py.viewer.display import text
-from maplab_py.viewer.display.callbacks import by_user
-from maplab_py.viewer.display.camera import FREE, RIDES, ride
+from maplab_py.viewer.display import panel
+from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, no_image
+from maplab_py.viewer.display.server import FREE, RIDES, ride
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.signals import Signal, vertex_signals
+from maplab_py.viewer.playback import Signal, vertex_signals
 
 logger = logging.getLogger(__name__)
 
@@ -354,8 +354,8 @@ class TimeLine:
                 "view", RIDES, hint="let the view ride along with the plotted mission"
             )
             self.mission: Any = server.gui.add_dropdown("plots of", ("",), visible=False)
-            self.time = server.gui.add_html(text.hint("the whole map"))
-            self.plots = server.gui.add_html(text.hint(_HINT))
+            self.time = server.gui.add_html(panel.hint("the whole map"))
+            self.plots = server.gui.add_html(panel.hint(_HINT))
         self.panel.float(x=_MARGIN_PX, y=-_MARGIN_PX, width=_WIDTH_PX)
         self.panel.minimize()
         for widget, action in (
@@ -402,8 +402,8 @@ class TimeLine:
             self._steps = steps
         if not self._is_sliding and int(self.slider.value) != step:
             self.slider.value = step
-        self.time.content = text.hint(note)
-        self.plots.content = plots or text.hint(_HINT)
+        self.time.content = panel.hint(note)
+        self.plots.content = plots or panel.hint(_HINT)
 
     def show_ride(self, ride: str) -> None:
         """Show how the view rides along."""

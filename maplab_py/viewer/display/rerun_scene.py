@@ -22,8 +22,8 @@ from maplab_py.sensors import Camera
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.drawing import Drawing, axis_lines
 from maplab_py.viewer.layers.cameras import frustum_points, mission_cameras
+from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Mesh, Part, Points, Scene
-from maplab_py.viewer.vertex_images import VertexImages
 
 _ROOT = "map"
 _TIME = "time"

@@ -27,8 +27,8 @@ from maplab_py.viewer.layers.cameras import (
 )
 from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
+from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
-from maplab_py.viewer.vertex_images import VertexImages
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import binary_descriptor_sizes
 from maplab_py.vimap.table import ragged_rows

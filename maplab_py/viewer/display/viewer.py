@@ -18,15 +18,13 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
-from maplab_py.viewer.display.callbacks import by_user
-from maplab_py.viewer.display.camera import aim, aim_initially, approach
 from maplab_py.viewer.display.panel import Panel
-from maplab_py.viewer.display.parts import Nodes
+from maplab_py.viewer.display.parts import Nodes, by_user
 from maplab_py.viewer.display.picture import export_html, save_picture, take_picture
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
-from maplab_py.viewer.display.server import LOOPBACK, start_server
+from maplab_py.viewer.display.server import LOOPBACK, aim, aim_initially, approach, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.layers.closures import REFUSED

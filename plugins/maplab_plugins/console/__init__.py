@@ -1,14 +1,12 @@
 """Commands of the console itself: help, lasting flags, aliases, jobs, timing, transcript, plugins."""
 
-from maplab_plugins.console.aliases import alias, unalias
-from maplab_plugins.console.help import list_plugins, show_help
+from maplab_plugins.console.aliases import alias, list_flags, set_flags, unalias, unset_flags
+from maplab_plugins.console.help import list_plugins, show_help, show_schema
 from maplab_plugins.console.jobs import cancel, join, list_jobs
-from maplab_plugins.console.lasting_flags import list_flags, set_flags, unset_flags
-from maplab_plugins.console.new_plugin import new_plugin
-from maplab_plugins.console.schema import show_schema
 from maplab_plugins.console.session import (
     clear_screen,
     enable_sheep,
+    new_plugin,
     show_timing,
     transcript,
     watch,

@@ -1,10 +1,12 @@
-"""Help pages and the list of plugins."""
+"""Help: commands, plugins, and the schemas of reports."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Mapping
+from typing import Any
 
 from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flags import Flag
@@ -251,3 +253,31 @@ def list_plugins(context: CommandContext) -> PluginList:
     )
     clashes = tuple(clash for p in registry.plugins for clash in p.clashes)
     return PluginList(lines, clashes)
+
+
+@dataclasses.dataclass(frozen=True)
+class SchemaReport(Report):
+    """A JSON schema."""
+
+    json_schema: dict[str, Any]
+
+    def as_text(self) -> str:
+        """Return it as indented JSON."""
+        return json.dumps(self.json_schema, indent=2)
+
+
+@command("schema", example="schema map_stats", see_also=("help",), needs_map=False)
+def show_schema(context: CommandContext, command_name: str = "") -> SchemaReport:
+    """Show the JSON schema of what --json prints for one command, or for all.
+
+    Every line is an object with the fields schema (the version, a number), command, status (0 done,
+    1 failed, 2 wrong usage, 130 cancelled), error, seconds and report.
+
+    Args:
+        command_name: Command or alias; empty = all commands.
+    """
+    from maplab_py.console.commands.schema import line_schema
+
+    registry = context.session.registry
+    commands = [registry.find(command_name)] if command_name else registry.commands
+    return SchemaReport(line_schema(commands))

@@ -1,13 +1,14 @@
 """maplab's vi_map_basic plugin: maps in memory and on disk, their content, undo."""
 
 from maplab_plugins.vi_map_basic.cells import join_submaps, split_map
-from maplab_plugins.vi_map_basic.history import history, redo, restore, snapshot, undo
 from maplab_plugins.vi_map_basic.information import (
     check_map_consistency,
     map_stats,
+    memory,
     mission_coobservability_stats,
     print_baseframes,
     print_camera_calibrations,
+    why,
 )
 from maplab_plugins.vi_map_basic.loading import (
     list_maps_on_file_system,
@@ -24,13 +25,17 @@ from maplab_plugins.vi_map_basic.memory import (
     copy_map,
     create_new_map,
     delete_map,
+    history,
     join_all_maps,
     list_maps,
     merge_map,
+    redo,
     rename_map,
+    restore,
     select_map,
+    snapshot,
+    undo,
 )
-from maplab_plugins.vi_map_basic.memory_report import memory
 from maplab_plugins.vi_map_basic.resources import (
     clean_up_resource_folders,
     list_resource_folders,
@@ -41,7 +46,6 @@ from maplab_plugins.vi_map_basic.resources import (
     use_map_resource_folder,
 )
 from maplab_plugins.vi_map_basic.saving import get_map_folder, save, save_all, set_map_folder
-from maplab_plugins.vi_map_basic.why import why
 
 __all__ = [
     "check_map_consistency",

@@ -8,16 +8,9 @@ from typing import TYPE_CHECKING
 
 from maplab_py.input_files import SizeOptions
 from maplab_py.options import option
-from maplab_py.plugin import (
-    CommandContext,
-    Message,
-    Report,
-    UserError,
-    command,
-    key_of_folder,
-)
+from maplab_py.plugin import CommandContext, Message, Report, UserError, command, key_of_folder
 from maplab_py.report import counted
-from maplab_py.storage.cache_options import CacheOptions
+from maplab_py.storage.cache.options import CacheOptions
 
 if TYPE_CHECKING:
     from maplab_py.storage.native import MapCache

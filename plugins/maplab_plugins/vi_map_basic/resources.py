@@ -17,7 +17,7 @@ from maplab_py.plugin import (
     command,
 )
 from maplab_py.report import counted
-from maplab_py.storage.resource_types import resource_type
+from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap
 
 MAP_FOLDER = -1
@@ -159,7 +159,7 @@ def use_external_resource_folder(context: CommandContext, resource_folder: Path)
 @command("resource_cache_statistics", "res_cache_stats")
 def resource_cache_statistics(context: CommandContext) -> CacheReport | Message:  # noqa: ARG001
     """Show how often resources came from the cache (hits) and from disk (misses), by type."""
-    from maplab_py.storage.resource_cache import SHARED_CACHE
+    from maplab_py.storage.resources.store import SHARED_CACHE
 
     kinds = SHARED_CACHE.kinds()
     if not kinds:
@@ -194,7 +194,7 @@ def remove_resources(
     Args:
         resource_type: Number or name of the type, as `resource_statistics` lists them.
     """
-    from maplab_py.storage.resource_types import resource_type_of
+    from maplab_py.storage.resources.types import resource_type_of
     from maplab_py.vimap.resource_queries import resources_of, without_resources
 
     kind = resource_type_of(resource_type)
@@ -226,7 +226,7 @@ def clean_up_resource_folders(
         remove_orphans: Delete the files; the map must be saved. Undo does not bring them back.
         yes: Do not ask before files are deleted.
     """
-    from maplab_py.storage.resource_files import orphaned_files, remove_files, with_merged_folders
+    from maplab_py.storage.resources.files import orphaned_files, remove_files, with_merged_folders
 
     vi_map, folder = context.vi_map, context.map_folder
     others = [entry.vi_map for entry in context.maps if entry.key != context.map_key]

@@ -8,8 +8,8 @@ from pathlib import Path
 from maplab_py.errors import MaplabError
 from maplab_py.options import option
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
-from maplab_py.storage.descriptor_layout import LayoutChoice
-from maplab_py.storage.resource_migration import ResourceMigration, delete_files
+from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice
+from maplab_py.storage.resources.files import ResourceMigration, delete_files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,8 +205,8 @@ def _check(
     migration: ResourceMigration,
     options: SaveOptions,
 ) -> None:
-    from maplab_py.storage.descriptor_layout import with_layout
     from maplab_py.storage.native import check_target
+    from maplab_py.storage.protobuf.descriptor_layout import with_layout
 
     migration.check()
     for key, folder in jobs:

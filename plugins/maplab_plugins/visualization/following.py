@@ -200,7 +200,7 @@ def show(
 def _show_in_rerun(subject: Subject, options: ViewerOptions, images: ImageOf) -> ViewReport:
     """Show a subject in Rerun, or write it to a file."""
     from maplab_py.viewer.display.rerun_scene import show_in_rerun
-    from maplab_py.viewer.vertex_images import VertexImages
+    from maplab_py.viewer.resource_clouds import VertexImages
 
     if options.file is None and not _has_desktop():
         raise UserError(
@@ -218,7 +218,7 @@ def _show_in_rerun(subject: Subject, options: ViewerOptions, images: ImageOf) ->
 def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:
     """Return the images and depth maps that the map keeps as resources; none when it was never loaded."""
     from maplab_py.viewer.display.selection import no_image
-    from maplab_py.viewer.vertex_images import VertexImages
+    from maplab_py.viewer.resource_clouds import VertexImages
 
     if context.map_folder is None or not len(vi_map.resources):
         return no_image

@@ -47,8 +47,7 @@ def _show(
     context: CommandContext, name: str, playback: PlaybackOptions, display: ViewerOptions
 ) -> ViewReport:
     from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.resource_clouds import resource_rows
-    from maplab_py.viewer.vertex_images import VertexImages
+    from maplab_py.viewer.resource_clouds import VertexImages, resource_rows
 
     resource_rows(context.vi_map, name)
     images = VertexImages(context.vi_map, context.map_folder or Path(), name)

@@ -66,7 +66,7 @@ def visualize(
 
         subject = subject.replace(truth=read_trajectory(ground_truth, needs_orientation=False))
     if informative_segments is not None:
-        from maplab_py.viewer.segment_file import read_segments
+        from maplab_py.viewer.layers.references import read_segments
 
         subject = subject.replace(segments=read_segments(informative_segments, context.vi_map))
     return show(context, subject, display)

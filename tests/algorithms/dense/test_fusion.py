@@ -16,7 +16,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.interop.resources.depth_maps import import_depth_maps
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.resource_queries import resources_of, without_resources

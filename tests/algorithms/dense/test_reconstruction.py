@@ -18,8 +18,8 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import parse_ply
 from maplab_py.interop.resources.images import ImageImportOptions, import_images
-from maplab_py.storage.new_resources import NewResources
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.resource_queries import resources_of, without_resources
 from tests.support.stereo_room import StereoRoom

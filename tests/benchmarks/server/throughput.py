@@ -27,8 +27,8 @@ from maplab_py.server.options import IncrementalOptions, MapServerOptions, Servi
 from maplab_py.server.preparation import Intake
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.server import MapServer
-from maplab_py.server.simulated_robots import recorded_sessions, timed_submaps
 from maplab_py.server.spool import Spool, push
+from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth

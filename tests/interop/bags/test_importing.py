@@ -18,7 +18,7 @@ from maplab_py.interop.bags.sensor_messages import CLOUD, COMPRESSED, IMAGE, Mes
 from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.bag_writing import BagFormat, BagMessage, Channel, write_bag
-from maplab_py.storage.resources import ResourceStore
+from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from tests.interop.bags.small_bags import (
     FORMATS,

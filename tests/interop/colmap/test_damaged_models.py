@@ -13,12 +13,10 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.colmap.binary import binary_files
-from maplab_py.interop.colmap.exporting import export_colmap
-from maplab_py.interop.colmap.from_map import model_of_map
+from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
 from maplab_py.interop.colmap.importing import import_colmap
-from maplab_py.interop.colmap.model import FILES, ColmapModel
+from maplab_py.interop.colmap.model import FILE_NAME, FILES, ColmapModel
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.vimap import VIMap
 from tests.support.scene import Scene
 

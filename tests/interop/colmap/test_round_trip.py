@@ -17,11 +17,10 @@ from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.colmap.binary import compile_kernels
-from maplab_py.interop.colmap.exporting import export_colmap
-from maplab_py.interop.colmap.from_map import model_of_map
+from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
 from maplab_py.interop.colmap.importing import import_colmap
+from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.colmap.side_file import FILE_NAME
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage.native import load_map, save_map

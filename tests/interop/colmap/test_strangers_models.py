@@ -16,9 +16,9 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop.colmap.exporting import export_colmap
 from maplab_py.interop.colmap.features import SCALED, UNDISTORTED, agreement
 from maplab_py.interop.colmap.importing import import_colmap
+from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
 from maplab_py.interop.colmap.reading import read_model
-from maplab_py.interop.colmap.side_file import FILE_NAME
 from tests.interop.colmap.test_round_trip import PINHOLES, Scene
 
 ORDER = ColmapImportOptions(timestamps_from="order")

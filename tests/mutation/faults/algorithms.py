@@ -108,7 +108,7 @@ ALGORITHMS = (
     ),
     Fault(
         "title_not_escaped",
-        "maplab_py/viewer/display/text.py",
+        "maplab_py/viewer/display/panel.py",
         "{escape(scene.title)}",
         "{scene.title}",
         _VIEWER,

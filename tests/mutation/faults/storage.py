@@ -75,7 +75,7 @@ STORAGE = (
     ),
     Fault(
         "plain_files_without_bound",
-        "maplab_py/storage/map_files.py",
+        "maplab_py/storage/protobuf/map_files.py",
         "        packed = read_file(path, max_bytes, error=MapError)\n",
         "        packed = read_file(path, 1 << 60, error=MapError)\n",
         _FIELDS,
@@ -89,21 +89,21 @@ STORAGE = (
     ),
     Fault(
         "listed_path_leaves_the_folder",
-        "maplab_py/storage/map_files.py",
+        "maplab_py/storage/protobuf/map_files.py",
         ' or ".." in relative.parts or',
         " or",
         _MAPS,
     ),
     Fault(
         "switch_variable_off_by_default",
-        "maplab_py/storage/tables_from_messages.py",
+        "maplab_py/storage/protobuf/tables_from_messages.py",
         'if e.HasField("switch_variable") else 1.0',
         'if e.HasField("switch_variable") else 0.0',
         _FIELDS,
     ),
     Fault(
         "switch_variance_not_written",
-        "maplab_py/storage/edges_to_messages.py",
+        "maplab_py/storage/protobuf/tables_to_messages.py",
         '        loop.switch_variable_variance = float(columns["loop.switch_variable_variance"][row])\n',
         "",
         _FIELDS,

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.storage.new_resources import NewResources
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.mesh_sources import coloured_mesh
 from maplab_py.viewer.options import MeshColouring, VisualizationOptions
-from maplab_py.viewer.vertex_images import VertexImages
+from maplab_py.viewer.resource_clouds import VertexImages
 from tests.viewer.display.browsing import IN_BROWSER, Page, chromium, place_on_page
 from tests.vimap.builders import walk_map
 

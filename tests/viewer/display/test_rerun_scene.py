@@ -18,7 +18,7 @@ from maplab_py.sensors.projection import back_project
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.display.rerun_scene import show_in_rerun
 from maplab_py.viewer.layers.cameras import mission_cameras
-from maplab_py.viewer.vertex_images import VertexImages
+from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.vimap.queries import mission_labels
 from tests.interop.bags.small_bags import map_with_resources
 from tests.vimap.builders import walk_map

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from maplab_py.viewer.display.playback_control import image_tag, plot_paths, strip_chart, value_text
-from maplab_py.viewer.signals import Signal
+from maplab_py.viewer.playback import Signal
 
 ALL = np.arange(50)
 

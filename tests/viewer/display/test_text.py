@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from maplab_py.viewer.building import Subject, build_scene
-from maplab_py.viewer.display import text
+from maplab_py.viewer.display import panel
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import LegendEntry, Scene
 from tests.vimap.builders import walk_map
@@ -23,15 +23,15 @@ def scene(title: str) -> Scene:
 @pytest.mark.parametrize(
     "markup",
     [
-        lambda: text.header(scene(HOSTILE)),
-        lambda: text.header(dataclasses.replace(scene("map"), notes=(HOSTILE,))),
-        lambda: text.legend([LegendEntry(HOSTILE, ("#000000",))]),
-        lambda: text.legend([LegendEntry(HOSTILE, ("#000000", "#ffffff"), "0", "1")]),
-        lambda: text.legend([LegendEntry("seen", ("#000000", "#ffffff"), HOSTILE, "1")]),
-        lambda: text.legend([LegendEntry("seen", ("#000000", "#ffffff"), "0", HOSTILE)]),
-        lambda: text.fact_table([(HOSTILE, "value")]),
-        lambda: text.fact_table([("name", HOSTILE)]),
-        lambda: text.hint(HOSTILE),
+        lambda: panel.header(scene(HOSTILE)),
+        lambda: panel.header(dataclasses.replace(scene("map"), notes=(HOSTILE,))),
+        lambda: panel.legend([LegendEntry(HOSTILE, ("#000000",))]),
+        lambda: panel.legend([LegendEntry(HOSTILE, ("#000000", "#ffffff"), "0", "1")]),
+        lambda: panel.legend([LegendEntry("seen", ("#000000", "#ffffff"), HOSTILE, "1")]),
+        lambda: panel.legend([LegendEntry("seen", ("#000000", "#ffffff"), "0", HOSTILE)]),
+        lambda: panel.fact_table([(HOSTILE, "value")]),
+        lambda: panel.fact_table([("name", HOSTILE)]),
+        lambda: panel.hint(HOSTILE),
     ],
 )
 def test_texts_are_escaped(markup) -> None:

@@ -1,4 +1,4 @@
-"""What the visual kernels share: weights, and the 3 x 3 system of one landmark.
+"""Common parts of the visual kernels: weights, and the 3 x 3 system of one landmark.
 
 `out` holds one observation: residual (2), depth, and the Jacobian's columns of two entries each:
 pose (6) from POSE on, landmark (3) from LANDMARK on; NUM_OUT entries in all, after which those of an
