@@ -238,7 +238,7 @@ def _sigmas_of(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FoundCalibration:
-    """What a window has said of the calibration."""
+    """Estimate of the calibration by a window."""
 
     calibration: WindowCalibration
     values: F64  # (K,) changes
@@ -268,7 +268,7 @@ class FoundCalibration:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameTimes:
-    """When the images of F frames were taken, and how fast the body turned."""
+    """Times of the images of F frames, and rates at which the body turned."""
 
     rate_I: F64  # (F, 3) angular velocity as measured [rad/s]
     delay_s: F64  # (F,) by which the frame's time differs from the stamps of its images
