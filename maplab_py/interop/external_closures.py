@@ -18,6 +18,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import read_text
+from maplab_py.interop.text_table import LARGEST
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import LoopClosureEdges, VIMap
@@ -98,7 +99,7 @@ def _entries(path: Path) -> list[Any]:
 def _pose(node: Any) -> F64:
     q = np.array(node["rotation_xyzw"], dtype=np.float64)
     p = np.array(node["translation_m"], dtype=np.float64)
-    if q.shape != (4,) or p.shape != (3,) or not np.linalg.norm(q) > 0.0:
+    if q.shape != (4,) or p.shape != (3,) or not 0.0 < np.abs(q).max() <= LARGEST:
         raise ValueError("a pose needs rotation_xyzw (4 numbers) and translation_m (3)")
     return se3.make(so3.normalize(q), p)
 

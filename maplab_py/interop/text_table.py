@@ -20,6 +20,8 @@ from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
+LARGEST = 1e100
+"""Numbers beyond it, whose squares overflow, are no measurements."""
 _AXIS, _AXES = re.compile(r"(^|[^a-z])[a-z]{0,2}[wxyz]\W*(\[.*)?$"), 3
 _ID = re.compile(r"(^|[-_. ])id$")
 _SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")
@@ -286,19 +288,23 @@ def _parse_values(rows: list[list[str]], source: str, numbers: list[int], allow_
             values = np.fromstring(text, dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning):
         values = np.zeros(0)
-    is_complete = values.size == len(rows) * width
-    if is_complete and allow_nan:
-        values[np.isinf(values)] = np.nan
-    if is_complete and (allow_nan or np.all(np.isfinite(values))):
-        return values.reshape(len(rows), width)
+    if values.size == len(rows) * width:
+        is_usable = np.abs(values) <= LARGEST
+        if allow_nan:
+            values[~is_usable] = np.nan
+        if allow_nan or np.all(is_usable):
+            return values.reshape(len(rows), width)
     for number, row in zip(numbers, rows, strict=True):
         for token in row:
             try:
-                is_finite = bool(np.isfinite(float(token))) or allow_nan
+                value = float(token)
             except ValueError:
-                is_finite = False
-            if not is_finite:
-                raise MapError(
-                    f"{source}:{number}: '{token}' is not a finite number: correct or remove the row"
+                value = np.nan
+            if not abs(value) <= LARGEST and not (allow_nan and _is_number(token)):
+                reason = (
+                    f"is beyond {LARGEST:g}" if np.isfinite(value) else "is not a finite number"
                 )
-    return np.array(rows, dtype=np.float64)
+                raise MapError(f"{source}:{number}: '{token}' {reason}: correct or remove the row")
+    values = np.array(rows, dtype=np.float64)
+    values[~(np.abs(values) <= LARGEST)] = np.nan  # allowed
+    return values

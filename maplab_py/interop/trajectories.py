@@ -19,6 +19,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.input_files import read_text
 from maplab_py.interop.stamps import POSES, read_stamps
 from maplab_py.interop.text_table import (
+    LARGEST,
     TextTable,
     format_rows,
     is_time_name,
@@ -231,7 +232,7 @@ def _numbers(path: Path, width: int, what: str) -> F64:
         values = np.array([row for row in rows if row], dtype=np.float64).reshape(-1, width)
     except ValueError as error:
         raise MapError(f"{path}: {what} is wanted per line: {error}") from None
-    if not len(values) or not np.all(np.isfinite(values)):
+    if not len(values) or not np.all(np.abs(values) <= LARGEST):
         raise MapError(f"{path}: {what} is wanted per line")
     return values
 
