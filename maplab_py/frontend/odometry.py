@@ -439,9 +439,10 @@ class Odometry:
     def _new_smoother(self) -> FixedLagSmoother:
         device, window = self._device, self.options.window
         rig = device.cameras, device.T_I_C, self._imu, window
+        calibration = self._calibration.with_delay(1e-9 * self._delay_ns)
         if self._map_rule is None:
-            return FixedLagSmoother(*rig, self._calibration)
-        return LocalizedSmoother(*rig, self._map_rule, self._calibration)
+            return FixedLagSmoother(*rig, calibration)
+        return LocalizedSmoother(*rig, self._map_rule, calibration)
 
     def find_calibration(self) -> None:
         """Keep what the window says of the calibration now, for the report and the next start."""

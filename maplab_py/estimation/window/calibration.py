@@ -153,6 +153,16 @@ class WindowCalibration:
             )
         return tuple(cameras), found.T_I_C
 
+    def with_delay(self, delay_s: float) -> WindowCalibration:
+        """Return the calibration that begins with a delay of the middle rows of images, if it is a state."""
+        column, camera = self.columns[0, CAMERA_DELAY_COLUMN], self.cameras[0]
+        if column < 0 or not delay_s:
+            return self
+        timing_s = self.of_kernels(self.mean).timing_s[0]
+        mean = self.mean.copy()
+        mean[column] += delay_s - float(timing_s @ [1.0, 0.5 * camera.height_px])
+        return dataclasses.replace(self, mean=mean)
+
     def reversed_at(self, values: F64) -> WindowCalibration:
         """Return the calibration with some values (K,), all known, for frames read backwards."""
         return dataclasses.replace(WindowCalibration.of(*self.calibrated(values)), direction=-1.0)

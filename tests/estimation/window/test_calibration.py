@@ -99,3 +99,17 @@ def test_known_cameras_have_no_states_and_backwards_the_opposite_lateness(
     forward = known.of_kernels(nothing).timing_s
     np.testing.assert_allclose(forward, [[0.01, 5e-5]])
     np.testing.assert_allclose(known.reversed_at(nothing).of_kernels(nothing).timing_s, -forward)
+
+
+def test_a_delay_that_was_measured_before_is_where_the_window_begins(
+    tracks: SimulatedTracks,
+) -> None:
+    rolling = dataclasses.replace(tracks.cameras[0], image_delay_s=0.001, line_delay_ns=50_000)
+    calibration = WindowCalibration.of((rolling,), tracks.T_I_C[:1], ("time_offset",))
+    begun = calibration.with_delay(-0.056)
+    timing_s = begun.of_kernels(begun.mean).timing_s[0]
+    assert timing_s @ [1.0, 0.5 * rolling.height_px] == pytest.approx(-0.056)
+    assert timing_s[1] == pytest.approx(5e-5)
+    assert calibration.with_delay(0.0) is calibration
+    known = WindowCalibration.of((rolling,), tracks.T_I_C[:1])
+    assert known.with_delay(-0.056) is known
