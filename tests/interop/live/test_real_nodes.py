@@ -78,7 +78,7 @@ def test_another_domain_is_answered_with_what_to_do(recorded: Path, tmp_path: Pa
         "jazzy",
         recorded,
         "--ros_domain_id=12 --live_wait_s=5",
-        f"{RATE} --limit 20 --no_wait",
+        f"{RATE} --limit 20 --wait_s 30",
     )
     assert run.status == 2
     assert "ROS 2 domain 12: nobody publishes /imu0" in run.printed
@@ -89,7 +89,7 @@ def test_a_topic_of_another_type_is_answered_with_what_to_do(
     recorded: Path, tmp_path: Path
 ) -> None:
     run = run_live(
-        tmp_path, "jazzy", recorded, "--imu_topic=/cam0/image_raw", f"{RATE} --limit 20 --no_wait"
+        tmp_path, "jazzy", recorded, "--imu_topic=/cam0/image_raw", f"{RATE} --limit 20 --wait_s 30"
     )
     assert run.status == 2
     assert (

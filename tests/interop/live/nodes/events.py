@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 Event = tuple[int, int, Any]  # stamp_ns, camera or -1 = IMU, pixels or [ax ay az gx gy gz]
-_CONNECT_S = 60.0
 _SETTLE_S = 1.0  # both sides learn of each other
 _LONGEST_WAIT_S = 10.0
 _QUIET_S, _LONGEST_QUIET_S = 5.0, 150.0
@@ -33,7 +32,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--last_s", type=float, default=0.0, help="end after so long; 0 = never")
     parser.add_argument("--killed", action="store_true", help="die without a word at the end")
     parser.add_argument("--best_effort", action="store_true", help="ROS 2")
-    parser.add_argument("--no_wait", action="store_true", help="do not wait for subscribers")
+    parser.add_argument("--wait_s", type=float, default=60.0, help="for subscribers")
     return parser.parse_args()
 
 
@@ -59,7 +58,7 @@ class Player:
 
     def play(self, is_connected: Callable[[], bool], send: Callable[[int, int, Any], None]) -> None:
         """Wait for subscribers, send everything, and wait until no more poses come."""
-        deadline_s = time.monotonic() + (0.0 if self._options.no_wait else _CONNECT_S)
+        deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s and not is_connected():
             time.sleep(0.05)
         time.sleep(_SETTLE_S)
