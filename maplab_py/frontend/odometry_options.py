@@ -8,11 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from maplab_py.errors import FlagError
-from maplab_py.estimation.window.calibration import KINDS
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.options import option
 from maplab_py.vision.tracking.options import TrackingOptions
+
+CALIBRATED = ("extrinsics", "time_offset", "intrinsics", "line_delay")
+"""Groups of numbers of a calibration that can be estimated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,10 +158,10 @@ class OdometryOptions:
         """
         self.tracking.check()
         for name in self.estimated:
-            if name not in KINDS:
+            if name not in CALIBRATED:
                 raise FlagError(
-                    f"--{self.flag_prefix}estimate: there is no {name}: give some of {', '.join(KINDS)}, "
-                    "separated by commas, or none"
+                    f"--{self.flag_prefix}estimate: there is no {name}: give some of "
+                    f"{', '.join(CALIBRATED)}, separated by commas, or none"
                 )
         self.initialization.check()
         self._check_window()

@@ -20,8 +20,6 @@ from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera
 from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 
-KINDS = ("extrinsics", "time_offset", "intrinsics", "line_delay")
-"""Groups of numbers that can be estimated."""
 _ROTATION, _NUMBERS = 3, ("position x", "position y", "position z")
 _ANGLES = ("rotation x", "rotation y", "rotation z")
 
