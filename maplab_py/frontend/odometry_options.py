@@ -8,13 +8,10 @@ from typing import ClassVar
 import numpy as np
 
 from maplab_py.errors import FlagError
-from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.options import option
 from maplab_py.vision.tracking.options import TrackingOptions
-
-CALIBRATED = ("extrinsics", "time_offset", "intrinsics", "line_delay")
-"""Groups of numbers of a calibration that can be estimated."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,8 @@ from typing import ClassVar
 from maplab_py.estimation.window.standstill import StandstillSigmas
 from maplab_py.options import option
 
+CALIBRATED = ("extrinsics", "time_offset", "intrinsics", "line_delay")
+"""Groups of numbers of a calibration that can be estimated."""
 _RIG_KEYFRAMES, _MONO_KEYFRAMES = 7, 12
 
 

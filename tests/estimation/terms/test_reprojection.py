@@ -21,7 +21,8 @@ from maplab_py.estimation.kernels.window_arguments import (
 )
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.terms.cameras import Cameras
-from maplab_py.estimation.window.calibration import KINDS, WindowCalibration
+from maplab_py.estimation.window.calibration import WindowCalibration
+from maplab_py.estimation.window.options import CALIBRATED
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.sensors.projection import project
@@ -135,7 +136,7 @@ def test_window_jacobians_by_the_calibration_and_of_late_rows_are_those_of_diffe
     T_I_C = se3.make(
         so3.exp([[-0.1, 0.3, 1.2], [-0.08, 0.3, 1.22]]), [[0.05, 0.02, -0.1], [0.1, 0, 0]]
     )
-    calibration = WindowCalibration.of((model, model), T_I_C, KINDS)
+    calibration = WindowCalibration.of((model, model), T_I_C, CALIBRATED)
     values = 0.3 * calibration.sigma * np.cos(np.arange(len(calibration)))
     poses = np.stack([se3.identity(), se3.exp([0.05, -0.1, 0.08, 0.1, -0.05, 0.15])])
     twist = np.array([[0.3, -0.2, 0.1, 0.5, -0.4, 0.8, 0.0], [0.2, 0.1, -0.3, -0.6, 0.2, 0.5, 0.0]])

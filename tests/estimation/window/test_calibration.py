@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64
-from maplab_py.estimation.window.calibration import KINDS, FoundCalibration, WindowCalibration
-from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.calibration import FoundCalibration, WindowCalibration
+from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera
@@ -71,18 +71,18 @@ def test_a_fault_is_found_within_its_deviations(tracks: SimulatedTracks, kind: s
 
 
 def test_nothing_is_found_where_nothing_is_wrong(tracks: SimulatedTracks) -> None:
-    found = found_by(tracks, WindowCalibration.of(tracks.cameras, tracks.T_I_C, KINDS))
+    found = found_by(tracks, WindowCalibration.of(tracks.cameras, tracks.T_I_C, CALIBRATED))
     assert (np.abs(found.values) <= 4.0 * found.sigma).all()
 
 
 def test_cameras_share_their_delays_and_have_names_and_units(tracks: SimulatedTracks) -> None:
     camera = tracks.cameras[0]
     T_I_C = np.tile(tracks.T_I_C[:1], (2, 1))
-    calibration = WindowCalibration.of((camera, camera), T_I_C, KINDS)
+    calibration = WindowCalibration.of((camera, camera), T_I_C, CALIBRATED)
     names = calibration.names()
     assert names.count("image delay") == names.count("line delay") == 1
     assert len(set(names)) == len(names) == len(calibration) == len(calibration.units())
-    sizes = [len(calibration.rows(kind)) for kind in KINDS]
+    sizes = [len(calibration.rows(kind)) for kind in CALIBRATED]
     assert sum(sizes) == len(calibration)
     assert sizes[:2] == [12, 1]
 
