@@ -39,6 +39,8 @@ from maplab_py.interop.recordings.protocol import (
 from maplab_py.report import counted
 
 _MAX_REMEMBERED = 1000
+_MAX_NOTED = 20
+"""Latest problems of the connection that the report repeats."""
 _CHECK_AFTER_S = 2.0
 _TELL_AFTER_S = 2.0
 """Silence that is told."""
@@ -360,6 +362,7 @@ class LiveRecording:
                     f"{name}: {counted(counts.not_later, 'message')} left out whose stamps do not come "
                     "after the one before: let its driver set header.stamp"
                 )
+        yield from dict.fromkeys(self._transport.problems[-_MAX_NOTED:])
         if self._latencies_ms:
             median, worst = np.percentile(list(self._latencies_ms), [50, 99])
             yield f"pose {median:.0f} ms after the arrival of its images (median; {worst:.0f} ms at 99 %)"

@@ -78,6 +78,7 @@ def test_damaged_and_late_messages_are_left_out_and_told(device: RecordedSensors
     messages = messages_of(content)
     for _, topic, data in messages:
         transport.send(topic, data)
+    transport.problems += ["the cable was out"] * 2
     transport.send("/imu0", messages[0][2])
     transport.send("/imu0", b"\x00\x01\x00\x00")
     stamp_ns = int(content.imu_ns[-1]) + 1_000_000
@@ -90,6 +91,7 @@ def test_damaged_and_late_messages_are_left_out_and_told(device: RecordedSensors
     assert "/imu0: 2 damaged messages left out" in notes
     assert "/imu0: 1 message left out whose stamps do not come after" in notes
     assert "/cam0/image_raw: 1 damaged message left out" in notes
+    assert notes.count("the cable was out") == 1
 
 
 class FakeImage:
