@@ -20,7 +20,7 @@ from maplab_plugins.vi_map_basic.loading import (
     load_merge_submap,
     recover,
 )
-from maplab_plugins.vi_map_basic.memory import (
+from maplab_plugins.vi_map_basic.maps import (
     clear_storage,
     copy_map,
     create_new_map,
