@@ -27,6 +27,8 @@ DEFAULT_MAX_MEGABYTES = 2000
 DEFAULT_MAX_BYTES = DEFAULT_MAX_MEGABYTES * 1_000_000
 SCRIPT_MAX_BYTES = 16_000_000
 """Of files that people write: scripts, flag files, aliases."""
+LARGEST = 1e100
+"""Numbers beyond it, whose squares overflow, are no measurements: readers of text refuse them."""
 RAISE_THE_BOUND = "raise --proto_max_size_megabytes if it is really that large"
 _CHUNK = 1 << 20
 _FIRST_CHUNK = 1 << 12

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.input_files import read_text
-from maplab_py.interop.text_table import LARGEST
+from maplab_py.input_files import LARGEST, read_text
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import LoopClosureEdges, VIMap

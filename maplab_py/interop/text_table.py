@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.input_files import read_text
+from maplab_py.input_files import LARGEST, read_text
 from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
-LARGEST = 1e100
-"""Numbers beyond it, whose squares overflow, are no measurements."""
 _AXIS, _AXES = re.compile(r"(^|[^a-z])[a-z]{0,2}[wxyz]\W*(\[.*)?$"), 3
 _ID = re.compile(r"(^|[-_. ])id$")
 _SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")

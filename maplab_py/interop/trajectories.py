@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.input_files import read_text
+from maplab_py.input_files import LARGEST, read_text
 from maplab_py.interop.stamps import POSES, read_stamps
 from maplab_py.interop.text_table import (
-    LARGEST,
     TextTable,
     format_rows,
     is_time_name,

@@ -11,6 +11,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
+from maplab_py.input_files import LARGEST
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: hand-written calibrations with four digits pass."""
@@ -224,13 +225,14 @@ def _floats(value: Any) -> Any:
 
 
 def _as_float(value: Any) -> float:
-    """Return a number, or NaN if the value is not a number."""
+    """Return a number, or NaN if the value is not a number or its square overflows."""
     if isinstance(value, bool) or value is None:
         return float("nan")
     try:
-        return float(value)
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
         return float("nan")
+    return number if abs(number) <= LARGEST else float("nan")
 
 
 def _kind(value: Any) -> str:
