@@ -18,7 +18,7 @@ ALGORITHMS = (
     Fault(
         "uphill_steps_are_kept",
         "maplab_py/estimation/problem/solver.py",
-        "        run.return_to_best()\n",
+        "    run.return_to_best()\n",
         "",
         _ESTIMATION,
     ),

@@ -40,7 +40,7 @@ STORAGE = (
     Fault(
         "map_not_flushed_to_disk",
         "maplab_py/atomic/folders.py",
-        "                flush_tree(temporary)\n",
+        "                flush_tree(temporary, on_disk)\n",
         "",
         _REPLACED_MAP,
         _ANY,
@@ -118,7 +118,7 @@ STORAGE = (
     Fault(
         "resources_lost_by_saving_over",
         "maplab_py/storage/map_saving.py",
-        "        _keep(folder, temporary)\n",
+        "        _keep(folder, temporary, on_disk)\n",
         "",
         _MAPS,
     ),
