@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
 import struct
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.input_files import read_text
+from maplab_py.interop.recordings.clocks import Run
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -39,6 +41,32 @@ _SQLITE, _SQLITE_HEADER = b"SQLite format 3\x00", 100
 _METADATA = "metadata.yaml"
 _MAX_METADATA_BYTES = 50_000_000
 _STORAGE = re.compile(r"\.(db3|mcap)(\.zstd?)?")
+
+
+IMU, ACCELEROMETER = -1, -2
+
+
+@dataclasses.dataclass(frozen=True)
+class TopicStream:
+    """One topic: the IMU's, its accelerometer's, or that of a camera."""
+
+    topic: str
+    camera: int  # row, or IMU, or ACCELEROMETER
+    time_offset_ns: int = 0
+    count: int = 0  # messages
+    first_ns: int = 0  # time of the first message
+    delay_ns: int = 0  # from its time to its arrival
+    arrivals_ns: tuple[int, int] | None = None  # of the part that is read
+
+    def of_run(self, run: Run) -> TopicStream:
+        """Return the stream that ends with a run of its clock."""
+        return dataclasses.replace(
+            self,
+            count=run.count,
+            first_ns=run.first_ns,
+            delay_ns=run.first_arrival_ns - run.first_ns,
+            arrivals_ns=(run.first_arrival_ns, run.last_arrival_ns),
+        )
 
 
 def is_bag(path: Path) -> bool:

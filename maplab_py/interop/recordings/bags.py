@@ -20,6 +20,9 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
 from maplab_py.interop.recordings.bag_files import (
+    ACCELEROMETER,
+    IMU,
+    TopicStream,
     damage_named,
     header_stamp_ns,
     imu_sample,
@@ -30,6 +33,7 @@ from maplab_py.interop.recordings.bag_files import (
 from maplab_py.interop.recordings.clocks import (
     ClockFilter,
     ClockRestart,
+    Run,
     check_common_time,
     check_dropped,
     common_part_count,
@@ -54,7 +58,6 @@ if TYPE_CHECKING:
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_IMU, _ACCELEROMETER = -1, -2
 _EXAMINED = 8
 """Messages of a topic, at most, from which its clock is known."""
 _DEFAULT = ReadingOptions()
@@ -62,29 +65,6 @@ _LARGEST_BATCH = 200
 _DELAY_MARGIN_NS = 1_000_000_000
 """Largest variation of the delay between stamp and arrival beyond that of the first messages."""
 _SEEK_MARGIN_NS = 5_000_000_000
-
-
-@dataclasses.dataclass(frozen=True)
-class _Stream:
-    """One topic: the IMU's, its accelerometer's, or that of a camera."""
-
-    topic: str
-    camera: int  # row, or _IMU, or _ACCELEROMETER
-    time_offset_ns: int = 0
-    count: int = 0  # messages
-    first_ns: int = 0  # time of the first message
-    delay_ns: int = 0  # from its time to its arrival
-    arrivals_ns: tuple[int, int] | None = None  # of the part that is read
-
-    def of_run(self, run: _Run) -> _Stream:
-        """Return the stream that ends with a run of its clock."""
-        return dataclasses.replace(
-            self,
-            count=run.count,
-            first_ns=run.first_ns,
-            delay_ns=run.first_arrival_ns - run.first_ns,
-            arrivals_ns=(run.first_arrival_ns, run.last_arrival_ns),
-        )
 
 
 class BagRecording:
@@ -127,12 +107,12 @@ class BagRecording:
                 f"--camera_topics names {len(topics)} topics, {len(device.cameras)} cameras are read"
             )
         streams = [
-            _Stream(topic, row, device.cameras[row].time_offset_ns)
+            TopicStream(topic, row, device.cameras[row].time_offset_ns)
             for row, topic in enumerate(topics)
         ]
         if device.imu is not None:
-            named = zip(imu_topics or (device.imu.topic,), (_IMU, _ACCELEROMETER), strict=False)
-            streams = [*(_Stream(topic, sensor) for topic, sensor in named), *streams]
+            named = zip(imu_topics or (device.imu.topic,), (IMU, ACCELEROMETER), strict=False)
+            streams = [*(TopicStream(topic, sensor) for topic, sensor in named), *streams]
         elif imu_topics:
             raise UserError(f"--imu_topic={','.join(imu_topics)}: the calibration has no IMU")
         with opened_bag(self._path) as reader:
@@ -181,7 +161,7 @@ class BagRecording:
                 max(run.last_ns for _, run in having),
             )
             images = sum(run.count for stream, run in having if stream.camera >= 0)
-            samples = sum(run.count for stream, run in having if stream.camera == _IMU)
+            samples = sum(run.count for stream, run in having if stream.camera == IMU)
             duration_s = (last_ns - first_ns) * 1e-9
             spans.append(PartSpan(part + 1, first_ns, duration_s, samples, images))
         return tuple(spans)
@@ -196,13 +176,13 @@ class BagRecording:
         times_ns: list[int] = []
         samples: list[tuple[float, ...]] = []
         for time_ns, stream, message in self._in_order(reader, start_ns, end_ns):
-            if stream.camera == _IMU:
+            if stream.camera == IMU:
                 times_ns.append(time_ns)
                 samples.append(message)
-            if times_ns and (stream.camera != _IMU or len(times_ns) == _LARGEST_BATCH):
+            if times_ns and (stream.camera != IMU or len(times_ns) == _LARGEST_BATCH):
                 yield self._batch(times_ns, samples)
                 times_ns, samples = [], []
-            if stream.camera != _IMU:
+            if stream.camera != IMU:
                 yield self._image(stream, time_ns, message, read_bits[stream.camera])
         if times_ns:
             yield self._batch(times_ns, samples)
@@ -223,7 +203,7 @@ class BagRecording:
         return read
 
     def _images_at(
-        self, reader: BagReader, stream: _Stream, places_ns: list[int]
+        self, reader: BagReader, stream: TopicStream, places_ns: list[int]
     ) -> Iterator[CameraImage]:
         """Yield the first image of a camera after each of some times of arrival."""
         connections = [c for c in reader.connections if c.topic == stream.topic]
@@ -236,11 +216,11 @@ class BagRecording:
 
     def _in_order(
         self, reader: BagReader, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[tuple[int, _Stream, Any]]:
+    ) -> Iterator[tuple[int, TopicStream, Any]]:
         """Yield time, stream and message in the order of time, the IMU's first among equals."""
         delays_ns = [stream.delay_ns for stream in self._streams]
         window_ns = max(delays_ns) - min(delays_ns) + _DELAY_MARGIN_NS
-        waiting: list[tuple[int, int, int, _Stream, Any]] = []
+        waiting: list[tuple[int, int, int, TopicStream, Any]] = []
         newest_ns = delivered_ns = -1
         number = itertools.count()
         restart: ClockRestart | None = None
@@ -271,7 +251,7 @@ class BagRecording:
 
     def _messages(
         self, reader: BagReader, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[tuple[int, _Stream, Any]]:
+    ) -> Iterator[tuple[int, TopicStream, Any]]:
         """Yield time, stream and message in the order of arrival, accelerations with angular rates."""
         delays_ns = [stream.delay_ns for stream in self._streams]
         begin = None if start_ns is None else start_ns + min(delays_ns) - _SEEK_MARGIN_NS
@@ -280,7 +260,7 @@ class BagRecording:
         self._clocks = [
             ClockFilter(None if begin is not None else stream.first_ns) for stream in self._streams
         ]
-        joined = PairedImu(None) if any(s.camera == _ACCELEROMETER for s in self._streams) else None
+        joined = PairedImu(None) if any(s.camera == ACCELEROMETER for s in self._streams) else None
         connections = [c for c in reader.connections if c.topic in rows]
         for connection, arrival_ns, data in reader.messages(connections, begin, end):
             row = rows[connection.topic]
@@ -310,7 +290,7 @@ class BagRecording:
                 elif joined is None:
                     yield time_ns, stream, content
                 else:
-                    sensor = GYRO if stream.camera == _IMU else ACCEL
+                    sensor = GYRO if stream.camera == IMU else ACCEL
                     for joint_ns, sample in joined.add(sensor, time_ns, content):
                         yield joint_ns, self._streams[0], sample
         for stream, clock in zip(self._streams, self._clocks, strict=True):
@@ -319,7 +299,7 @@ class BagRecording:
 
     def _pushed(
         self,
-        stream: _Stream,
+        stream: TopicStream,
         clock: ClockFilter[Any],
         stamp_ns: int,
         message: Any,
@@ -343,7 +323,7 @@ class BagRecording:
             return arrival_ns
         return header_stamp_ns(data, is_ros_2=is_ros_2)
 
-    def _check_late(self, stream: _Stream, clock: ClockFilter[Any]) -> None:
+    def _check_late(self, stream: TopicStream, clock: ClockFilter[Any]) -> None:
         check_dropped(
             f"{self._path}: {stream.topic}",
             clock.dropped,
@@ -352,11 +332,11 @@ class BagRecording:
             self._reading.max_late_share,
         )
 
-    def _runs(self) -> list[list[_Run]]:
+    def _runs(self) -> list[list[Run]]:
         """Return the runs of each stream's clock; reads the stamps of the whole bag."""
         rows = {stream.topic: row for row, stream in enumerate(self._streams)}
         clocks: list[ClockFilter[int]] = [ClockFilter(s.first_ns) for s in self._streams]
-        runs: list[list[_Run]] = [[_Run()] for _ in self._streams]
+        runs: list[list[Run]] = [[Run()] for _ in self._streams]
         with opened_bag(self._path) as reader:
             connections = [c for c in reader.connections if c.topic in rows]
             for connection, arrival_ns, data in reader.messages(connections):
@@ -365,7 +345,7 @@ class BagRecording:
                 time_ns = stamp_ns + self._streams[row].time_offset_ns
                 for ready_ns, ready_arrival_ns in clocks[row].push(time_ns, arrival_ns):
                     if clocks[row].part == len(runs[row]):
-                        runs[row].append(_Run())
+                        runs[row].append(Run())
                     runs[row][-1].add(ready_ns, ready_arrival_ns)
         return runs
 
@@ -428,8 +408,8 @@ class BagRecording:
             )
 
     def _examined(
-        self, reader: BagReader, stream: _Stream, within_ns: tuple[int, int] | None = None
-    ) -> _Stream:
+        self, reader: BagReader, stream: TopicStream, within_ns: tuple[int, int] | None = None
+    ) -> TopicStream:
         """Return the stream with the bag's name of its topic and the times of its first message.
 
         Args:
@@ -506,26 +486,9 @@ class BagRecording:
             )
         return ImuBatch.of(self.device.imu, np.array(times_ns, dtype=np.int64), values)
 
-    def _image(self, stream: _Stream, time_ns: int, message: Any, bits: int) -> CameraImage:
+    def _image(self, stream: TopicStream, time_ns: int, message: Any, bits: int) -> CameraImage:
         stamp_ns = time_ns - stream.time_offset_ns
         camera = self.device.cameras[stream.camera]
         name = f"{self._path}: {stream.topic} at {stamp_ns}"
         data = image_of_message(message, name, camera)
         return CameraImage(stream.camera, time_ns, stamp_ns, data, bits)
-
-
-@dataclasses.dataclass
-class _Run:
-    """Stamps between two starts of a clock."""
-
-    count: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    first_arrival_ns: int = 0
-    last_arrival_ns: int = 0
-
-    def add(self, time_ns: int, arrival_ns: int) -> None:
-        """Add a message."""
-        if not self.count:
-            self.first_ns, self.first_arrival_ns = time_ns, arrival_ns
-        self.count, self.last_ns, self.last_arrival_ns = self.count + 1, time_ns, arrival_ns

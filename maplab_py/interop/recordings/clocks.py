@@ -33,6 +33,23 @@ class Dropped:
     before_ns: int
 
 
+@dataclasses.dataclass
+class Run:
+    """Stamps between two starts of a clock."""
+
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    first_arrival_ns: int = 0
+    last_arrival_ns: int = 0
+
+    def add(self, time_ns: int, arrival_ns: int) -> None:
+        """Add a message."""
+        if not self.count:
+            self.first_ns, self.first_arrival_ns = time_ns, arrival_ns
+        self.count, self.last_ns, self.last_arrival_ns = self.count + 1, time_ns, arrival_ns
+
+
 class ClockFilter(Generic[T]):
     """Passes items of one sensor whose stamps increase, in the order of arrival.
 
