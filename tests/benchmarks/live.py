@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import re
 import resource
 import subprocess
 import tempfile
@@ -38,7 +39,7 @@ from tests.support.data import shared_data
 
 _LONGEST_S = 900.0
 _COLUMNS = (
-    "robot", "rate", "sets sent", "sets used", "left out", "IMU sent", "IMU left out",
+    "robot", "rate", "sets sent", "sets used", "left out", "IMU sent", "IMU lost",
     "ATE to the folder [mm]", "pose after stamp, median [ms]", "99 % [ms]",
     "processor [s]", "player late [ms]",
 )  # fmt: skip
@@ -110,9 +111,9 @@ def _print_row(*columns: object) -> None:
 
 
 def _left_out(notes: Sequence[str], about: str) -> int:
-    """Return the count that stands in the notes about something."""
-    words = [note.replace("/imu0:", "").split() for note in notes if about in note]
-    return sum(int(text[0]) for text in words if text[0].isdecimal())
+    """Return the sum of the counts with which the notes about something begin."""
+    texts = [note.removeprefix("/imu0: ") for note in notes if about in note]
+    return sum(int(count.group()) for text in texts if (count := re.search(r"\d+", text)))
 
 
 def _ate_m(expected: Path, live: Path) -> float:
