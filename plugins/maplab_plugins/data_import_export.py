@@ -13,6 +13,7 @@ from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
 if TYPE_CHECKING:
+    from maplab_py.algorithms.recording_check.findings import RecordingCheck
     from maplab_py.interop.recordings.summary import RecordingReport
     from maplab_py.vision.projection import DescriptorProjection
 
@@ -272,6 +273,53 @@ def recording_info(
         check_images=check_images,
         progress=context.progress,
     )
+
+
+@command(
+    "check_recording",
+    example="check_recording MH_01_easy",
+    see_also=("recording_info", "rovioli", "import_calibration"),
+    needs_map=False,
+    reads=("recording",),
+    writes_files=True,
+)
+def check_recording(
+    context: CommandContext,
+    recording: Path,
+    *,
+    source: SourceOptions = _SOURCE,
+    stream: StreamOptions = _STREAM,
+    apply: Path | None = None,
+    overwrite: bool = False,
+) -> RecordingCheck:
+    """Find what is wrong with a recording or its calibration before a map is made of it.
+
+    Units, axes, signs, clocks, extrinsics, scale and noise of the IMU, light, sharpness and texture of the
+    images, and the geometry of the cameras are compared with each other. Causes come before effects in
+    the table: mend the first, and check again. The status is 1 if no map can be made of the recording.
+
+    Args:
+        recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
+        apply: Write here, as sensors.yaml, the calibration with what could be determined.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.algorithms.recording_check.correction import correct
+    from maplab_py.algorithms.recording_check.doctor import diagnose, report
+    from maplab_py.interop.recordings.opening import open_recording
+    from maplab_py.output_files import check_writable, write_text
+    from maplab_py.sensors.sensors_yaml import write_sensors
+
+    if apply is not None:
+        check_writable(apply, overwrite=overwrite)
+    opened = open_recording(recording, source)
+    diagnosis = diagnose(opened, stream, progress=context.progress)
+    checked = report(diagnosis, opened)
+    if apply is None:
+        return checked
+    corrected = correct(diagnosis)
+    write_text(apply, [write_sensors(corrected.device.sensors)], overwrite=overwrite)
+    notes = (*checked.notes, *corrected.notes)
+    return dataclasses.replace(checked, sensors_file=apply, notes=notes)
 
 
 def _given(path: Path | None, flag: str) -> Path:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from maplab_py.frontend.reports import MappingReport
     from maplab_py.frontend.run_options import OutputOptions
     from maplab_py.interop.recordings.protocol import Recording
+    from maplab_py.server.submap_sources import SubmapWriter
     from maplab_py.viewer.display.viewer import Viewer
 
 _DATA = DataSourceOptions()
@@ -48,6 +49,7 @@ _DEFAULT_KEY = "rovioli"
     acts_outside=True,
     guards_effects=True,
     see_also=(
+        "check_recording",
         "recording_info",
         "optimize_visual_inertial",
         "loopclosure_all_missions",
@@ -99,13 +101,11 @@ def rovioli(
     observers: list[Observer] = []
     if rovioli_visualize_map:
         observers.append(_observer(context, key, map_publish_interval_s))
-    writer = None
+    is_live, writer = data.type in TRANSPORTS, None
     if submaps.submap_spool is not None:
         # runs of hours: the map is at the server, and what is there need not stay in memory
-        writer = SubmapWriter(submaps, forgets=data.type in TRANSPORTS and folder is None)
-    if writer is not None:
+        writer = SubmapWriter(submaps, forgets=is_live and folder is None)
         observers.append(writer)
-    is_live = data.type in TRANSPORTS
     with contextlib.ExitStack() as stack:
         is_to_end = stack.enter_context(ending_early())
         recording: Recording
@@ -127,20 +127,55 @@ def rovioli(
             status=status,
             keeps_states=not is_live or run.output.export_estimated_poses_to_csv is not None,
         )
-        mapping.run(context.progress, is_to_end=is_to_end)
+        _run_checked(context, mapping, None if is_live else recording, is_to_end)
         if writer is not None:
             writer.finish(mapping)
-        finished = finish(
-            mapping, recording.name, map_key=key, progress=context.progress, is_to_end=is_to_end
-        )
+        name, progress = recording.name, context.progress
+        finished = finish(mapping, name, map_key=key, progress=progress, is_to_end=is_to_end)
     if mapping.is_ended_early:
         _tell_end(context, finished, mapping.statistics.elapsed_s)
-    is_at_server = writer is not None and writer.pushed > 0 and writer.is_whole
-    if writer is not None and writer.pushed:
-        where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
-        context.terminal.note(f"pushed {counted(writer.pushed, 'submap')} to {where}")
+    is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
     _keep_map(context, key, finished, is_at_server=is_at_server)
     return finished.report
+
+
+def _tell_pushed(context: CommandContext, writer: SubmapWriter, submaps: SubmapOutput) -> bool:
+    """Say what has gone to the server; return whether all of the map has."""
+    if writer.pushed:
+        where = f"{submaps.submap_spool}/incoming/{submaps.robot_name}"
+        context.terminal.note(f"pushed {counted(writer.pushed, 'submap')} to {where}")
+    return writer.pushed > 0 and writer.is_whole
+
+
+def _run_checked(
+    context: CommandContext,
+    mapping: Mapping,
+    recording: Recording | None,
+    is_to_end: Callable[[], bool],
+) -> None:
+    """Look at the first seconds, run, and tell the cause where the odometry does not start.
+
+    Args:
+        context: Of the command.
+        mapping: The run.
+        recording: Its recording; None = it is live and cannot be read twice.
+        is_to_end: Tells whether the user ends the run.
+
+    Raises:
+        UserError: No map can be made of the recording.
+        EstimationError: The odometry has not started.
+    """
+    from maplab_py.algorithms.recording_check.doctor import check_first_seconds, explain_refusal
+
+    stream = mapping.options.stream
+    doubts = check_first_seconds(recording, stream) if recording is not None else ()
+    try:
+        mapping.run(context.progress, is_to_end=is_to_end)
+    except EstimationError as error:
+        if recording is None:
+            raise
+        raise EstimationError(explain_refusal(recording, stream, str(error))) from error
+    mapping.statistics.notes.extend(doubts)
 
 
 def _check_output(output: OutputOptions) -> None:

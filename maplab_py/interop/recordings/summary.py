@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from maplab_py.array_types import I64
 from maplab_py.interop.recordings.clocks import ClockRestart
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch, PartSpan, Recording
@@ -197,10 +198,7 @@ def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterato
         if not len(reference) or not len(other):
             yield f"camera {row if len(reference) else 0} has no images"
             continue
-        after = np.clip(np.searchsorted(reference, other), 1, max(len(reference) - 1, 1))
-        after = np.minimum(after, len(reference) - 1)
-        before = np.maximum(after - 1, 0)
-        apart_ns = np.minimum(np.abs(other - reference[after]), np.abs(other - reference[before]))
+        apart_ns = nearest_apart_ns(reference, other)
         apart = int(np.count_nonzero(apart_ns > options.nframe_sync_tolerance_ns))
         if apart:
             median_ms = (
@@ -211,6 +209,15 @@ def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterato
                 f"{median_ms:.3g} ms away at the median: check the trigger, or raise "
                 "--vio_nframe_sync_tolerance_ns"
             )
+
+
+def nearest_apart_ns(reference: I64, other: I64) -> I64:
+    """Return how far each of some times (N,) is from the nearest of a reference (M,), M > 0, ascending."""
+    after = np.clip(np.searchsorted(reference, other), 1, max(len(reference) - 1, 1))
+    after = np.minimum(after, len(reference) - 1)
+    before = np.maximum(after - 1, 0)
+    apart_ns = np.minimum(np.abs(other - reference[after]), np.abs(other - reference[before]))
+    return np.asarray(apart_ns, dtype=np.int64)
 
 
 def _usual_step_ns(times: Times) -> float:

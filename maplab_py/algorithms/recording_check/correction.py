@@ -1,0 +1,113 @@
+"""A calibration with what a recording has shown: mounting, time offset, line delay, scale, noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from maplab_py.algorithms.recording_check.doctor import Diagnosis
+from maplab_py.algorithms.recording_check.findings import Finding, Verdict
+from maplab_py.algorithms.recording_check.inertial_checks import measured_quiet
+from maplab_py.algorithms.recording_check.turn_checks import check_clock, check_scale
+from maplab_py.geometry import se3, so3
+from maplab_py.interop.device import RecordedSensors
+from maplab_py.sensors import CameraRig, Imu
+from maplab_py.sensors.imu import ImuIntrinsics
+
+_MENDED = (Verdict.WRONG, Verdict.NOTE)
+_AXES = np.eye(3)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Correction:
+    """A corrected calibration, and what has changed in it or must be changed elsewhere."""
+
+    device: RecordedSensors
+    notes: tuple[str, ...]
+
+
+def correct(diagnosis: Diagnosis) -> Correction:
+    """Return the calibration of a recording with what its diagnosis shows to be off.
+
+    Units and axes are of the samples, not of the calibration: they are only told.
+    """
+    device = diagnosis.signals.device
+    notes = [
+        f"not of the calibration: {finding.line}"
+        for finding in diagnosis.findings
+        if finding.verdict is Verdict.WRONG and finding.check.startswith(("unit", "axes", "sign"))
+    ]
+    if diagnosis.cameras and device.imu is not None:
+        rig, told = _corrected_rig(diagnosis)
+        imu, also = _corrected_imu(diagnosis, device.imu)
+        known = {**device.sensors.sensors, rig.id: rig, imu.id: imu}
+        device = dataclasses.replace(
+            device, sensors=dataclasses.replace(device.sensors, sensors=known)
+        )
+        notes += [*told, *also]
+    return Correction(device, tuple(notes) or ("nothing to correct",))
+
+
+def _verdicts(diagnosis: Diagnosis, beginning: str) -> list[Finding]:
+    return [f for f in diagnosis.findings if f.check.startswith(beginning) and f.verdict in _MENDED]
+
+
+def _corrected_rig(diagnosis: Diagnosis) -> tuple[CameraRig, list[str]]:
+    device, notes = diagnosis.signals.device, []
+    rig, T_B_C = device.rig, device.rig.T_B_C.copy()
+    models = list(rig.cameras)
+    is_late = check_clock(diagnosis.cameras, rig.cameras).verdict in _MENDED
+    for row, camera in enumerate(diagnosis.cameras):
+        fit = camera.hand_eye
+        if fit is None or not camera.agrees:
+            continue
+        if _verdicts(diagnosis, "rotation of the extrinsics, camera " + str(row)) or (
+            _verdicts(diagnosis, "rotation of the extrinsics") and not _is_upright(camera.axes)
+        ):
+            R = camera.axes.T @ fit.R_I_C  # of the IMU's axes as recorded
+            turn = so3.from_matrix(camera.R_I_C.T @ R)
+            T_B_C[row] = se3.compose(T_B_C[row], np.concatenate([turn, np.zeros(3)]))
+            angle = float(np.degrees(np.linalg.norm(so3.log(turn))))
+            notes.append(f"camera {row}: turned by {angle:.1f} deg (T_B_C)")
+        if is_late:
+            offset_ns = models[row].time_offset_ns + round(fit.delay_s * 1e9)
+            models[row] = dataclasses.replace(models[row], time_offset_ns=offset_ns)
+            notes.append(f"camera {row}: time offset {offset_ns * 1e-6:.1f} ms")
+        if _verdicts(diagnosis, f"shutter of camera {row}"):
+            line_ns = round(fit.readout_s * 1e9 / models[row].height_px)
+            models[row] = dataclasses.replace(
+                models[row],
+                line_delay_ns=line_ns,
+                image_delay_s=-0.5 * fit.readout_s,  # the stamp is that of the middle row
+            )
+            notes.append(f"camera {row}: line delay {line_ns} ns")
+    return dataclasses.replace(rig, cameras=tuple(models), T_B_C=T_B_C), notes
+
+
+def _corrected_imu(diagnosis: Diagnosis, imu: Imu) -> tuple[Imu, list[str]]:
+    notes: list[str] = []
+    quiet = measured_quiet(diagnosis.signals)
+    if quiet is not None:
+        units = {"acc": 1.0, "gyro": diagnosis.cameras[0].unit}
+        for name, key, measured in (
+            ("accelerometer", "acc", quiet.accel_density),
+            ("gyroscope", "gyro", quiet.gyro_density),
+        ):
+            if _verdicts(diagnosis, f"noise of the {name}"):
+                density = measured * units[key]
+                changed: dict[str, Any] = {f"{key}_noise_density": density}
+                imu = dataclasses.replace(imu, **changed)
+                notes.append(f"{key}_noise_density {density:.3g}")
+    fit = diagnosis.cameras[0].hand_eye
+    if fit is not None and check_scale(diagnosis.cameras).verdict in _MENDED:
+        known = imu.intrinsics or ImuIntrinsics()
+        scaled = dataclasses.replace(known, T_g=fit.scale * known.T_g)
+        imu = dataclasses.replace(imu, intrinsics=scaled)
+        notes.append(f"T_g times {fit.scale:.3f}")
+    return imu, notes
+
+
+def _is_upright(axes: np.ndarray) -> bool:
+    return bool(np.array_equal(axes, _AXES))

@@ -1,0 +1,236 @@
+"""The doctor: all checks of a recording, causes before effects, and the line that a run says of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from maplab_py.algorithms.recording_check.findings import (
+    Finding,
+    RecordingCheck,
+    Verdict,
+    cause,
+    ok,
+    unknown,
+)
+from maplab_py.algorithms.recording_check.image_checks import check_images
+from maplab_py.algorithms.recording_check.inertial_checks import (
+    accel_unit,
+    check_accel_axes,
+    check_accel_sign,
+    check_gyro_alone,
+    check_magnitude,
+    check_noise,
+    measured_quiet,
+    raw_axes_agree,
+)
+from maplab_py.algorithms.recording_check.rates import CameraTurns, analyse_camera
+from maplab_py.algorithms.recording_check.signals import Signals, read_signals
+from maplab_py.algorithms.recording_check.stereo import StereoFit, fit_stereo
+from maplab_py.algorithms.recording_check.timing_checks import cannot_work, check_times
+from maplab_py.algorithms.recording_check.turn_checks import (
+    check_agreement,
+    check_axes,
+    check_clock,
+    check_mounting,
+    check_scale,
+    check_shutter,
+    check_unit,
+    scale_of,
+)
+from maplab_py.array_types import F64
+from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.geometry import se3
+from maplab_py.interop.recordings.options import StreamOptions
+from maplab_py.interop.recordings.protocol import Recording
+from maplab_py.progress import SILENT, Progress
+
+QUICK_S = 4.0
+"""Seconds at the beginning that a run looks at before it starts."""
+_STEREO_PX, _SWAPPED_SHARE, _FITS_PX = 1.2, 0.5, 0.7
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Findings, and the figures behind them."""
+
+    signals: Signals
+    findings: tuple[Finding, ...]
+    cameras: tuple[CameraTurns, ...]  # none if nothing can be compared
+
+
+def diagnose(
+    recording: Recording,
+    stream: StreamOptions | None = None,
+    *,
+    first_s: float = 0.0,
+    progress: Progress = SILENT,
+) -> Diagnosis:
+    """Check a recording.
+
+    Args:
+        recording: Recording.
+        stream: Part of it, and how it is synchronised.
+        first_s: Look at so many seconds only; 0 = all.
+        progress: Told of the progress.
+
+    Raises:
+        MapError: A table of it is damaged.
+        UserError: An option is wrong.
+    """
+    stream = stream or StreamOptions()
+    stream.check()
+    signals = read_signals(recording, stream, first_s=first_s, progress=progress)
+    return diagnose_signals(signals, stream, is_whole=not first_s)
+
+
+def diagnose_signals(
+    signals: Signals, stream: StreamOptions | None = None, *, is_whole: bool = True
+) -> Diagnosis:
+    """Check signals; see `diagnose`."""
+    stream = stream or StreamOptions()
+    findings = list(check_times(signals, stream, is_whole=is_whole))
+    if cannot_work(signals, is_whole=is_whole):
+        return Diagnosis(signals, tuple(findings), ())
+    cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
+    findings += check_images(signals)
+    findings += _check_motion(signals, cameras)
+    return Diagnosis(signals, tuple(findings), cameras)
+
+
+def report(diagnosis: Diagnosis, recording: Recording) -> RecordingCheck:
+    """Return the report on a diagnosis."""
+    signals = diagnosis.signals
+    return RecordingCheck(
+        recording=recording.name,
+        duration_s=signals.duration_s,
+        checked_images=sum(len(camera.figures) for camera in signals.cameras),
+        findings=diagnosis.findings,
+        notes=(*recording.device.notes, *recording.notes),
+    )
+
+
+def first_cause(diagnosis: Diagnosis) -> Finding | None:
+    """Return what is wrong with a recording; None if nothing speaks against it."""
+    first = cause(diagnosis.findings)
+    is_grave = first is not None and first.verdict in (Verdict.WRONG, Verdict.HOPELESS)
+    return first if is_grave else None
+
+
+def check_first_seconds(recording: Recording, stream: StreamOptions) -> tuple[str, ...]:
+    """Return a line on what the first seconds show to be wrong, none if all is well.
+
+    Raises:
+        UserError: No map can be made of the recording.
+    """
+    try:
+        first = first_cause(diagnose(recording, stream, first_s=QUICK_S))
+    except MapError:
+        return ()  # whoever reads on is told, and keeps what comes before
+    if first is None:
+        return ()
+    if first.verdict is Verdict.HOPELESS:
+        raise UserError(f"{recording.name}: {first.line}")
+    return (f"first {QUICK_S:g} s: {first.line} (check_recording tells more)",)
+
+
+def explain_refusal(recording: Recording, stream: StreamOptions, reason: str) -> str:
+    """Return why odometry has not started: what is wrong with the recording, else the given reason."""
+    try:
+        first = first_cause(diagnose(recording, stream))
+    except MaplabError:
+        return reason
+    if first is None:
+        return reason
+    return (
+        f"{recording.name}: the odometry has not started: {first.line} (check_recording tells more)"
+    )
+
+
+def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
+    """Yield findings on the IMU, and on the cameras against it."""
+    first = cameras[0]
+    quiet = measured_quiet(signals)
+    accel = signals.imu.accel_gyro[:, :3] * (accel_unit(quiet) if quiet is not None else 1.0)
+    yield from check_magnitude(signals, quiet)
+    alone = None if first.agrees else check_gyro_alone(signals)
+    yield alone if alone is not None else check_agreement(first)
+    yield check_unit(first)
+    raw_agree = raw_axes_agree(signals, accel, first)
+    yield check_axes(first, raw_agree)
+    is_exchanged = not np.array_equal(first.axes, np.eye(3))
+    if not is_exchanged:  # otherwise it would only say the same again
+        axes, agree = check_accel_axes(signals, accel, first)
+        yield axes
+        if agree:
+            yield check_accel_sign(signals, accel, first)
+    yield check_clock(cameras, signals.device.cameras)
+    yield from _check_stereo(cameras, _stereo_fits(signals))
+    if not is_exchanged:
+        yield from check_mounting(cameras)
+    yield check_scale(cameras)
+    yield from check_shutter(cameras, signals.device.cameras)
+    if signals.device.imu is not None:
+        units = (accel_unit(quiet) if quiet is not None else 1.0, first.unit)
+        yield from check_noise(signals.device.imu, quiet, units)
+
+
+def _stereo_fits(signals: Signals) -> list[StereoFit | None]:
+    cameras, T_I_C = signals.device.cameras, signals.device.T_I_C
+    return [
+        fit_stereo(points, (cameras[0], cameras[row]), _pose_between(T_I_C, row))
+        for row, points in enumerate(signals.stereo, start=1)
+    ]
+
+
+def _pose_between(T_I_C: F64, row: int) -> F64:
+    return np.asarray(se3.relative(T_I_C[0], T_I_C[row]))
+
+
+def _check_stereo(
+    cameras: Sequence[CameraTurns], fits: Sequence[StereoFit | None]
+) -> Iterator[Finding]:
+    """Yield a finding on the first and each other camera that see the same."""
+    for row, fit in enumerate(fits, start=1):
+        check, expected = f"cameras 0 and {row}", f"points {_STEREO_PX:g} px from epipolar lines"
+        if fit is None:
+            yield unknown(check, "too few points that both see", expected)
+            continue
+        observed = f"{fit.as_is:.2f} px at the median of {fit.points} points"
+        if fit.as_is <= _STEREO_PX:
+            yield ok(check, observed, expected)
+        elif fit.swapped < _SWAPPED_SHARE * fit.as_is and fit.swapped < 2.0 * _STEREO_PX:
+            observed += f", {fit.swapped:.2f} px with the cameras exchanged"
+            remedy = (
+                "exchange the images or topics of the cameras, or their entries in the calibration"
+            )
+            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+        elif fit.moved < _FITS_PX:
+            observed += f", {fit.moved:.2f} px with camera {row} turned by {fit.turn_deg:.1f} deg"
+            which = _turned_camera(cameras, row)
+            remedy = f"the extrinsics of camera {which} (T_B_C, kalibr: T_cn_cnm1): calibrate the rig again"
+            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+        else:
+            observed += f", {fit.moved:.2f} px whatever their poses"
+            which = _unlike_camera(cameras, row)
+            remedy = f"the intrinsics or distortion of camera {which}: calibrate it again"
+            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+
+
+def _turned_camera(cameras: Sequence[CameraTurns], row: int) -> int:
+    """Return the camera whose mounting the gyroscope contradicts more."""
+    errors = [float(np.linalg.norm(cameras[c].mounting_error)) for c in (0, row)]
+    return 0 if errors[0] > errors[1] else row
+
+
+def _unlike_camera(cameras: Sequence[CameraTurns], row: int) -> int:
+    """Return the camera whose turns the gyroscope contradicts more, or whose points fit worse."""
+    scales = [scale_of(cameras[c]) for c in (0, row)]
+    if (scales[0] is None) != (scales[1] is None):
+        return row if scales[0] is None else 0
+    errors = [
+        fit.error_px if (fit := cameras[c].hand_eye) is not None else np.inf for c in (0, row)
+    ]
+    return 0 if errors[0] > errors[1] else row

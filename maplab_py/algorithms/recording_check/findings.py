@@ -1,0 +1,132 @@
+"""Findings of the checks, their order, and the report on a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from maplab_py.report import Report
+
+
+class Verdict(Enum):
+    """Judgement on one check."""
+
+    OK = "ok"
+    UNKNOWN = "not seen"  # the recording does not show it
+    NOTE = "note"  # works, but could be better
+    WRONG = "wrong"
+    HOPELESS = "cannot work"
+
+
+_WEIGHT = {
+    Verdict.HOPELESS: 3,
+    Verdict.WRONG: 2,
+    Verdict.NOTE: 1,
+    Verdict.OK: 0,
+    Verdict.UNKNOWN: 0,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Result of one check: what the recording shows, what it should, and what mends it."""
+
+    check: str
+    observed: str
+    expected: str
+    verdict: Verdict
+    remedy: str = ""  # names the line of the calibration or the flag
+
+    @property
+    def line(self) -> str:
+        """Return the finding in one line."""
+        text = f"{self.check}: {self.observed}, expected {self.expected}"
+        return f"{text}: {self.remedy}" if self.remedy else text
+
+
+def ok(check: str, observed: str, expected: str) -> Finding:
+    """Return a finding with which all is well."""
+    return Finding(check, observed, expected, Verdict.OK)
+
+
+def unknown(check: str, reason: str, expected: str) -> Finding:
+    """Return a finding on what the recording does not show, with the reason."""
+    return Finding(check, reason, expected, Verdict.UNKNOWN)
+
+
+def cause(findings: Sequence[Finding]) -> Finding | None:
+    """Return the finding to mend first: the first of the gravest; None where all is well.
+
+    Checks run in the order of causes: what an earlier one finds may be why a later one complains.
+    """
+    worst = max((_WEIGHT[finding.verdict] for finding in findings), default=0)
+    return next((f for f in findings if worst and _WEIGHT[f.verdict] == worst), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Row:
+    check: str
+    observed: str
+    expected: str
+    verdict: str
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shown(Report):
+    recording: str
+    duration_s: float
+    checked_images: int
+    findings: tuple[_Row, ...]
+    remedies: tuple[str, ...]
+    notes: tuple[str, ...]
+    sensors_file: Path | None
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingCheck(Report):
+    """Findings on a recording, causes before effects."""
+
+    recording: str
+    duration_s: float
+    checked_images: int
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...] = ()
+    sensors_file: Path | None = None  # that was written
+
+    @property
+    def cause(self) -> Finding | None:
+        """The finding to mend first."""
+        return cause(self.findings)
+
+    @property
+    def failure(self) -> str:
+        """Say why no map can be made of the recording; empty if nothing speaks against it."""
+        first = self.cause
+        return first.line if first is not None and first.verdict is Verdict.HOPELESS else ""
+
+    @property
+    def advice(self) -> str:
+        """Say what to mend first."""
+        first = self.cause
+        if first is None:
+            return f"rovioli {self.recording} --save_map_folder=FOLDER makes a map of it"
+        if first.verdict is Verdict.HOPELESS:
+            return ""
+        return f"first: {first.check}{': ' + first.remedy if first.remedy else ''}"
+
+    def display(self) -> Any:
+        """Return the table, with the remedies below it."""
+        rows = tuple(_Row(f.check, f.observed, f.expected, f.verdict.value) for f in self.findings)
+        remedies = tuple(f"{f.check}: {f.remedy}" for f in self.findings if f.remedy)
+        return _Shown(
+            self.recording,
+            self.duration_s,
+            self.checked_images,
+            rows,
+            remedies,
+            self.notes,
+            self.sensors_file,
+        )
