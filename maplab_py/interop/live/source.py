@@ -89,7 +89,7 @@ class LiveRecording:
         tolerance_ns: int,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Wait for the topics, and subscribe to them.
+        """Wait for the topics.
 
         Args:
             transport: Connection to the topics.
@@ -129,12 +129,19 @@ class LiveRecording:
         self._first_samples: list[F64] = []
         self._is_checked = False
         self.notes: tuple[str, ...] = ()
+        self._topics, self._is_subscribed = topics, False
         self.started_s = time.monotonic()
-        for row, topic in enumerate(topics):
+
+    def subscribe(self) -> None:
+        """Receive from now on; `items` does it, when whoever reads is ready."""
+        if self._is_subscribed:
+            return
+        self._is_subscribed, self.started_s = True, time.monotonic()
+        for row, topic in enumerate(self._topics):
             is_imu = row < len(self._imu_names)
             sensor = row if is_imu else row - len(self._imu_names)
             take = self._take_imu if is_imu else self._take_image
-            transport.subscribe(topic, partial(take, sensor, self.counts[topic.name]))
+            self._transport.subscribe(topic, partial(take, sensor, self.counts[topic.name]))
 
     def _wanted_types(self) -> list[tuple[str, ...]]:
         return [
@@ -177,6 +184,7 @@ class LiveRecording:
             raise UserError(
                 f"{self.name} is live: leave out --vio_rosbag_start_s and --vio_rosbag_end_s"
             )
+        self.subscribe()
         heard_s, has_told = time.monotonic(), False
         while not self._is_to_end():
             arrivals = self.inbox.take(LOOK_EVERY_S)

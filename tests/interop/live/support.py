@@ -96,8 +96,8 @@ def live(
     wait_s: float = 0.2,
     tell: Callable[[str], None] = lambda _: None,
 ) -> LiveRecording:
-    """Open a live recording that ends soon after the last message."""
-    return LiveRecording(
+    """Open a live recording that receives from now on, and ends soon after the last message."""
+    recording = LiveRecording(
         transport,
         device,
         source or SourceOptions(),
@@ -106,6 +106,8 @@ def live(
         tolerance_ns=500_000,
         tell=tell,
     )
+    recording.subscribe()
+    return recording
 
 
 class SmallMaster:
