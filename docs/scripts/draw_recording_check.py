@@ -43,17 +43,18 @@ def main() -> None:
 
 
 def draw(axis: plt.Axes, camera: CameraTurns, title: str) -> None:
-    """Draw the size of the rates by images and by gyroscope over ten seconds."""
-    rays, gyro = camera.rays, camera.gyro
+    """Draw the rates about the optical axis, by images and by gyroscope, over ten seconds."""
+    rays, gyro, fit = camera.rays, camera.gyro, camera.hand_eye
     assert gyro is not None
+    assert fit is not None
     middle_ns = (rays.first_ns + rays.second_ns) // 2
     shown = middle_ns > middle_ns[-1] - SECONDS * 1e9
     seconds = (middle_ns[shown] - middle_ns[shown][0]) * 1e-9
     phi = gyro.phi(rays.first_ns, rays.second_ns) - camera.bias * rays.duration_s[:, None]
-    for values, label in ((camera.turns.phi, "images"), (phi, "gyroscope")):
-        rate = np.degrees(np.linalg.norm(values, axis=1) / rays.duration_s)
+    for values, label in ((camera.turns.phi, "images"), (phi @ fit.R_I_C, "gyroscope")):
+        rate = np.degrees(values[:, 2] / rays.duration_s)
         axis.plot(seconds, rate[shown], label=label, linewidth=1.2)
-    axis.set_ylabel("turn [deg/s]")
+    axis.set_ylabel("roll [deg/s]")
     axis.set_title(title, fontsize=10)
     axis.legend(frameon=False, fontsize=8)
 

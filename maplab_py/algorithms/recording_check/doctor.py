@@ -38,7 +38,6 @@ from maplab_py.algorithms.recording_check.turn_checks import (
     check_scale,
     check_shutter,
     check_unit,
-    scale_of,
 )
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, MaplabError, UserError
@@ -49,7 +48,7 @@ from maplab_py.progress import SILENT, Progress
 
 QUICK_S = 4.0
 """Seconds at the beginning that a run looks at before it starts."""
-_STEREO_PX, _SWAPPED_SHARE, _FITS_PX = 1.2, 0.5, 0.7
+_STEREO_PX, _SWAPPED_SHARE, _FITS_PX, _UNLIKE_SCALE = 1.2, 0.5, 0.4, 0.015
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -167,9 +166,9 @@ def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[
         if agree:
             yield check_accel_sign(signals, accel, first)
     yield check_clock(cameras, signals.device.cameras)
-    yield from _check_stereo(cameras, _stereo_fits(signals))
     if not is_exchanged:
         yield from check_mounting(cameras)
+    yield from _check_stereo(cameras, _stereo_fits(signals))
     yield check_scale(cameras)
     yield from check_shutter(cameras, signals.device.cameras)
     if signals.device.imu is not None:
@@ -226,11 +225,11 @@ def _turned_camera(cameras: Sequence[CameraTurns], row: int) -> int:
 
 
 def _unlike_camera(cameras: Sequence[CameraTurns], row: int) -> int:
-    """Return the camera whose turns the gyroscope contradicts more, or whose points fit worse."""
-    scales = [scale_of(cameras[c]) for c in (0, row)]
-    if (scales[0] is None) != (scales[1] is None):
-        return row if scales[0] is None else 0
-    errors = [
-        fit.error_px if (fit := cameras[c].hand_eye) is not None else np.inf for c in (0, row)
-    ]
-    return 0 if errors[0] > errors[1] else row
+    """Return the camera whose turns have another size than the gyroscope's, or whose points fit worse."""
+    fits = [cameras[c].hand_eye for c in (0, row)]
+    if fits[0] is None or fits[1] is None:
+        return row
+    off = [abs(fit.scale - 1.0) for fit in fits if fit is not None]
+    if abs(off[0] - off[1]) > _UNLIKE_SCALE:
+        return 0 if off[0] > off[1] else row
+    return 0 if fits[0].error_px > fits[1].error_px else row
