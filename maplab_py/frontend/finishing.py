@@ -205,9 +205,9 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
             f"--imu_to_camera_time_offset_ns={_offset_ns(mapping, delays.delay_s)}"
             " to have it from the beginning (--vio_estimate=none keeps the stamps)"
         )
-    if odometry.calibration_found is not None:
-        found = odometry.calibration_found
-        words, differs = found.words(), found.differs
+    if odometry.calibration_estimate is not None:
+        estimate = odometry.calibration_estimate
+        words, differs = estimate.words(), estimate.differs
         notes.append(f"calibration by the images and the IMU, changes: {', '.join(words)}")
         if differs:
             of_map = (

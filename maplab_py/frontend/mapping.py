@@ -163,11 +163,11 @@ class Mapping:
                 self.builder.fill(backfill)
             self.builder.refine(self.odometry.window_states())
         self.odometry.find_calibration()
-        found = self.odometry.calibration_found
-        if found is None or not found.differs or not self.options.odometry.apply_calibration:
+        estimate = self.odometry.calibration_estimate
+        if estimate is None or not estimate.differs or not self.options.odometry.apply_calibration:
             return
         if self.builder is not None:
-            self.builder.calibrate(self.odometry.device.with_cameras(*found.cameras()))
+            self.builder.calibrate(self.odometry.device.with_cameras(*estimate.cameras()))
 
     @property
     def recording_notes(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.estimation.linear.threads import single_thread
-from maplab_py.estimation.window.calibration import FoundCalibration, WindowCalibration
+from maplab_py.estimation.window.calibration import CalibrationEstimate, WindowCalibration
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.map_rule import MapRule
@@ -121,7 +121,7 @@ class Odometry:
         self._calibration = WindowCalibration.of(
             device.cameras, device.T_I_C, self.options.window_states
         )
-        self.calibration_found: FoundCalibration | None = None
+        self.calibration_estimate: CalibrationEstimate | None = None
         self._backfiller = Backfiller(self._backward_smoother, is_wanted=self.options.backfill)
         self._starter: Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
@@ -389,12 +389,9 @@ class Odometry:
         self._gyro_bias = state.gyro_bias[0]
         self._speed_mps = float(np.linalg.norm(state.v_M_I[0]))
         return dataclasses.replace(
-            update,
-            status=OdometryStatus.TRACKING,
-            mission=self.counts.starts - 1,
-            interval=None,
+            update, status=OdometryStatus.TRACKING, mission=self.counts.starts - 1, interval=None,
             state=state,
-        )
+        )  # fmt: skip
 
     def _started(self, start: Start) -> BodyStates:
         """Start the smoother, and add the frames that have come since; return the newest state."""
@@ -448,12 +445,12 @@ class Odometry:
         """Keep what the window says of the calibration now, for the report and the next start."""
         if self._smoother is None or not len(self._calibration):
             return
-        found = FoundCalibration(
+        estimate = CalibrationEstimate(
             self._calibration, self._smoother.states.calibration,
             self._smoother.calibration_sigma(), 1e-9 * self._delay_ns,
         )  # fmt: skip
-        self.calibration_found = found
-        self._calibration = dataclasses.replace(self._calibration, mean=found.values)
+        self.calibration_estimate = estimate
+        self._calibration = dataclasses.replace(self._calibration, mean=estimate.values)
 
     def _smoothed(
         self, update: OdometryUpdate, frame: WindowFrame, smoother: FixedLagSmoother
@@ -470,10 +467,10 @@ class Odometry:
         update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
         if problem:
             healthy_until_ns = self._health.healthy_until_ns
-            note = self._start_again(problem)
             return dataclasses.replace(
-                update, interval=None, note=note, healthy_until_ns=healthy_until_ns
-            )
+                update, interval=None, note=self._start_again(problem),
+                healthy_until_ns=healthy_until_ns,
+            )  # fmt: skip
         self._gyro_bias = result.gyro_bias
         self._speed_mps = float(np.linalg.norm(result.v_M))
         self._backfiller.check_scale(smoother, update.stamp_ns, frame, self._buffer.samples)

@@ -194,14 +194,14 @@ def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> 
     parts = []
     for group in _GROUPS:
         if not getattr(options, group.flag):
-            parts += _found(group, report.calibration)
+            parts += _describe_values(group, report.calibration)
     return (
         f"the residuals contradict the calibration, so this was estimated: {', '.join(parts)} "
         "(--ba_calibration=fixed holds it)"
     )
 
 
-def _found(group: _Group, rows: list[CalibratedParameter]) -> list[str]:
+def _describe_values(group: _Group, rows: list[CalibratedParameter]) -> list[str]:
     """Return the largest change of a group of numbers in words."""
     label = {
         "fix_ncamera_time_offset": "image delay",
@@ -215,7 +215,7 @@ def _found(group: _Group, rows: list[CalibratedParameter]) -> list[str]:
         of_group = [row for row in of_group if "rotation" not in row.parameter]
     if not of_group:
         return []
-    row = max(of_group, key=lambda one: abs(one.after - one.before))
+    row = max(of_group, key=lambda row: abs(row.after - row.before))
     size = group.size * (row.before if group.block == INTRINSICS else 1.0)
     change, sigma = (row.after - row.before) / size, row.sigma / size
     digits = max(0, -int(np.floor(np.log10(max(sigma, 1e-3))))) if np.isfinite(sigma) else 1

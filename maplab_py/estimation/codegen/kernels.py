@@ -85,7 +85,7 @@ def _window_source() -> str:
         f"POSE, ANCHOR, LANDMARK, NUM_OUT = {_POSE}, {anchor}, {landmark}, {end}\n"
         f"DELAY, INTRINSICS = {CAMERA_DELAY_COLUMN}, {CAMERA_INTRINSICS_COLUMN}\n\n\n"
     )
-    names = ("camera", "visual_common", "window")
+    names = ("camera", "visual_common", "window_calibration", "window")
     return "\n\n".join([_HEADER + places + _camera_source(), *map(template_source, names)])
 
 

@@ -131,15 +131,15 @@ class WindowCalibration:
 
     def calibrated(self, values: F64, delay_s: float = 0.0) -> tuple[tuple[Camera, ...], F64]:
         """Return cameras and poses (C, 7) with some values (K,), of images whose frames are so late."""
-        found = self.of_kernels(values)
+        cameras_now = self.of_kernels(values)
         cameras = []
         for row, camera in enumerate(self.cameras):
             size, count = len(camera.intrinsics), len(camera.distortion_parameters)
-            numbers = found.parameters[row, 1 : 1 + size + count]
-            lateness_s = float(found.timing_s[row, 0]) - delay_s
+            numbers = cameras_now.parameters[row, 1 : 1 + size + count]
+            lateness_s = float(cameras_now.timing_s[row, 0]) - delay_s
             line_delay_ns = camera.line_delay_ns
             if self.columns[row, CAMERA_DELAY_COLUMN + 1] >= 0:
-                line_delay_ns = round(1e9 * float(found.timing_s[row, 1]))
+                line_delay_ns = round(1e9 * float(cameras_now.timing_s[row, 1]))
             cameras.append(
                 dataclasses.replace(
                     camera,
@@ -149,7 +149,7 @@ class WindowCalibration:
                     line_delay_ns=line_delay_ns,
                 )
             )
-        return tuple(cameras), found.T_I_C
+        return tuple(cameras), cameras_now.T_I_C
 
     def with_delay(self, delay_s: float) -> WindowCalibration:
         """Return the calibration that begins with a delay of the middle rows of images, if it is a state."""
@@ -191,8 +191,8 @@ class WindowCalibration:
             "line_delay": (CAMERA_DELAY_COLUMN + 1, CAMERA_DELAY_COLUMN + 2),
             "intrinsics": (CAMERA_INTRINSICS_COLUMN, self.columns.shape[1]),
         }[kind]
-        found = np.unique(self.columns[:, first:last])
-        return found[found >= 0]
+        columns = np.unique(self.columns[:, first:last])
+        return columns[columns >= 0]
 
     def units(self) -> list[tuple[float, str]]:
         """Return by what each of the states (K) is multiplied to be shown, and its unit."""
@@ -245,7 +245,7 @@ def _sigmas_of(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FoundCalibration:
+class CalibrationEstimate:
     """Estimate of the calibration by a window."""
 
     calibration: WindowCalibration

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from enum import Enum
 
-from maplab_py.array_types import F64, I32, I64
+import numpy as np
+
+from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import UserError
 
 
@@ -40,6 +42,36 @@ class WindowFrame:
         counts = {len(x) for x in (self.camera, self.track_id, self.uv_px, self.sigma_px)}
         if len(counts) > 1 or len(self.imu_times_ns) != len(self.accel_gyro):
             raise UserError(f"the columns of the frame at {self.time_ns} ns differ in length")
+
+
+@dataclasses.dataclass(eq=False)
+class FrameRows:
+    """Columns of the F frames in a window that are not estimated, in the order of time."""
+
+    time_ns: I64 = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    is_keyframe: Mask = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    is_resting: Mask = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    """Frames at rest, or that surely turn on the spot."""
+    is_turning: Mask = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    rate_I: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))  # as measured
+    delay_s: F64 = dataclasses.field(default_factory=lambda: np.zeros(0))
+
+    def append(
+        self, frame: WindowFrame, *, is_keyframe: bool, is_resting: bool, is_turning: bool
+    ) -> None:
+        """Add a later frame."""
+        self.time_ns = np.append(self.time_ns, frame.time_ns)
+        self.is_keyframe = np.append(self.is_keyframe, is_keyframe)
+        self.is_resting = np.append(self.is_resting, is_resting)
+        self.is_turning = np.append(self.is_turning, is_turning)
+        rate_I = frame.accel_gyro[-1:, 3:] if len(frame.accel_gyro) else np.zeros((1, 3))
+        self.rate_I = np.concatenate([self.rate_I, rate_I])
+        self.delay_s = np.append(self.delay_s, frame.delay_s)
+
+    def remove(self, frame: int) -> None:
+        """Remove a frame."""
+        for field in dataclasses.fields(self):
+            setattr(self, field.name, np.delete(getattr(self, field.name), frame, axis=0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

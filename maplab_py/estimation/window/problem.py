@@ -24,7 +24,7 @@ from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibratio
 from maplab_py.estimation.window.factors import EVERY, FrameFactors, Part
 from maplab_py.estimation.window.map_terms import MapElimination, MapTerms
 from maplab_py.estimation.window.prior import WindowPrior
-from maplab_py.estimation.window.states import WindowStates
+from maplab_py.estimation.window.states import WindowStates, scale_sigma
 
 _SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 _LANDMARK_DAMPING, _NEARLY_UNDAMPED = 1e-12, 1e-4
@@ -182,6 +182,30 @@ class WindowProblem:
         """
         first = FRAME_SIZE * linear.kept.Y.shape[1]
         return self._covariance(linear, first + np.arange(len(self._calibration)))
+
+    def newest_covariance(self, states: WindowStates) -> F64:
+        """Return the covariance (15, 15) of the newest frame; infinite = unknown."""
+        try:
+            return self.covariance(self.undamped_near(states), len(states) - 1)
+        except NotPositiveDefinite:
+            return np.full((FRAME_SIZE, FRAME_SIZE), np.inf)
+
+    def scale_sigma(self, states: WindowStates) -> float:
+        """Return the standard deviation of the scale of the positions, as a share; infinite = unknown."""
+        try:
+            covariance = self.covariance_of_frames(self.undamped_near(states))
+        except NotPositiveDefinite:
+            return float("inf")
+        size = FRAME_SIZE * len(states)
+        return scale_sigma(states.T_M_I[:, 4:], covariance[:size, :size])
+
+    def calibration_sigma(self, states: WindowStates) -> F64:
+        """Return the standard deviations (K,) of the calibration; infinite = unknown."""
+        try:
+            covariance = self.covariance_of_calibration(self.undamped_near(states))
+        except NotPositiveDefinite:
+            return np.full(len(self._calibration), np.inf)
+        return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
 
     def _covariance(self, linear: WindowLinearization, rows: I64) -> F64:
         matrix = linear.system.matrix.copy()

@@ -17,8 +17,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
-from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, WindowPoint
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.kernels.window_arguments import WindowPoint
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, SolverSummary, optimize_states
 from maplab_py.estimation.symbolic import sources
@@ -26,7 +25,7 @@ from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibratio
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
-from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
+from maplab_py.estimation.window.frame import FrameRows, Motion, StartState, WindowFrame
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.keyframes import needs_keyframe
 from maplab_py.estimation.window.map_terms import MapTerms
@@ -35,10 +34,10 @@ from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.standstill import Standstill
-from maplab_py.estimation.window.states import WindowStates, scale_sigma
+from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
-from maplab_py.estimation.window.turning import is_surely_on_the_spot, shows_parallax
+from maplab_py.estimation.window.turning import is_on_the_spot, shows_parallax
 from maplab_py.estimation.window.update import ReleasedStates, WindowUpdate
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Camera, Imu
@@ -66,19 +65,19 @@ class FixedLagSmoother:
         options: WindowOptions,
         calibration: WindowCalibration | None = None,
     ) -> None:
-        """Prepare kernels.
+        """Prepare kernels for cameras at T_I_C (C, 7) and an IMU.
 
         Args:
-            cameras: The cameras.
-            T_I_C: Their poses (C, 7).
-            imu: The IMU.
-            options: See there.
+            cameras, T_I_C, imu, options: See above.
             calibration: Of the same cameras, with what of it is estimated; None = nothing.
         """
         self.calibration = calibration or WindowCalibration.of(cameras, T_I_C)
         self._cameras = self.calibration.of_kernels(self.calibration.mean)
         self.options = options
         self._keyframes_kept = options.keyframes_kept(len(cameras))
+        self._solver = SolverOptions(
+            num_iterations=options.num_iterations, function_tolerance=options.function_tolerance
+        )
         self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, self.calibration)
         self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
@@ -88,12 +87,7 @@ class FixedLagSmoother:
         self.tracks = Tracks()
         self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
         self.newest_covariance: F64 = np.full((15, 15), np.inf)  # order [p, theta, v, b_g, b_a]
-        self._time_ns: I64 = np.zeros(0, dtype=np.int64)
-        self._is_keyframe: Mask = np.zeros(0, dtype=np.bool_)
-        self._is_resting: Mask = np.zeros(0, dtype=np.bool_)  # or surely turns on the spot
-        self._is_turning: Mask = np.zeros(0, dtype=np.bool_)
-        self._rate_I: F64 = np.zeros((0, 3))  # as measured
-        self._delay_s: F64 = np.zeros(0)
+        self._frames = FrameRows()
         self._states = WindowStates(np.zeros((0, 7)), np.zeros((0, 9)), np.zeros((0, 3)))
         self._stage_ms: dict[str, float] = {}
         self._released: list[tuple[int, F64, F64]] = []
@@ -112,8 +106,7 @@ class FixedLagSmoother:
         self._prior = WindowPrior.of_state(
             T_M_I, motion, np.asarray(state.sigma), (mean, self.calibration.sigma)
         )
-        none = np.zeros((0, 3))
-        self._states = WindowStates(T_M_I[None], motion[None], none, calibration=mean)
+        self._states = WindowStates(T_M_I[None], motion[None], np.zeros((0, 3)), calibration=mean)
         self._take_calibration()
         self._append_frame(frame, is_keyframe=True)
         self._see(frame)
@@ -136,28 +129,22 @@ class FixedLagSmoother:
                 self._gate_new()
                 self._triangulate(frame.motion)
             with self._stage("optimise"):
-                map_terms = self._map_terms()
+                map_terms = self._map_terms()  # it takes tracks from the odometry's landmarks
                 problem, rows, order = self._problem(self.tracks.landmark_rows, map_terms)
-                self._states, summary = optimize_states(
-                    problem, self._states, self._solver_options(), SILENT
-                )
+                self._states, summary = optimize_states(problem, self._states, self._solver, SILENT)
                 self.tracks.h[rows] = self._states.h
                 self._take_calibration()
                 self._take_map_states()
             with self._stage("covariance"):
-                covariance = self._covariance(problem)
-                self.newest_covariance = covariance
+                self.newest_covariance = self._covariance(problem)
             with self._stage("outliers"):
                 error_px = self._remove_outliers(problem, order)
             with self._stage("slide"):
                 newest = self._states.T_M_I[-1], self._states.motion[-1]
-                self._is_keyframe[-1] = self._decide(frame.motion)
-                is_keyframe = bool(self._is_keyframe[-1])
+                self._frames.is_keyframe[-1] = is_keyframe = self._decide(frame.motion)
                 self._slide()
         used = len(rows), len(order)
-        return self._update(
-            frame, newest, covariance, error_px, summary, used, is_keyframe=is_keyframe
-        )
+        return self._update(frame, newest, error_px, summary, used, is_keyframe=is_keyframe)
 
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places p_M (L, 3) of the landmarks in the window that are not too far."""
@@ -178,12 +165,12 @@ class FixedLagSmoother:
     @property
     def times_ns(self) -> I64:
         """Times (F,) of the frames in the window."""
-        return self._time_ns
+        return self._frames.time_ns
 
     @property
     def is_keyframe(self) -> Mask:
         """Frames (F,) that are, or will become, keyframes."""
-        return self._is_keyframe
+        return self._frames.is_keyframe
 
     @property
     def median_depth_m(self) -> float:
@@ -192,31 +179,17 @@ class FixedLagSmoother:
 
     def scale_sigma(self) -> float:
         """Return the standard deviation of the scale of the window, as a share; infinite = unknown."""
-        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
-        try:
-            linear = problem.undamped_near(self._states)
-            covariance = problem.covariance_of_frames(linear)
-        except NotPositiveDefinite:
-            return float("inf")
-        size = FRAME_SIZE * len(self._states)
-        return scale_sigma(self._states.T_M_I[:, 4:], covariance[:size, :size])
+        return self.problem()[0].scale_sigma(self._states)
 
     def calibration_sigma(self) -> F64:
         """Return the standard deviations (K,) of the calibration; infinite = unknown."""
         if not len(self.calibration) or not len(self._states):
             return self.calibration.sigma
-        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
-        try:
-            linear = problem.undamped_near(self._states)
-            covariance = problem.covariance_of_calibration(linear)
-        except NotPositiveDefinite:
-            return np.full(len(self.calibration), np.inf)
-        return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        return self.problem()[0].calibration_sigma(self._states)
 
     def problem(self) -> tuple[WindowProblem, WindowStates]:
         """Return the least-squares problem of the window as it is now, and its states."""
-        problem, _, _ = self._problem(self.tracks.landmark_rows, self._map_terms())
-        return problem, self._states
+        return self._problem(self.tracks.landmark_rows, self._map_terms())[0], self._states
 
     # -- a new frame ------------------------------------------------------------------------------
 
@@ -235,12 +208,12 @@ class FixedLagSmoother:
         motion = self._states.motion[-1]
         self._chain.append(times_ns, accel_gyro, motion, is_resting=is_resting)
         if is_resting:
-            self._is_resting[-1] = True
+            self._frames.is_resting[-1] = True
         T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)
         self._states = self._states.with_frame(T_M_I, new_motion)
         self._prior = self._prior.with_frame(T_M_I, new_motion)
         if frame.motion is Motion.TURNING and shows_parallax(
-            frame, self._time_ns, self.tracks, self._states.T_M_I, self._cameras.T_I_C,
+            frame, self._frames.time_ns, self.tracks, self._states.T_M_I, self._cameras.T_I_C,
             self._back_projection,
         ):  # fmt: skip
             frame = dataclasses.replace(frame, motion=Motion.MOVING)
@@ -249,30 +222,22 @@ class FixedLagSmoother:
 
     def _may_replace(self, frame: WindowFrame) -> bool:
         """Tell whether the latest frame rests, too, and the joined interval is not too long."""
-        if len(self._states) < 2 or not self._chain.is_resting[-1] or self._is_keyframe[-1]:
+        if len(self._states) < 2 or not self._chain.is_resting[-1] or self._frames.is_keyframe[-1]:
             return False
-        duration_ns = frame.time_ns - int(self._time_ns[-2])
-        return duration_ns * 1e-9 <= self.options.max_joined_s
+        return (frame.time_ns - self._frames.time_ns[-2]) * 1e-9 <= self.options.max_joined_s
 
     def _append_frame(self, frame: WindowFrame, *, is_keyframe: bool) -> None:
-        speed = float(np.linalg.norm(self._states.motion[-1, :3]))
-        turns = frame.motion is Motion.TURNING and speed <= self.options.turning_max_mps
-        is_sure = turns and is_surely_on_the_spot(
+        turns, is_sure = is_on_the_spot(
             frame, self._states.motion[-1], self.newest_covariance, self.options
         )
-        self._time_ns = np.append(self._time_ns, frame.time_ns)
-        self._is_keyframe = np.append(self._is_keyframe, is_keyframe)
-        self._is_resting = np.append(self._is_resting, frame.motion is Motion.RESTING or is_sure)
-        self._is_turning = np.append(self._is_turning, turns)
-        rate_I = frame.accel_gyro[-1:, 3:] if len(frame.accel_gyro) else np.zeros((1, 3))
-        self._rate_I = np.concatenate([self._rate_I, rate_I])
-        self._delay_s = np.append(self._delay_s, frame.delay_s)
+        rests = frame.motion is Motion.RESTING or is_sure
+        self._frames.append(frame, is_keyframe=is_keyframe, is_resting=rests, is_turning=turns)
 
     def _see(self, frame: WindowFrame) -> None:
         """Add the observations of the newest frame."""
         rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
         if self.calibration.has_lateness:
-            rate_I = self._rate_I[-1] - self._states.gyro_bias[-1]
+            rate_I = self._frames.rate_I[-1] - self._states.gyro_bias[-1]
             rays = self.calibration.rays_at_frame(frame, rays, self._cameras, rate_I)
         nothing = np.zeros(len(rays), dtype=np.int64)
         seen = Observations(
@@ -280,8 +245,9 @@ class FixedLagSmoother:
             np.asarray(frame.uv_px, dtype=np.float64),
             np.asarray(frame.sigma_px, dtype=np.float64), rays,
         )  # fmt: skip
-        newest = len(self._states) - 1
-        self.tracks.add(newest, frame.track_id[valid].astype(np.int64), seen.take(valid))
+        self.tracks.add(
+            len(self._states) - 1, frame.track_id[valid].astype(np.int64), seen.take(valid)
+        )
 
     def _gate_new(self) -> None:
         """Remove observations of the newest frame far from where landmarks are expected.
@@ -338,7 +304,9 @@ class FixedLagSmoother:
     ) -> tuple[WindowProblem, I64, I64]:
         """Return the problem with some landmarks, their rows, and its observations' rows."""
         data, order = self.tracks.data(rows, self.options.huber_sigmas)
-        factors = FrameFactors(self._chain, self._standstill, self._is_resting, self._is_turning)
+        factors = FrameFactors(
+            self._chain, self._standstill, self._frames.is_resting, self._frames.is_turning
+        )
         problem = WindowProblem(
             self._kernels, data, self.calibration, factors, self._prior,
             keep_first_estimates=self.options.keep_first_estimates, map_terms=map_terms,
@@ -350,7 +318,7 @@ class FixedLagSmoother:
     def _times(self) -> FrameTimes | None:
         if not self.calibration.has_lateness:
             return None
-        return FrameTimes(self._rate_I, self._delay_s)
+        return FrameTimes(self._frames.rate_I, self._frames.delay_s)
 
     def _point(self) -> WindowPoint:
         """Return frames and cameras as kernels read them."""
@@ -364,18 +332,8 @@ class FixedLagSmoother:
             self._cameras = self.calibration.of_kernels(self._states.calibration)
             self._back_projection.parameters = self._cameras.parameters
 
-    def _solver_options(self) -> SolverOptions:
-        return SolverOptions(
-            num_iterations=self.options.num_iterations,
-            function_tolerance=self.options.function_tolerance,
-        )
-
     def _covariance(self, problem: WindowProblem) -> F64:
-        try:
-            linear = problem.undamped_near(self._states)
-            return problem.covariance(linear, len(self._states) - 1)
-        except NotPositiveDefinite:
-            return np.full((15, 15), np.inf)
+        return problem.newest_covariance(self._states)
 
     def _remove_outliers(self, problem: WindowProblem, order: I64) -> float:
         """Remove observations with errors beyond the gate; return the median error [px]."""
@@ -388,11 +346,9 @@ class FixedLagSmoother:
         return float(np.median(error))
 
     def _remove(self, observations: I64) -> None:
-        if not len(observations):
-            return
-        is_removed: Mask = np.zeros(len(self.tracks.observations), dtype=np.bool_)
-        is_removed[observations] = True
-        self.tracks.remove_observations(is_removed, self._poses())
+        if len(observations):
+            is_removed = np.isin(np.arange(len(self.tracks.observations)), observations)
+            self.tracks.remove_observations(is_removed, self._poses())
 
     # -- what a localised smoother adds -----------------------------------------------------------
 
@@ -420,7 +376,7 @@ class FixedLagSmoother:
         """Tell whether the newest frame becomes a keyframe."""
         if motion is Motion.RESTING:
             return False
-        last = int(np.flatnonzero(self._is_keyframe)[-1])
+        last = int(np.flatnonzero(self._frames.is_keyframe)[-1])
         return needs_keyframe(
             self.tracks, self._states.T_M_I, self._cameras.T_I_C, last, self.options
         )
@@ -431,7 +387,7 @@ class FixedLagSmoother:
         if options.follows_thesis:
             self._marginalize_used()
         leaving = len(self._states) - options.num_recent_frames
-        if leaving > 0 and not self._is_keyframe[leaving]:
+        if leaving > 0 and not self._frames.is_keyframe[leaving]:
             self._drop(leaving)
         elif leaving >= self._keyframes_kept:
             self._marginalize_first()
@@ -478,11 +434,7 @@ class FixedLagSmoother:
         Source: Schneider 2019, Paper I, sections 3.3 and 3.4.
         """
         tracks = self.tracks
-        tracks.is_persistent &= tracks.is_landmark & tracks.is_active
-        others = np.flatnonzero(tracks.is_landmark & tracks.is_active & ~tracks.is_persistent)
-        order = np.argsort(-tracks.counts()[others], kind="stable")
-        room = self.options.thesis_persistent_landmarks - np.count_nonzero(tracks.is_persistent)
-        tracks.is_persistent[others[order[: max(room, 0)]]] = True
+        tracks.make_persistent(self.options.thesis_persistent_landmarks)
         rows = np.flatnonzero(tracks.is_landmark & ~tracks.is_persistent)
         if len(rows):
             self._marginalize(rows, None)
@@ -498,16 +450,12 @@ class FixedLagSmoother:
 
     def _release(self, frame: int) -> None:
         states = self._states
-        self._released.append(
-            (int(self._time_ns[frame]), states.T_M_I[frame], states.motion[frame])
-        )
+        time_ns = int(self._frames.time_ns[frame])
+        self._released.append((time_ns, states.T_M_I[frame], states.motion[frame]))
 
     def _forget_frame(self, frame: int) -> None:
         self._states = self._states.without_frame(frame)
-        for name in (
-            "_time_ns", "_is_keyframe", "_is_resting", "_is_turning", "_rate_I", "_delay_s",
-        ):  # fmt: skip
-            setattr(self, name, np.delete(getattr(self, name), frame, axis=0))
+        self._frames.remove(frame)
 
     def _poses(self) -> CameraPoses:
         return CameraPoses.of(self._states.T_M_I, self._cameras.T_I_C)
@@ -524,7 +472,6 @@ class FixedLagSmoother:
         self,
         frame: WindowFrame,
         newest: tuple[F64, F64],
-        covariance: F64,
         error_px: float,
         summary: SolverSummary,
         used: tuple[int, int],
@@ -538,7 +485,7 @@ class FixedLagSmoother:
             v_M=motion[:3],
             gyro_bias=motion[3:6],
             accel_bias=motion[6:],
-            covariance=covariance,
+            covariance=self.newest_covariance,
             is_keyframe=is_keyframe,
             num_frames=len(self._states),
             num_landmarks=used[0],

@@ -210,6 +210,15 @@ class Tracks:
         kept = self.is_landmark[rows]
         self.make_landmarks(rows[kept], p_M[kept], poses)
 
+    def make_persistent(self, wanted: int) -> None:
+        """Let the landmarks seen most that are still tracked stay, until there are as many as wanted."""
+        may_stay = self.is_landmark & self.is_active
+        self.is_persistent &= may_stay
+        others = np.flatnonzero(may_stay & ~self.is_persistent)
+        order = np.argsort(-self.counts()[others], kind="stable")
+        room = wanted - np.count_nonzero(self.is_persistent)
+        self.is_persistent[others[order[: max(room, 0)]]] = True
+
     def remove_frame(self, frame: int, poses: CameraPoses, rows: I64 | None = None) -> None:
         """Remove a frame with its observations, and those of some tracks; later frames move down."""
         is_removed = self.observations.frame == frame

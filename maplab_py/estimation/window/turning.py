@@ -7,7 +7,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
-from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.tracks import Tracks
 
@@ -62,10 +62,10 @@ def shows_parallax(
     return bool(np.median(angle) >= np.radians(_LEAST_PARALLAX_DEG) + by_turn)
 
 
-def is_surely_on_the_spot(
+def is_on_the_spot(
     frame: WindowFrame, motion: F64, covariance: F64, options: WindowOptions
-) -> bool:
-    """Tell whether a frame turns, with a velocity that is well known to be zero.
+) -> tuple[bool, bool]:
+    """Tell whether a frame turns on the spot, and whether that is sure: at a speed well known to be zero.
 
     Args:
         frame: The frame, with the samples that lead to it.
@@ -74,14 +74,16 @@ def is_surely_on_the_spot(
         options: Thresholds.
     """
     v_M, gyro_bias = motion[:3], motion[3:6]
+    speed_mps = float(np.linalg.norm(v_M))
+    if frame.motion is not Motion.TURNING or speed_mps > options.turning_max_mps:
+        return False, False
     rate = np.mean(frame.accel_gyro[:, 3:], axis=0) - gyro_bias
     covariance = covariance[6:9, 6:9]
     if not np.isfinite(covariance).all():
-        return False
+        return True, False
     variance = np.linalg.eigvalsh(covariance)
     if variance[0] <= 0.0 or variance[-1] > options.turning_max_sigma_mps**2:
-        return False
+        return True, False
     distance = float(v_M @ np.linalg.solve(covariance, v_M))
-    return distance <= options.gate_chi2 and (
-        float(np.linalg.norm(rate)) >= options.turning_min_radps
-    )
+    is_fast = float(np.linalg.norm(rate)) >= options.turning_min_radps
+    return True, distance <= options.gate_chi2 and is_fast

@@ -12,7 +12,7 @@ from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flags import Flag
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
-_MAX_FOUND = 12
+_MAX_MATCHES = 12
 _MAX_FLAGS = 2
 
 
@@ -56,7 +56,7 @@ class CommandIndex(Report):
 
 
 @dataclasses.dataclass(frozen=True)
-class FoundLine:
+class MatchLine:
     """A command that has something to do with the words of a search."""
 
     command: str
@@ -65,10 +65,10 @@ class FoundLine:
 
 
 @dataclasses.dataclass(frozen=True)
-class FoundCommands(Report):
-    """Commands found by words of their names, flags and help; the best first."""
+class MatchingCommands(Report):
+    """Commands whose names, flags or help have the words of a search; the best first."""
 
-    found: tuple[FoundLine, ...]
+    commands: tuple[MatchLine, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +131,7 @@ def show_help(
     plugin: str = "",
     all_: bool = False,
     command_filter: str = "",
-) -> CommandIndex | CommandPage | CommandPages | FoundCommands:
+) -> CommandIndex | CommandPage | CommandPages | MatchingCommands:
     """List common tasks and the commands, explain one command, or search for words.
 
     Words that are no command are searched in names, flags and help of all commands.
@@ -168,20 +168,22 @@ def show_help(
     return CommandIndex(() if plugin or wanted else TASKS, groups)
 
 
-def _explain(context: CommandContext, words: tuple[str, ...]) -> CommandPage | FoundCommands:
+def _explain(context: CommandContext, words: tuple[str, ...]) -> CommandPage | MatchingCommands:
     """Return the page of a command, or the commands that have to do with the words."""
     registry = context.session.registry
     if len(words) == 1 and registry.knows(words[0]):
         return _page(context, words[0])
     wanted = " ".join(words).lower().split()
     scores = {c.name: sum(_match(c, w) for w in wanted) for c in registry.commands}
-    found = [c for c in registry.commands if scores[c.name] and all(_match(c, w) for w in wanted)]
-    if not found:
+    matching = [
+        c for c in registry.commands if scores[c.name] and all(_match(c, w) for w in wanted)
+    ]
+    if not matching:
         if len(words) == 1:
             registry.find(words[0])  # it names similar commands, or where to look
         raise UserError(f"help: no command has to do with '{' '.join(words)}' (see: help)")
-    best = sorted(found, key=lambda c: (-scores[c.name], c.name))[:_MAX_FOUND]
-    return FoundCommands(tuple(_found_line(c, wanted) for c in best))
+    best = sorted(matching, key=lambda c: (-scores[c.name], c.name))[:_MAX_MATCHES]
+    return MatchingCommands(tuple(_match_line(c, wanted) for c in best))
 
 
 def _match(described: Command, word: str) -> int:
@@ -205,14 +207,14 @@ def _help_of(flag: Flag) -> str:
     return f"{flag.name} {flag.help} {flag.type.text}"
 
 
-def _found_line(described: Command, wanted: list[str]) -> FoundLine:
+def _match_line(described: Command, wanted: list[str]) -> MatchLine:
     flags = [
         f"--{flag.name}"
         for flag in described.flags.values()
         if any(_has(_help_of(flag), word) for word in wanted)
     ]
     more = [f"and {len(flags) - _MAX_FLAGS} more"] if len(flags) > _MAX_FLAGS else []
-    return FoundLine(described.name, ", ".join(flags[:_MAX_FLAGS] + more), described.summary)
+    return MatchLine(described.name, ", ".join(flags[:_MAX_FLAGS] + more), described.summary)
 
 
 def _page(context: CommandContext, name: str) -> CommandPage:

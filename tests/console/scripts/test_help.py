@@ -27,12 +27,12 @@ def session() -> Session:
     ],
 )
 def test_words_find_commands(session: Session, words: tuple[str, ...], first: str) -> None:
-    assert session.help(*words).found[0].command == first
+    assert session.help(*words).commands[0].command == first
 
 
 def test_the_beginning_of_a_word_counts_but_no_part_in_it(session: Session) -> None:
-    found = session.help("tum").found  # as in frustum
-    assert "visualize_mesh" not in [line.command for line in found]
+    names = [line.command for line in session.help("tum").commands]
+    assert "visualize_mesh" not in names  # its flags say frustum
 
 
 def test_a_command_has_its_page_and_one_that_is_misspelt_a_proposal(session: Session) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64
-from maplab_py.estimation.window.calibration import FoundCalibration, WindowCalibration
+from maplab_py.estimation.window.calibration import CalibrationEstimate, WindowCalibration
 from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import se3
@@ -39,7 +39,7 @@ def with_fault(tracks: SimulatedTracks, kind: str) -> tuple[tuple[Camera, ...], 
     return tuple(dataclasses.replace(c, intrinsics=c.intrinsics * scale) for c in cameras), T_I_C
 
 
-def found_by(tracks: SimulatedTracks, calibration: WindowCalibration) -> FoundCalibration:
+def estimate_by(tracks: SimulatedTracks, calibration: WindowCalibration) -> CalibrationEstimate:
     smoother = FixedLagSmoother(
         calibration.cameras, calibration.T_I_C, tracks.imu, WindowOptions(), calibration
     )
@@ -47,13 +47,13 @@ def found_by(tracks: SimulatedTracks, calibration: WindowCalibration) -> FoundCa
     for frame in tracks.frames[1:]:
         smoother.add(frame)
     values = smoother.states.calibration
-    return FoundCalibration(calibration, values, smoother.calibration_sigma(), 0.0)
+    return CalibrationEstimate(calibration, values, smoother.calibration_sigma(), 0.0)
 
 
 @pytest.mark.parametrize("kind", list(FAULTS))
 def test_a_fault_is_found_within_its_deviations(tracks: SimulatedTracks, kind: str) -> None:
     calibration = WindowCalibration.of(*with_fault(tracks, kind), (kind,))
-    found = found_by(tracks, calibration)
+    found = estimate_by(tracks, calibration)
     cameras, T_I_C = found.cameras()
     assert found.differs
     assert all(word for word in found.words())
@@ -71,7 +71,7 @@ def test_a_fault_is_found_within_its_deviations(tracks: SimulatedTracks, kind: s
 
 
 def test_nothing_is_found_where_nothing_is_wrong(tracks: SimulatedTracks) -> None:
-    found = found_by(tracks, WindowCalibration.of(tracks.cameras, tracks.T_I_C, CALIBRATED))
+    found = estimate_by(tracks, WindowCalibration.of(tracks.cameras, tracks.T_I_C, CALIBRATED))
     assert (np.abs(found.values) <= 4.0 * found.sigma).all()
 
 
