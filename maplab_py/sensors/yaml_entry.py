@@ -140,7 +140,7 @@ class Entry:
             return default
         value = _as_float(self.raw(key))
         if not np.isfinite(value):
-            raise MapError(f"{self.where}: key '{key}' must be a finite number")
+            raise MapError(f"{self.where}: key '{key}' must be a finite number below {LARGEST:g}")
         if positive and value <= 0.0:
             raise MapError(f"{self.where}: key '{key}' must be positive, not {value:g}")
         return value

@@ -121,7 +121,7 @@ def test_keys_are_read_or_named(
         ("line_delay: 30", "30 s"),
         ("line_delay: 0.1", "a line delay of 0.1 s is 4.8 s for 48 rows"),
         ("timeshift_cam_imu: 4000000", "'timeshift_cam_imu': 4e.06 s: it must be below 10 s"),
-        ("timeshift_cam_imu: 1e300", "it must be below 10 s"),
+        ("timeshift_cam_imu: 1e300", "must be a finite number below 1e.100"),
     ],
 )
 @pytest.mark.parametrize("form", ["kalibr", "euroc"])
