@@ -9,6 +9,7 @@ to neighbours).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -20,6 +21,10 @@ _WINDOW = 60
 """Number of closures before and after each closure, by arc length, that it is compared with."""
 _REACH_M = 15.0
 """Maximum arc length between compared closures."""
+_NEAR_M = 3.0
+"""Arc length within which closures that disagree contradict each other."""
+_MOST_PAIRS = 1_000_000
+"""Pairs of closures that are compared at once, for the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,18 +59,20 @@ def check_consensus(
     rule: ConsensusRule,
 ) -> tuple[I64, Mask, Mask]:
     """Return support (N,), and which closures are supported and which contradicted (N,)."""
-    count = len(query_vertex)
     mission = vi_map.vertices.mission
     pair = mission[query_vertex].astype(np.int64) * len(vi_map.missions) + mission[place_vertex]
     way = path_lengths(vi_map)
     order = np.lexsort((place_vertex, way[query_vertex], pair))
     T_A_I = vi_map.vertices.T_M_I[query_vertex]
-    alive = np.ones(count, dtype=np.bool_)
+    parts = [
+        _compare(i, j, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, rule)
+        for i, j in _neighbours(order)
+    ]
+    compared = _Compared(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    alive = np.ones(len(query_vertex), dtype=np.bool_)
     # a wrong closure may contradict correct ones: test twice, the second time with survivors only
     for _ in range(2):
-        support, for_, against = _votes(
-            order, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, inliers, alive, rule
-        )
+        support, for_, against = compared.votes(inliers, alive)
         contradicted = against > for_
         alive = alive & ~contradicted & (support > 0)
     lone = (support == 0) & (against == 0) & (inliers >= rule.lone_inliers)
@@ -73,38 +80,62 @@ def check_consensus(
     return support, supported, contradicted
 
 
-def _votes(
-    order: I64,
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Compared:
+    """Pairs (P,) of neighbouring closures: j judges i."""
+
+    i: I64
+    j: I64
+    supports: Mask  # agrees, for another query vertex
+    agrees: Mask
+    contradicts: Mask  # disagrees so near by that drift cannot be the reason
+
+    def votes(self, inliers: I64, alive: Mask) -> tuple[I64, F64, F64]:
+        """Return support by distinct query vertices, and the inliers that support and contradict."""
+        count = len(inliers)
+
+        def total(judges: Mask) -> F64:
+            rows = judges & alive[self.j]
+            return np.bincount(self.i[rows], inliers[self.j[rows]], minlength=count)
+
+        supporting = self.i[self.supports & alive[self.j]]
+        support = np.bincount(supporting, minlength=count).astype(np.int64)
+        return support, inliers + total(self.agrees), total(self.contradicts)
+
+
+def _neighbours(order: I64) -> Iterator[tuple[I64, I64]]:
+    """Yield pairs of closures at most `_WINDOW` apart in the order, both ways round, in pieces."""
+    steps = range(1, min(_WINDOW, len(order) - 1) + 1)
+    size = max(_MOST_PAIRS // max(len(order), 1), 1)
+    for first in range(0, max(len(steps), 1), size):
+        some = steps[first : first + size]
+        one = np.concatenate([order[:0], *(order[:-step] for step in some)])
+        other = np.concatenate([order[:0], *(order[step:] for step in some)])
+        yield np.concatenate([one, other]), np.concatenate([other, one])
+
+
+def _compare(
+    i: I64,
+    j: I64,
     pair: I64,
     way: F64,
     query: I64,
     place: I64,
     T_A_I: F64,
     T_B_I: F64,
-    inliers: I64,
-    alive: Mask,
     rule: ConsensusRule,
-) -> tuple[I64, F64, F64]:
-    """Return support by distinct query vertices, and the inliers that support and contradict."""
-    count = len(query)
-    support = np.zeros(count, dtype=np.int64)
-    for_, against = inliers.astype(np.float64), np.zeros(count)
+) -> tuple[I64, I64, Mask, Mask, Mask]:
+    """Return the columns of `_Compared` for those of some pairs that are near each other."""
+    between = np.abs(way[query[i]] - way[query[j]])
+    near = (pair[i] == pair[j]) & (between < _REACH_M)
+    i, j, between = i[near], j[near], between[near]
     E = yaw.from_pose(se3.compose(T_B_I, se3.inverse(T_A_I)))  # frame A in frame B
-    for step in range(1, min(_WINDOW, count - 1) + 1):
-        for i, j in ((order[:-step], order[step:]), (order[step:], order[:-step])):
-            between = np.abs(way[query[i]] - way[query[j]])
-            near = (pair[i] == pair[j]) & (between < _REACH_M) & alive[j]
-            between_places = np.abs(way[place[i]] - way[place[j]])
-            # position of query i implied by closure j
-            p = yaw.transform(E[j], T_A_I[i, 4:])
-            both_ways = between + np.minimum(between_places, between + _REACH_M)
-            largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways
-            largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
-            apart_m = np.linalg.norm(p - T_B_I[i, 4:], axis=1)
-            agrees = apart_m < rule.max_difference * largest_m
-            agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.max_difference * largest_rad
-            other = query[i] != query[j]
-            support[i] += near & agrees & other
-            for_[i] += np.where(near & agrees, inliers[j], 0)
-            against[i] += np.where(near & ~agrees & (between < 3.0), inliers[j], 0)
-    return support, for_, against
+    between_places = np.abs(way[place[i]] - way[place[j]])
+    both_ways = between + np.minimum(between_places, between + _REACH_M)
+    largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways
+    largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
+    # position of query i implied by closure j
+    apart_m = np.linalg.norm(yaw.transform(E[j], T_A_I[i, 4:]) - T_B_I[i, 4:], axis=1)
+    agrees = apart_m < rule.max_difference * largest_m
+    agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.max_difference * largest_rad
+    return i, j, agrees & (query[i] != query[j]), agrees, ~agrees & (between < _NEAR_M)
