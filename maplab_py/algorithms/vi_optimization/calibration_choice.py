@@ -197,7 +197,7 @@ def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> 
             parts += _describe_values(group, report.calibration)
     return (
         f"the residuals contradict the calibration, so this was estimated: {', '.join(parts)} "
-        "(--ba_calibration=fixed holds it)"
+        "(without --ba_calibration=auto it stays)"
     )
 
 
@@ -218,5 +218,7 @@ def _describe_values(group: _Group, rows: list[CalibratedParameter]) -> list[str
     row = max(of_group, key=lambda row: abs(row.after - row.before))
     size = group.size * (row.before if group.block == INTRINSICS else 1.0)
     change, sigma = (row.after - row.before) / size, row.sigma / size
-    digits = max(0, -int(np.floor(np.log10(max(sigma, 1e-3))))) if np.isfinite(sigma) else 1
+    if not np.isfinite(sigma):
+        return [f"{group.words} {change:+.1f} {group.unit} (uncertainty unknown)"]
+    digits = max(0, -int(np.floor(np.log10(max(sigma, 1e-3)))))
     return [f"{group.words} {change:+.{digits}f} +- {sigma:.{digits}f} {group.unit}"]

@@ -83,10 +83,10 @@ class FixedStates:
     """Fixed states."""
 
     calibration: str = option(
-        "auto",
+        "fixed",
         help="Calibration of the cameras while all of it is fixed: fixed = it stays; auto = once the cost "
         "has converged, what the residuals contradict is freed, and the optimisation goes on",
-        choices=("auto", "fixed"),
+        choices=("fixed", "auto"),
     )
     fix_vertices: bool = option(False, help="Hold all poses fixed.")
     fix_velocity: bool = option(False, help="Hold all velocities fixed.")

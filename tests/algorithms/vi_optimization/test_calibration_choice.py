@@ -23,8 +23,8 @@ from maplab_py.simulation.scenario import (
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.vimap import VIMap
 
-AUTO = VIOptimizationOptions()
-FIXED = VIOptimizationOptions(calibration="fixed")
+AUTO = VIOptimizationOptions(calibration="auto")
+FIXED = VIOptimizationOptions()
 
 
 def scenario(line_delay_s: float = 0.0) -> Scenario:
@@ -86,7 +86,7 @@ def test_a_fault_is_freed_named_and_mended(
     kept, _ = optimize(start, FIXED)
     truth = data.truth
     assert words in report.note
-    assert "--ba_calibration=fixed" in report.note
+    assert "--ba_calibration=auto" in report.note
     assert any(block in row.parameter for row in report.calibration)
     assert all(np.isfinite(row.sigma) and row.sigma > 0.0 for row in report.calibration)
     of_truth_m = evaluate_map(wanted, truth).ate_m
