@@ -108,10 +108,10 @@ def _neighbours(order: I64) -> Iterator[tuple[I64, I64]]:
     steps = range(1, min(_WINDOW, len(order) - 1) + 1)
     size = max(_MOST_PAIRS // max(len(order), 1), 1)
     for first in range(0, max(len(steps), 1), size):
-        some = steps[first : first + size]
-        one = np.concatenate([order[:0], *(order[:-step] for step in some)])
-        other = np.concatenate([order[:0], *(order[step:] for step in some)])
-        yield np.concatenate([one, other]), np.concatenate([other, one])
+        piece = steps[first : first + size]
+        earlier = np.concatenate([order[:0], *(order[:-step] for step in piece)])
+        later = np.concatenate([order[:0], *(order[step:] for step in piece)])
+        yield np.concatenate([earlier, later]), np.concatenate([later, earlier])
 
 
 def _compare(

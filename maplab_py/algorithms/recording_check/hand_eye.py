@@ -246,8 +246,10 @@ def _eliminated(residual: F64, J: F64, weight: F64, variance: float) -> tuple[F6
     g = np.einsum("pki,pk->pi", WJ, residual)
     # without parallax, noise alone makes the direction look as if it could explain everything
     noise = variance * weight.sum(axis=1)
-    own = H[:, _UNKNOWNS:, _UNKNOWNS:] + _DIRECTION_DAMPING * noise[:, None, None] * np.eye(2)
-    gain = H[:, :_UNKNOWNS, _UNKNOWNS:] @ np.linalg.inv(own)
+    of_direction = H[:, _UNKNOWNS:, _UNKNOWNS:] + _DIRECTION_DAMPING * noise[
+        :, None, None
+    ] * np.eye(2)
+    gain = H[:, :_UNKNOWNS, _UNKNOWNS:] @ np.linalg.inv(of_direction)
     common = H[:, :_UNKNOWNS, :_UNKNOWNS] - gain @ H[:, _UNKNOWNS:, :_UNKNOWNS]
-    own_g = np.einsum("pij,pj->pi", gain, g[:, _UNKNOWNS:])
-    return common.sum(axis=0), (g[:, :_UNKNOWNS] - own_g).sum(axis=0)
+    direction_g = np.einsum("pij,pj->pi", gain, g[:, _UNKNOWNS:])
+    return common.sum(axis=0), (g[:, :_UNKNOWNS] - direction_g).sum(axis=0)

@@ -95,8 +95,8 @@ class CameraSampler:
         is_repeated = before is not None and np.array_equal(before[1], image)
         self.figures.append(_figures(time_ns, image, len(uv), is_repeated))
         if before is not None and time_ns - before[0] <= _LONGEST_S * 1e9:
-            there, is_found = follow(before[1], image, before[2], before[2], _FLOW)
-            both = np.stack([before[2][is_found], there[is_found]], axis=1)
+            there, is_tracked = follow(before[1], image, before[2], before[2], _FLOW)
+            both = np.stack([before[2][is_tracked], there[is_tracked]], axis=1)
             recorded = self._preparation.to_recorded(both.reshape(-1, 2)).reshape(-1, 2, 2)
             if len(recorded) >= _LEAST_SHARED:
                 self.pairs.append((before[0], time_ns, recorded))

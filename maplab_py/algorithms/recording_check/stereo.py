@@ -57,9 +57,9 @@ class StereoSampler:
         uv_1 = np.array([key.pt for key in keys_1])[i]
         uv_2 = np.array([key.pt for key in keys_2])[j]
         if self._is_alike:
-            moved, is_found = follow(first, second, uv_1, uv_2, _FLOW)
-            is_found &= np.linalg.norm(moved - uv_2, axis=1) < 4.0
-            uv_1, uv_2 = uv_1[is_found], moved[is_found]
+            moved, is_tracked = follow(first, second, uv_1, uv_2, _FLOW)
+            is_tracked &= np.linalg.norm(moved - uv_2, axis=1) < 4.0
+            uv_1, uv_2 = uv_1[is_tracked], moved[is_tracked]
         self._points.append(np.stack([uv_1, uv_2], axis=1))
 
     def points(self) -> F64:
