@@ -96,7 +96,8 @@ class _Compared:
 
         def total(judges: Mask) -> F64:
             rows = judges & alive[self.j]
-            return np.bincount(self.i[rows], inliers[self.j[rows]], minlength=count)
+            weights = inliers[self.j[rows]].astype(np.float64)
+            return np.bincount(self.i[rows], weights, minlength=count).astype(np.float64)
 
         supporting = self.i[self.supports & alive[self.j]]
         support = np.bincount(supporting, minlength=count).astype(np.int64)

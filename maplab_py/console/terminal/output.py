@@ -137,6 +137,7 @@ class ConsoleTerminal:
     def note(self, text: str) -> None:
         """Print a line that is not part of a report; never into a pipe that wants reports."""
         stream = sys.stdout if sys.stdout.isatty() and not self.as_json else sys.stderr
+        self._hide_progress()
         _write_line(stream, text, "\x1b[2m")
         self._copy(text)
 
@@ -160,6 +161,7 @@ class ConsoleTerminal:
 
     def warning(self, text: str) -> None:
         """Print one line on standard error."""
+        self._hide_progress()
         _write_line(sys.stderr, f"warning: {text}", "\x1b[33m")
         self._copy(f"warning: {text}")
 

@@ -224,7 +224,7 @@ class FixedLagSmoother:
         """Tell whether the latest frame rests, too, and the joined interval is not too long."""
         if len(self._states) < 2 or not self._chain.is_resting[-1] or self._frames.is_keyframe[-1]:
             return False
-        return (frame.time_ns - self._frames.time_ns[-2]) * 1e-9 <= self.options.max_joined_s
+        return (frame.time_ns - int(self._frames.time_ns[-2])) * 1e-9 <= self.options.max_joined_s
 
     def _append_frame(self, frame: WindowFrame, *, is_keyframe: bool) -> None:
         turns, is_sure = is_on_the_spot(
