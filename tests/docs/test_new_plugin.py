@@ -6,6 +6,7 @@ The environment has nothing of this one but the libraries, which would take minu
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import venv
@@ -86,7 +87,12 @@ def _pip(site: Path, source: Path) -> None:
 
 def _run(*words: str | Path, folder: Path | None = None) -> str:
     done = subprocess.run(
-        [str(word) for word in words], capture_output=True, text=True, check=False, cwd=folder
+        [str(word) for word in words],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env={**os.environ, "MAPLAB_WHEEL_KERNELS": "none"},  # those of the cache serve as well
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout.strip()
