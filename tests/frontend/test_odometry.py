@@ -369,10 +369,10 @@ def test_a_wrong_mounting_is_estimated_and_given_to_the_sensors() -> None:
     odometry = Odometry(wrong, OdometryOptions(estimate="extrinsics"), make_starter=start)
     states = states_of(pushed(odometry, events))
     odometry.find_calibration()
-    found = odometry.calibration_found
-    assert found is not None
-    assert found.differs
-    mended = wrong.with_cameras(*found.cameras())
+    estimate = odometry.calibration_estimate
+    assert estimate is not None
+    assert estimate.differs
+    mended = wrong.with_cameras(*estimate.cameras())
     off = np.abs(se3.local(device.T_I_C, mended.T_I_C))
     assert np.degrees(off[:, 3:].max()) < 0.5
     assert position_errors(start.truth, states.times_ns, states.T_M_I)[-1] < 0.1
@@ -389,6 +389,6 @@ def test_only_what_is_named_is_estimated() -> None:
     odometry = Odometry(device, make_starter=start)
     pushed(odometry, events[:40])
     odometry.find_calibration()
-    assert odometry.calibration_found is None
+    assert odometry.calibration_estimate is None
     with pytest.raises(FlagError, match="--vio_estimate: there is no focus: give some of"):
         OdometryOptions(estimate="extrinsics,focus").check()
