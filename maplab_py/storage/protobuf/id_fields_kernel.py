@@ -64,7 +64,7 @@ def parts_of_field(data, field):  # type: ignore[no-untyped-def]
         field: Number of the field.
 
     Returns:
-        The parts; and whether the message holds nothing else and is not truncated.
+        The parts; and whether the message holds nothing else, no part is empty, and none truncated.
     """
     count, begin, end = 0, np.empty(0, np.int64), np.empty(0, np.int64)
     for is_counting in (True, False):
@@ -72,7 +72,8 @@ def parts_of_field(data, field):  # type: ignore[no-untyped-def]
         while place < len(data):
             tag, place = _varint(data, place, len(data))
             size, place = _varint(data, place, len(data))
-            if tag != np.uint64(8 * field + 2) or size > np.uint64(len(data) - place):
+            is_part = tag == np.uint64(8 * field + 2) and size > np.uint64(0)
+            if not is_part or size > np.uint64(len(data) - place):
                 return begin, end, False
             if not is_counting:
                 begin[row], end[row] = place, place + np.int64(size)

@@ -124,7 +124,7 @@ def ids_of_parts(data: bytes | bytearray, field: int, inner: Sequence[int]) -> l
     Returns:
         Ids by inner field; None where the message is small, or holds something else.
     """
-    if len(data) < LARGE_MESSAGE:
+    if len(data) < LARGE_MESSAGE or data[1] == 0:  # the first part is empty: no kernel is needed
         return None
     from maplab_py.storage.protobuf.id_fields_kernel import parts_of_field, read_ids
 
