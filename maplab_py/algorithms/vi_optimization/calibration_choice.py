@@ -43,19 +43,20 @@ class _Group:
     unit: str
     size: float  # of the unit
     words: str
+    label: str  # in the names of its parameters in the report
 
 
 _GROUPS = (
-    _Group("fix_ncamera_time_offset", TIMING, 0, 1, 0.003, 1.0, "ms", 1e-3, "image delay"),
-    _Group("fix_ncamera_line_delay", TIMING, 1, 2, 0.005, 5.0, "us", 1e-6, "line delay"),
+    _Group("fix_ncamera_time_offset", TIMING, 0, 1, 0.003, 1.0, "ms", 1e-3, "image delay", "image delay"),
+    _Group("fix_ncamera_line_delay", TIMING, 1, 2, 0.005, 5.0, "us", 1e-6, "line delay", "line delay"),
     _Group(
         "fix_ncamera_extrinsics_rotation", EXTRINSICS, 3, 6, 0.01, 0.3, "deg", np.pi / 180.0,
-        "rotation on the IMU",
+        "rotation on the IMU", "rotation",
     ),
-    _Group("fix_ncamera_intrinsics", INTRINSICS, 0, 99, 0.011, 0.6, "%", 0.01, "focal length"),
+    _Group("fix_ncamera_intrinsics", INTRINSICS, 0, 99, 0.011, 0.6, "%", 0.01, "focal length", " fu"),
     _Group(
         "fix_ncamera_extrinsics_translation", EXTRINSICS, 0, 3, 0.02, 20.0, "mm", 1e-3,
-        "position on the IMU",
+        "position on the IMU", "on IMU",
     ),
 )  # fmt: skip
 """Least gains and changes are above those of true calibrations: of MH_01 and V1_01 the rotation gains 0.4 %
@@ -203,14 +204,7 @@ def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> 
 
 def _describe_values(group: _Group, rows: list[CalibratedParameter]) -> list[str]:
     """Return the largest change of a group of numbers in words."""
-    label = {
-        "fix_ncamera_time_offset": "image delay",
-        "fix_ncamera_line_delay": "line delay",
-        "fix_ncamera_extrinsics_rotation": "rotation",
-        "fix_ncamera_extrinsics_translation": "on IMU",
-        "fix_ncamera_intrinsics": " fu",
-    }[group.flag]
-    of_group = [row for row in rows if label in row.parameter]
+    of_group = [row for row in rows if group.label in row.parameter]
     if group.flag == "fix_ncamera_extrinsics_translation":
         of_group = [row for row in of_group if "rotation" not in row.parameter]
     if not of_group:
