@@ -34,7 +34,7 @@ class TaskLine:
 
 
 TASKS = (
-    TaskLine("check a recording, make a map of it", "recording_info, rovioli"),
+    TaskLine("check a recording, make a map of it", "check_recording, rovioli"),
     TaskLine("open maps, join sessions", "load, load_merge_all_maps, anchor_all_missions"),
     TaskLine("make it accurate", "optvi, relax, lc"),
     TaskLine("see it", "visualize, map_stats, plot_trajectory, why"),
