@@ -62,19 +62,19 @@ def measure(kind: BagFormat, messages: int = MESSAGES, repeats: int = 3) -> BagF
                 Path(folder) / (name if kind.is_ros_2 else f"{name}.bag")
                 for name in ("ours", "objects")
             )
-            marks = [time.perf_counter()]
+            marks = [time.process_time()]
             rows = imu_messages(content.imu_ns, content.accel_gyro, "imu", is_ros_2=kind.is_ros_2)
             write_bag(path, kind, messages_of_topic(content.imu_ns, _TOPIC, _TYPE, rows))
-            marks.append(time.perf_counter())
+            marks.append(time.process_time())
             batches = [b for b in BagRecording(path, device).items() if isinstance(b, ImuBatch)]
-            marks.append(time.perf_counter())
+            marks.append(time.process_time())
             version = 2 if kind.is_ros_2 else 1
             write_bag_of_objects(content, other, version=version, storage=kind.value)
-            marks.append(time.perf_counter())
+            marks.append(time.process_time())
             with opened_bag(other) as reader:
                 for connection, _, data in reader.messages():
                     reader.deserialize(data, connection.msgtype)
-            marks.append(time.perf_counter())
+            marks.append(time.process_time())
         times.append(np.diff(marks).tolist())
         read_ns = np.concatenate([batch.times_ns for batch in batches])
         read = np.concatenate([batch.accel_gyro for batch in batches])

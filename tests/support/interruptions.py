@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import re
 import shutil
+import signal
 import time
 from pathlib import Path
 
@@ -128,8 +129,11 @@ class Interrupter:
         self._read_prompt()
 
     def close(self) -> None:
-        """End the console."""
-        self._child.close(force=True)
+        """End the console, however long a busy machine takes for it."""
+        if self._child.isalive():
+            self._child.kill(signal.SIGKILL)
+            self._child.wait()
+        self._child.close()
 
     def run(self, line: str, seconds: float = 120.0) -> str:
         """Run a line to its end and return what was printed meanwhile."""
