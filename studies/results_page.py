@@ -77,7 +77,7 @@ def _scenario(path: Path, docs: Path) -> list[str]:
         "",
         *_table("what|thesis|here", [*_errors(results), *_odometry(results), *_spreads(results)]),
         *_parameters(results),
-        *_predict(lines_of(path.with_name(f"{path.stem}_predict.jsonl"))),
+        *_predictions(lines_of(path.with_name(f"{path.stem}_predicted.jsonl"))),
     ]
 
 
@@ -276,7 +276,7 @@ def _parameters(results: Results) -> list[str]:
     ]
 
 
-def _predict(rows: list[Row]) -> list[str]:
+def _predictions(rows: list[Row]) -> list[str]:
     """Return the section on deviations from the Jacobians, without an estimate."""
     if not rows:
         return []
