@@ -34,7 +34,7 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
 
 _HEALTH_EVERY_S = 1.0
-_STATUS_EVERY_S = 0.1
+_STATUS_EVERY_S = 0.25
 _ZERO_SAMPLES = 50
 """Samples after which an IMU that measures rates or accelerations only is refused."""
 _LONGEST_SLEEP_S = 0.1

@@ -108,7 +108,8 @@ class RunStatistics:
 
     def stages(self, last: int = 0) -> tuple[StageTime, ...]:
         """Return median and 99th percentile of each stage over the last frames; 0 = over all."""
-        table = np.asarray(self.stage_ms, dtype=np.float64).reshape(-1, len(_STAGES))[-last:]
+        rows = np.asarray(self.stage_ms[-last * len(_STAGES) :], dtype=np.float64)
+        table = rows.reshape(-1, len(_STAGES))
         if not len(table):
             return ()
         used = [name for name, column in zip(_STAGES, table.T, strict=True) if column.any()]
