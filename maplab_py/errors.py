@@ -2,7 +2,21 @@
 
 
 class MaplabError(Exception):
-    """Root of every error that this project raises on purpose."""
+    """Root of every error that this project raises on purpose.
+
+    Attributes:
+        remedy: Command line after which the refused command can be run again; empty if none is known.
+    """
+
+    def __init__(self, *message: object, remedy: str = "") -> None:
+        """Make an error of one line.
+
+        Args:
+            message: The line.
+            remedy: Command line that mends the cause.
+        """
+        super().__init__(*message)
+        self.remedy = remedy
 
 
 class UserError(MaplabError):

@@ -19,7 +19,7 @@ from maplab_py.console.session.context import CommandContext
 from maplab_py.console.session.importing import importer
 from maplab_py.console.session.maps import key_of_folder
 from maplab_py.console.session.missions import ALL_MISSIONS, MissionChoice
-from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
+from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, MaplabError, UserError
 from maplab_py.options import option
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import Progress
@@ -57,6 +57,7 @@ __all__ = [
     "LayerLines",
     "LayerPoints",
     "MapError",
+    "MaplabError",
     "Message",
     "MissionChoice",
     "Progress",

@@ -30,6 +30,11 @@ class Report:
         return ""
 
     @property
+    def remedy(self) -> str:
+        """Command line after which a command that failed can be run again; empty if none is known."""
+        return ""
+
+    @property
     def advice(self) -> str:
         """One line on what to do next, empty where nothing is known; the prompt shows it."""
         return ""

@@ -439,7 +439,7 @@ def _nearest(p_G: F64, rows: I64, wanted: Mask, options: IncrementalOptions) -> 
 
 
 def _has_large_gap(refused: dict[str, int]) -> bool:
-    from maplab_py.algorithms.loop_closure.merging import GAP
+    from maplab_py.algorithms.loop_closure.reports import GAP
 
     return GAP in refused
 

@@ -38,10 +38,17 @@ class RelaxReport(Report):
 
     @property
     def failure(self) -> str:
-        """Return why nothing was relaxed."""
-        relaxed = self.relaxation.failure
-        search = self.loop_closures.reason
-        return f"{relaxed}; {search}" if relaxed and search else relaxed
+        """Return why nothing was relaxed although there are loop closures, or could not be searched."""
+        searched = self.loop_closures.failure
+        if self.relaxation.num_ignored or self.loop_closures.accepted or searched:
+            relaxed = self.relaxation.failure
+            return f"{relaxed}; {searched}" if relaxed and searched else relaxed
+        return ""
+
+    @property
+    def advice(self) -> str:
+        """Tell that there was nothing to relax."""
+        return "" if self.relaxation.num_loop_closures else "the map has no loop closures to relax"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +60,8 @@ class RelaxMissionsReport(Report):
     @property
     def failure(self) -> str:
         """Return why nothing was relaxed; empty if any mission was."""
-        failures = [f"{name}: {report.failure}" for name, report in self.missions.items()]
-        if any(not report.failure for report in self.missions.values()):
+        failures = [f"{k}: {each.failure}" for k, each in self.missions.items() if each.failure]
+        if not failures or any(r.relaxation.num_loop_closures for r in self.missions.values()):
             return ""
         return "no mission was relaxed: " + "; ".join(failures)
 
@@ -78,7 +85,8 @@ class RelaxMissionsReport(Report):
             tuple(
                 f"{name}: {note}"
                 for name, report in self.missions.items()
-                for note in report.relaxation.notes
+                for note in (report.loop_closures.reason, *report.relaxation.notes)
+                if note
             ),
         )
 

@@ -183,7 +183,10 @@ def pairs_from_closures(vi_map: VIMap, scans: Scans, options: CloudClosureOption
     closures = read_record(vi_map).closures
     closures = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
     if not len(closures):
-        raise UserError("--lidar_lc_from_closures: the map records no accepted closure (see: lc)")
+        raise UserError(
+            "--lidar_lc_from_closures: the map records no accepted closure (see: lc)",
+            remedy="loopclosure_all_missions",
+        )
     a = vi_map.vertex_index.rows(closures.query)
     b = vi_map.vertex_index.rows(closures.place)
     query, place = _cloud_of_vertex(vi_map, scans, a), _cloud_of_vertex(vi_map, scans, b)

@@ -92,7 +92,10 @@ def convert_depth_maps(
     resources = FrameResources(vi_map, map_folder)
     rows = np.flatnonzero(resources_of(vi_map, DEPTH_MAPS))
     if not len(rows):
-        raise UserError("the map has no depth maps: stereo_dense_reconstruction makes some")
+        raise UserError(
+            "the map has no depth maps: stereo_dense_reconstruction makes some",
+            remedy="stereo_dense_reconstruction",
+        )
     if (vi_map.resources.owner_kind[rows] != ResourceOwner.FRAME).any():
         raise MapError("a depth map belongs to no frame: see check_map_consistency")
     had = np.isin(

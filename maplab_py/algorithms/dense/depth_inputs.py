@@ -93,7 +93,10 @@ def depth_type(vi_map: VIMap, missions: I64, given: int | None) -> int:
         if resources_of(vi_map, (kind,), missions).any():
             return kind
     what = "depth" if given is None else resource_type(given).name
-    raise UserError(f"the missions have no {what}: stereo_dense_reconstruction makes depth maps")
+    raise UserError(
+        f"the missions have no {what}: stereo_dense_reconstruction makes depth maps",
+        remedy="stereo_dense_reconstruction",
+    )
 
 
 def mission_groups(vi_map: VIMap, missions: I64) -> tuple[list[list[int]], list[str]]:

@@ -323,7 +323,10 @@ def load_fields(
     chosen = np.array(chosen_missions(vi_map, missions))
     rows = np.flatnonzero(resources_of(vi_map, (FIELD_TYPE,), chosen))
     if not len(rows):
-        raise UserError("the map has no distance field: create_esdf_from_depth_resource makes one")
+        raise UserError(
+            "the map has no distance field: create_esdf_from_depth_resource makes one",
+            remedy="create_esdf_from_depth_resource",
+        )
     store, table = ResourceStore(vi_map, map_folder), vi_map.resources
     return [
         (

@@ -155,7 +155,10 @@ def update_grids(
     rows = np.array(chosen_missions(vi_map, missions))
     grids = np.flatnonzero(_grids(vi_map, rows))
     if not len(grids):
-        raise UserError("the missions have no grid: create_tsdf_from_depth_resource makes one")
+        raise UserError(
+            "the missions have no grid: create_tsdf_from_depth_resource makes one",
+            remedy="create_tsdf_from_depth_resource",
+        )
     groups, notes = mission_groups(vi_map, np.arange(len(vi_map.missions)))
     store = ResourceStore(vi_map, map_folder)
     new = NewResources(seed=b"grid")
@@ -265,7 +268,10 @@ def load_grids(
     """
     rows = np.flatnonzero(_grids(vi_map, np.array(chosen_missions(vi_map, missions))))
     if not len(rows):
-        raise UserError("the map has no grid: create_tsdf_from_depth_resource makes one")
+        raise UserError(
+            "the map has no grid: create_tsdf_from_depth_resource makes one",
+            remedy="create_tsdf_from_depth_resource",
+        )
     store = ResourceStore(vi_map, map_folder)
     return [
         (

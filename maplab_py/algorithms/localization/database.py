@@ -133,7 +133,10 @@ def database_of_map(
     good_features = features_of_good_landmarks(judged, features)
     if len(good_features) == 0:
         name = type_name(feature_type)
-        raise EstimationError(f"the map has no good landmark with {name} descriptors: run rtl")
+        raise EstimationError(
+            f"the map has no good landmark with {name} descriptors: run rtl",
+            remedy="retriangulate_landmarks",
+        )
     descriptors = features.descriptors.take(good_features)
     landmarks, label = np.unique(descriptors.label, return_inverse=True)
     vertices, observer = np.unique(features.vertex[good_features], return_inverse=True)

@@ -14,6 +14,7 @@ from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
@@ -28,8 +29,6 @@ FEW_OBSERVATIONS = "too few verified observations agree"
 TOO_FAR = "too far apart once the closure is applied"
 UNLIKELY = "farther apart than their rays allow"
 SAME_IMAGE = "both seen in one image"
-GAP = "the closure corrects too much: relax first"
-UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

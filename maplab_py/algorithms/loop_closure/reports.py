@@ -30,6 +30,11 @@ OF_CLOUDS = (Verdict.SMALL_OVERLAP, Verdict.BAD_FIT, Verdict.DEGENERATE)
 """Verdicts of gates that only closures between clouds have."""
 
 
+GAP = "the closure corrects too much: relax first"
+UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
+"""Reasons for which landmarks are not merged."""
+
+
 @dataclasses.dataclass(frozen=True)
 class LoopClosureReport(Report):
     """Counts of a search and the use of its result."""
@@ -60,6 +65,15 @@ class LoopClosureReport(Report):
         """
         could_search = self.database_landmarks > 0
         return "" if could_search and not self.accepted else self.reason
+
+    @property
+    def remedy(self) -> str:
+        """Return the command that makes the refused merges possible."""
+        if not self.failure:
+            return ""
+        if UNKNOWN_BASE_FRAME in self.merges_refused:
+            return "anchor_all_missions"
+        return "relax" if GAP in self.merges_refused else ""
 
     @property
     def advice(self) -> str:

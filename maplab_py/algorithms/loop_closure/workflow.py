@@ -13,7 +13,7 @@ from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.features import SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
-from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
+from maplab_py.algorithms.loop_closure.reports import GAP, LoopClosureReport
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
@@ -68,7 +68,7 @@ def close_loops(
         observations_moved=result.observations_moved,
         merges_refused=result.refused,
     )
-    if merging.GAP in result.refused:
+    if GAP in result.refused:
         open_ = closures.accepted & (closures.correction_m > options.max_merge_gap_m)
         remedy = (
             f"{counted(int(np.count_nonzero(open_)), 'closure')} with a correction of up to "
@@ -78,7 +78,7 @@ def close_loops(
         report = dataclasses.replace(report, notes=(*report.notes, remedy))
     if not report.reason and result.landmarks_merged == 0 and result.refused:
         reasons = "; ".join(f"{why} ({n})" for why, n in result.refused.items())
-        reason = report.notes[-1] if merging.GAP in result.refused else reasons
+        reason = report.notes[-1] if GAP in result.refused else reasons
         report = dataclasses.replace(report, reason=f"no landmarks merged: {reason}")
     return recorded, report
 

@@ -75,7 +75,10 @@ def sparsify(
     judged, notes = evaluate_unknown_quality(vi_map, progress)
     good = np.flatnonzero(judged.landmarks.quality == LandmarkQuality.GOOD)
     if len(good) == 0:
-        raise UserError("no landmark is of good quality: run retriangulate_landmarks first")
+        raise UserError(
+            "no landmark is of good quality: run retriangulate_landmarks first",
+            remedy="retriangulate_landmarks",
+        )
     problem, vertex = coverage_problem(judged, good, min(keep, len(good)), options)
     if keep >= len(good):
         everything = np.ones(len(good), dtype=np.bool_)

@@ -60,7 +60,8 @@ def make_summary_map(
     rows = features_of_good_landmarks(judged, features)
     if len(rows) == 0:
         raise EstimationError(
-            f"no good landmark has {type_name(feature_type)} descriptors: run rtl"
+            f"no good landmark has {type_name(feature_type)} descriptors: run rtl",
+            remedy="retriangulate_landmarks",
         )
     progress.step(1, 3, "select observations")
     rows = rows[np.argsort(features.descriptors.label[rows], kind="stable")]

@@ -65,6 +65,12 @@ CONSOLE_FLAGS = {
             "advice", BOOL, True, "After a command, one line on what to do next where it is known"
         ),
         Flag(
+            "auto_fix",
+            BOOL,
+            False,
+            "After a refusal with a known remedy, run the remedy and the command again (see fix)",
+        ),
+        Flag(
             "complete_while_typing",
             BOOL,
             False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import shlex
 import signal
 import subprocess
 import time
@@ -20,13 +21,15 @@ from maplab_py.console.scripts.checking import LEAVE, check_commands
 from maplab_py.console.scripts.rescue import rescue_unsaved
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
-from maplab_py.console.session.session import Session
+from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status, describe, status_of
 from maplab_py.console.terminal.foreground import interruptible, run_in_foreground, terminal_lent
 from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.errors import UserError
+from maplab_py.errors import MaplabError, UserError
 from maplab_py.report import Report
 
+FIX = "fix"
+"""Command that runs the remedy of a refusal and the refused command again."""
 _MAX_ALIAS_DEPTH = 8
 _INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
 """Exit codes of a shell command after Ctrl-C: by the signal, or by a shell that reports it."""
@@ -67,7 +70,12 @@ class Runner:
         failed: list[str] = []
         first = Status.OK
         for command in commands:
+            before = self.session.refusal
             status = self._run_typed(command, keep_going=keep_going)
+            refusal = self.session.refusal
+            is_new = refusal is not None and refusal is not before
+            if is_new and self.session.settings.is_on("auto_fix"):
+                status = self.run_words([FIX])
             first = first or status
             failed += [command.source] if status else []
             if self.wants_exit or status == Status.CANCELLED or (status and not keep_going):
@@ -144,6 +152,15 @@ class Runner:
         self.terminal.failed(text, name, int(status))
         return status
 
+    def _keep_refusal(self, words: Sequence[str], remedy: str) -> None:
+        """Keep a refusal with a remedy for `fix`, and tell a person at the prompt."""
+        if not remedy or words[0] == FIX:
+            return
+        line = shlex.join(words)
+        self.session.refusal = Refusal(line, remedy)
+        if self.terminal.is_prompt:
+            self.terminal.advise(f"fix runs {remedy}, then {line} again")
+
     def _run_typed(self, command: TypedCommand, *, keep_going: bool) -> Status:
         """Run what was typed: an assignment, a shell command, an alias or a command."""
         try:
@@ -197,7 +214,9 @@ class Runner:
                 is_shown = self._show(report, name, seconds, in_shell=bool(command.shell))
         except (Exception, KeyboardInterrupt) as error:
             logger.exception("%s", words[0])
-            return self.report_error(words[0], error, has_effects=token.has_effects)
+            status = self.report_error(words[0], error, has_effects=token.has_effects)
+            self._keep_refusal(words, error.remedy if isinstance(error, MaplabError) else "")
+            return status
         trial = " (dry run: nothing has changed)" if call.is_trial else ""
         self.terminal.note(f"{name}: {format_seconds(seconds)}{trial}")
         if report.advice and self.terminal.is_prompt and self.session.settings.is_on("advice"):
@@ -205,7 +224,10 @@ class Runner:
         if report.failure:
             self.terminal.error(f"{name}: {report.failure}")
             logger.error("%s: %s", name, report.failure)
+            self._keep_refusal(words, report.remedy)
             return Status.FAILED
+        if name == FIX:
+            self.session.refusal = None
         if token.cancelled or not is_shown:
             self.terminal.error(
                 f"{name}: finished before Ctrl-C; the following commands are not run"

@@ -26,6 +26,7 @@ from maplab_py.console.session.provenance import Provenance
 from maplab_py.console.session.settings import Layer, Setting, Settings
 from maplab_py.console.session.watchers import Watchers
 from maplab_py.console.terminal.protocol import SilentTerminal, Terminal
+from maplab_py.errors import EstimationError
 from maplab_py.memory import memory_limited
 from maplab_py.output_files import planning, staging
 from maplab_py.report import Message, Report, to_html
@@ -40,6 +41,14 @@ class Timing:
 
     command: str
     seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Refusal:
+    """Command line that was refused, and the command line that mends the cause."""
+
+    line: str
+    remedy: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +91,7 @@ class Session:
         self.uses: Counter[str] = Counter()  # how often each command was typed
         self.variables: dict[str, str] = {}  # $NAME in typed lines, before the environment's
         self.marks: dict[str, str] = {}  # shown around the prompt: the sheep, a viewer's address
+        self.refusal: Refusal | None = None  # the last one that a command can mend
         self.provenance = Provenance()
         self.results: dict[Hashable, object] = {}  # what commands compare their next result with
         self.lock = threading.RLock()  # held while a command of the foreground runs
@@ -185,7 +195,12 @@ class Session:
         """
         for words in split_commands(text):
             call = self.parse(words)
-            terminal.show(self.execute(call), call.command.name)
+            report = self.execute(call)
+            terminal.show(report, call.command.name)
+            if report.failure:
+                raise EstimationError(
+                    f"{call.command.name}: {report.failure}", remedy=report.remedy
+                )
 
     def set_flags(self, assignments: Sequence[str]) -> list[Setting]:
         """Set flags for the rest of the session, all or none of them.

@@ -6,6 +6,7 @@ from maplab_plugins.console.jobs import cancel, join, list_jobs
 from maplab_plugins.console.session import (
     clear_screen,
     enable_sheep,
+    fix,
     new_plugin,
     show_timing,
     transcript,
@@ -17,6 +18,7 @@ __all__ = [
     "cancel",
     "clear_screen",
     "enable_sheep",
+    "fix",
     "join",
     "list_flags",
     "list_jobs",

@@ -7,7 +7,15 @@ import time
 from pathlib import Path
 
 from maplab_py.cancellation import current_token
-from maplab_py.plugin import Cancelled, CommandContext, Message, Report, UserError, command
+from maplab_py.plugin import (
+    Cancelled,
+    CommandContext,
+    MaplabError,
+    Message,
+    Report,
+    UserError,
+    command,
+)
 from maplab_py.report import counted
 
 
@@ -83,6 +91,31 @@ def watch(
         current_token().cancelled = False  # it is how this command is meant to end
         return Message(f"stopped after {counted(runs, 'run')}")
     return Message(counted(runs, "run"))
+
+
+@command("fix", see_also=("undo",), needs_map=False, acts_outside=True)
+def fix(context: CommandContext) -> Message:
+    """Run the remedy of the command that was refused last, then that command again.
+
+    A refusal whose remedy is a command says so at the prompt. `maplab --auto_fix` does it in scripts
+    without being asked.
+    """
+    refusal = context.session.refusal
+    if refusal is None:
+        raise UserError("fix: no command was refused for a reason that another command mends")
+    remedies = [refusal.remedy]
+    while True:
+        context.progress.line(f"> {remedies[-1]}")
+        context.session.run_line(remedies[-1], context.terminal)
+        context.progress.line(f"> {refusal.line}")
+        try:
+            context.session.run_line(refusal.line, context.terminal)
+        except MaplabError as error:
+            if not error.remedy or error.remedy in remedies:
+                raise
+            remedies.append(error.remedy)
+        else:
+            return Message(f"{refusal.line} has run after {', '.join(remedies)}")
 
 
 def _sleep(context: CommandContext, seconds: float) -> None:

@@ -155,7 +155,8 @@ def visualize_loop_closures(
     vi_map = context.vi_map
     if not len(vi_map.loop_closure_edges) and not len(read_record(vi_map).closures):
         raise UserError(
-            f"map '{context.map_key}' has no loop closures: loopclosure_all_missions finds them"
+            f"map '{context.map_key}' has no loop closures: loopclosure_all_missions finds them",
+            remedy="loopclosure_all_missions",
         )
     subject = Subject(
         vi_map, context.map_key, options,
