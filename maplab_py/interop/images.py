@@ -119,6 +119,7 @@ def check_raw(
     described = encoding_of(encoding, name)
     row_bytes = width_px * described.channels * np.dtype(described.type).itemsize
     rows = round(height_px * described.planes)
+    step = step or row_bytes  # some drivers do not set it
     if step < row_bytes or size < step * rows:
         raise MapError(
             f"{name}: the image is truncated: {size} bytes in rows of {step}, {row_bytes * rows} are needed; "
@@ -153,6 +154,7 @@ def raw_pixels(
     """
     described = check_raw(name, encoding, width_px, height_px, step, len(data))
     rows = round(height_px * described.planes)
+    step = step or len(data) // rows
     stored = np.frombuffer(data, dtype=np.uint8, count=step * rows).reshape(rows, step)
     dtype = np.dtype(described.type).newbyteorder(">" if is_big_endian else "<")
     stored = np.ascontiguousarray(stored[:, : width_px * described.channels * dtype.itemsize])

@@ -37,6 +37,10 @@ _REMEDIES = (
 _S_TO_NS = 1_000_000_000
 _IMU_NUMBERS, _GYRO, _ACCEL = 37, slice(13, 16), slice(25, 28)
 """Numbers behind the header of sensor_msgs/Imu, and which of them are the measurements."""
+_IMU_LAYOUTS = tuple(
+    (struct.Struct(f"{order}I").unpack_from, struct.Struct(f"{order}{_IMU_NUMBERS}d").unpack_from)
+    for order in "><"
+)
 _SQLITE, _SQLITE_HEADER = b"SQLite format 3\x00", 100
 _METADATA = "metadata.yaml"
 _MAX_METADATA_BYTES = 50_000_000
@@ -250,11 +254,10 @@ def header_stamp_ns(data: bytes, *, is_ros_2: bool) -> int:
     Raises:
         struct.error: The message is too short.
     """
-    if is_ros_2:
-        seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    else:
-        seconds, nanoseconds = struct.unpack_from("<II", data, 4)
-    return int(seconds) * _S_TO_NS + int(nanoseconds)
+    form = "<II" if not is_ros_2 else "<iI" if data[1] & 1 else ">iI"
+    seconds, nanoseconds = struct.unpack_from(form, data, 4)
+    stamp_ns: int = seconds * _S_TO_NS + nanoseconds
+    return stamp_ns
 
 
 def imu_sample(data: bytes, *, is_ros_2: bool) -> tuple[float, ...]:
@@ -263,12 +266,11 @@ def imu_sample(data: bytes, *, is_ros_2: bool) -> tuple[float, ...]:
     Raises:
         struct.error: The message is too short.
     """
-    order = "<" if not is_ros_2 or data[1] & 1 else ">"
-    text_at = 12  # behind the stamp
-    begin = text_at + 4 + int(struct.unpack_from(f"{order}I", data, text_at)[0])
+    length, values = _IMU_LAYOUTS[not is_ros_2 or data[1] & 1 > 0]
+    begin = 16 + length(data, 12)[0]  # behind the stamp is the frame's name
     if is_ros_2:
         begin += -(begin - 4) % 8
-    numbers = struct.unpack_from(f"{order}{_IMU_NUMBERS}d", data, begin)
+    numbers: tuple[float, ...] = values(data, begin)
     return numbers[_ACCEL] + numbers[_GYRO]
 
 

@@ -198,11 +198,13 @@ class BagReader:
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield messages of one file; those that are compressed one by one are decompressed."""
         sources = [source for source, _ in wanted.values()]
+        named = {key: connection for key, (_, connection) in wanted.items()}
+        is2 = self.is2
         for source, time_ns, data in storage.messages(sources, start, stop):
-            content = data
-            if data[:4] == _ZSTD_FRAME and self.is2:
-                content = zstd.decompress(data)
-            yield wanted[source.id][1], time_ns, content
+            if is2 and data[:4] == _ZSTD_FRAME:
+                yield named[source.id], time_ns, zstd.decompress(data)
+            else:
+                yield named[source.id], time_ns, data
 
     def _new_store(self, msgtype: str) -> Typestore:
         """Return definitions of a type and its parts: the bag's, else the standard ones."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
 from maplab_py.interop.recordings.bag_files import (
@@ -180,12 +180,12 @@ class BagRecording:
                 times_ns.append(time_ns)
                 samples.append(message)
             if times_ns and (stream.camera != IMU or len(times_ns) == _LARGEST_BATCH):
-                yield self._batch(times_ns, samples)
+                yield from self._batch(times_ns, samples)
                 times_ns, samples = [], []
             if stream.camera != IMU:
                 yield self._image(stream, time_ns, message, read_bits[stream.camera])
         if times_ns:
-            yield self._batch(times_ns, samples)
+            yield from self._batch(times_ns, samples)
 
     def _read_bits(self, reader: BagReader, start_ns: int | None, end_ns: int | None) -> list[int]:
         """Return the bits of each camera, sought in messages that are spread over a time."""
@@ -256,36 +256,40 @@ class BagRecording:
         delays_ns = [stream.delay_ns for stream in self._streams]
         begin = None if start_ns is None else start_ns + min(delays_ns) - _SEEK_MARGIN_NS
         end = None if end_ns is None else end_ns + max(delays_ns) + _SEEK_MARGIN_NS
-        rows = {stream.topic: row for row, stream in enumerate(self._streams)}
         self._clocks = [
             ClockFilter(None if begin is not None else stream.first_ns) for stream in self._streams
         ]
+        rows = {s.topic: (s, clock) for s, clock in zip(self._streams, self._clocks, strict=True)}
+        is_ros_2, has_stamps = reader.is2, not self._reading.use_arrival_time
         joined = PairedImu(None) if any(s.camera == ACCELEROMETER for s in self._streams) else None
         connections = [c for c in reader.connections if c.topic in rows]
         for connection, arrival_ns, data in reader.messages(connections, begin, end):
-            row = rows[connection.topic]
-            stream, clock = self._streams[row], self._clocks[row]
+            stream, clock = rows[connection.topic]
             bounds = stream.arrivals_ns
             if bounds is not None and not bounds[0] <= arrival_ns <= bounds[1]:
                 continue
-            stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
-            message: Any
-            if stream.camera < 0:
-                message = imu_sample(data, is_ros_2=reader.is2)
+            stamp_ns = header_stamp_ns(data, is_ros_2=is_ros_2) if has_stamps else arrival_ns
+            is_image = stream.camera >= 0
+            message: Any = connection.msgtype, data
+            if not is_image:
+                message = imu_sample(data, is_ros_2=is_ros_2)
+            time_ns = stamp_ns + stream.time_offset_ns
+            if clock.passes(time_ns):
+                if joined is None and not is_image and start_ns is end_ns is None:  # most messages
+                    yield time_ns, stream, message
+                    continue
+                ready = [(time_ns, message)]
             else:
-                message = connection.msgtype, data
-            ready = [(stamp_ns + stream.time_offset_ns, message)]
-            if not clock.passes(ready[0][0]):
                 part = clock.part
                 ready = self._pushed(stream, clock, stamp_ns, message, (start_ns, end_ns))
                 if clock.part > part and clock.restart is not None:
-                    if end_ns is not None and clock.restart.before_ns >= end_ns:
+                    if end_ns is not None and (clock.restart.before_ns or 0) >= end_ns:
                         return
                     raise restart_error(f"{self._path}: {stream.topic}", clock.restart)
             for time_ns, content in ready:
                 if not self._is_within(time_ns, start_ns, end_ns):
                     continue
-                if stream.camera >= 0:
+                if is_image:
                     yield time_ns, stream, reader.deserialize(content[1], content[0])
                 elif joined is None:
                     yield time_ns, stream, content
@@ -475,16 +479,18 @@ class BagRecording:
             arrivals_ns=within_ns,
         )
 
-    def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> ImuBatch:
+    def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> Iterator[ImuBatch]:
         assert self.device.imu is not None  # its topic is read
         values: F64 = np.array(samples, dtype=np.float64)
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise MapError(
-                f"{self._path}: {self._streams[0].topic}: the sample at {times_ns[row]} is not a "
-                "number: leave it out with --vio_rosbag_start_s and --vio_rosbag_end_s"
-            )
-        return ImuBatch.of(self.device.imu, np.array(times_ns, dtype=np.int64), values)
+        times: I64 = np.array(times_ns, dtype=np.int64)
+        is_number = np.isfinite(values).all(axis=1)
+        if not is_number.all():
+            stream, clock = self._streams[0], self._clocks[0]
+            for time_ns in times[~is_number].tolist():
+                clock.leave_out(time_ns)
+            self._check_late(stream, clock)
+        if is_number.any():
+            yield ImuBatch.of(self.device.imu, times[is_number], values[is_number])
 
     def _image(self, stream: TopicStream, time_ns: int, message: Any, bits: int) -> CameraImage:
         stamp_ns = time_ns - stream.time_offset_ns

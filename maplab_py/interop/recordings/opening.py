@@ -15,6 +15,8 @@ from maplab_py.interop.recordings.images import check_size
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
 
+_MOST_LISTED = 3
+
 
 def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
     """Open an EuRoC or TUM-VI folder, or a ROS bag.
@@ -41,7 +43,7 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
     if not is_bag(path):
         raise UserError(
             f"{path} is no recording: wants a folder with mav0/cam0, a ROS 1 bag (.bag) or a ROS 2 "
-            "bag (a folder, or a file .db3 or .mcap)"
+            f"bag (a folder, or a file .db3 or .mcap){_hint(path)}"
         )
     return _checked(
         BagRecording(
@@ -53,6 +55,19 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
         ),
         options,
     )
+
+
+def _hint(path: Path) -> str:
+    """Return a clause on what the user may have meant."""
+    if path.suffixes[-2:] == [".bag", ".active"]:
+        return f"; it is a bag that was not closed: run `rosbag reindex {path}` and name it .bag"
+    if not path.is_dir():
+        return ""
+    below = [p for p in sorted(path.iterdir()) if image_root(p) is not None or is_bag(p)]
+    listed = ", ".join(map(str, below[:_MOST_LISTED])) + (
+        ", ..." if len(below) > _MOST_LISTED else ""
+    )
+    return f"; it holds {listed}" if below else ""
 
 
 def _checked(recording: BagRecording | FolderRecording, options: SourceOptions) -> Recording:

@@ -8,9 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.array_types import I64
+from maplab_py.errors import MapError
 from maplab_py.interop.recordings.clocks import ClockRestart
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch, PartSpan, Recording
+from maplab_py.interop.recordings.protocol import (
+    CameraImage,
+    FrameSet,
+    ImuBatch,
+    PartSpan,
+    Recording,
+)
 from maplab_py.interop.recordings.stream import EventStream, StreamStatistics, Times
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -89,6 +96,7 @@ def summarise(
     stream, checked = EventStream(recording, options), 0
     parts: tuple[PartSpan, ...] = ()
     encodings: dict[int, str] = {}
+    unread: list[str] = []
     try:
         for event in stream:
             if isinstance(event, ImuBatch):
@@ -96,7 +104,7 @@ def summarise(
             if isinstance(event, FrameSet):
                 for image in event.images:
                     if image.camera not in encodings:
-                        encodings[image.camera] = image.data.encoding
+                        encodings[image.camera] = _encoding(image, unread)
                     if check_images:
                         image.data.check()
                         checked += 1
@@ -106,10 +114,21 @@ def summarise(
     except ClockRestart:
         parts = recording.parts()
     report = _report(recording, stream.statistics, checked, options, encodings)
+    report = dataclasses.replace(report, notes=(*report.notes, *unread))
     if not parts:
         return report
     note = f"the clock starts again: figures are of part 1 of {len(parts)}, --recording_part=N reads another"
     return dataclasses.replace(report, parts=parts, notes=(note, *report.notes))
+
+
+def _encoding(image: CameraImage, unread: list[str]) -> str:
+    """Return the encoding of an image, empty if it cannot be read, which is added to `unread`."""
+    try:
+        image.data.check()
+    except MapError as error:
+        unread.append(str(error))
+        return ""
+    return image.data.encoding
 
 
 def _report(
@@ -154,8 +173,10 @@ def _notes(
     zero_ns, imu = recording.start_ns, statistics.imu
     if not recording.device.imu_id and not recording.notes:
         yield "there is no IMU"
-    if set(encodings.values()) - _USUAL_ENCODINGS:
-        listed = ", ".join(f"camera {row} {name}" for row, name in sorted(encodings.items()))
+    if set(encodings.values()) - _USUAL_ENCODINGS - {""}:
+        listed = ", ".join(
+            f"camera {row} {name}" for row, name in sorted(encodings.items()) if name
+        )
         yield f"images are converted: {listed}"
     if statistics.imu_gaps:
         yield (

@@ -250,6 +250,7 @@ def test_zero_stamps_and_arrival_times(tmp_path: Path, calibration: Path) -> Non
     recording = opened(written_bag(tmp_path, messages), calibration)
     assert recording.start_ns == int(content.imu_ns[0])
     assert len(frame_sets(list(EventStream(recording)))) == 7
+    assert recording.notes[0].endswith(f"the first is 0 beside {content.stamps_ns[0][1]}")
     for entry in images:
         entry[2].header.stamp.sec = entry[2].header.stamp.nanosec = 0
     path = written_bag(tmp_path, messages)
@@ -263,6 +264,25 @@ def test_zero_stamps_and_arrival_times(tmp_path: Path, calibration: Path) -> Non
         open_recording(
             tmp_path / "device", SourceOptions(reading=ReadingOptions(use_arrival_time=True))
         )
+
+
+def test_samples_that_are_no_numbers(tmp_path: Path, calibration: Path) -> None:
+    content = make_content(frames=20)
+    content.accel_gyro[[50, 51], 2] = np.nan
+    path = written_bag(tmp_path, bag_messages(content))
+    recording = opened(path, calibration)
+    times_ns, _ = samples(list(EventStream(recording)))
+    np.testing.assert_array_equal(times_ns, np.delete(content.imu_ns, [50, 51]))
+    (note,) = recording.notes
+    assert note.endswith(f"left out 2 that are no numbers, the first at {content.imu_ns[50]}")
+    with pytest.raises(
+        MapError, match=r"2 of 199 samples are left out, .* is no number: skip them"
+    ):
+        list(EventStream(opened(path, calibration, max_late_share=0.0)))
+    content.accel_gyro[100:140] = np.inf
+    path = written_bag(tmp_path, bag_messages(content))
+    times_ns, _ = samples(list(EventStream(opened(path, calibration, max_late_share=0.5))))
+    assert len(times_ns) == len(content.imu_ns) - 42
 
 
 def test_gyroscope_and_accelerometer_on_two_topics(tmp_path: Path, calibration: Path) -> None:

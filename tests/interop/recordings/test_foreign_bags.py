@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sqlite3
 import struct
@@ -9,20 +10,25 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (
     assert_content,
+    image_message,
+    imu_message,
     make_content,
     write_bag,
     write_calibration,
     write_folder,
+    write_messages,
 )
 
-pytest.importorskip("rosbags")
+typesys = pytest.importorskip("rosbags.typesys")
+Stores, get_typestore = typesys.Stores, typesys.get_typestore
 
 CONTENT = make_content(frames=4)
 MCAP, DATA_END = b"\x89MCAP0\r\n", 0x0F
@@ -190,6 +196,54 @@ def test_several_files_without_metadata(tmp_path: Path, calibrated: SourceOption
     with sqlite3.connect(path / "a_second.db3") as data:
         data.execute("DELETE FROM messages WHERE timestamp < ?", (middle,))
     assert_reads(path, calibrated)
+
+
+def test_rows_of_images_without_a_step(tmp_path: Path, calibrated: SourceOptions) -> None:
+    assert_reads(image_bag(tmp_path, step=0), calibrated)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"),
+    [("32FC1", "are depths"), ("", "are unknown"), ("bayer_rggb12p", "are unknown")],
+)
+def test_images_that_cannot_be_read_are_noted(
+    tmp_path: Path, calibrated: SourceOptions, encoding: str, words: str
+) -> None:
+    path = image_bag(tmp_path, encoding=encoding)
+    notes = summarise(open_recording(path, calibrated)).notes
+    assert len(notes) == 2  # of two cameras
+    for row, note in enumerate(notes):
+        assert f"/cam{row}/image_raw at" in note
+        assert f"'{encoding}' {words}" in note
+
+
+def image_bag(tmp_path: Path, **changes: object) -> Path:
+    """A bag of unpadded images with changed fields."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    stamps = CONTENT.imu_ns.tolist()
+    messages = [
+        (t, "/imu0", imu_message(store, t, values, 1))
+        for t, values in zip(stamps, CONTENT.accel_gyro, strict=True)
+    ]
+    for camera in (0, 1):
+        for t, image in zip(
+            CONTENT.stamps_ns[camera].tolist(), CONTENT.images[camera], strict=True
+        ):
+            message = image_message(store, t, image, "mono8", 1, padding=0)
+            changed = dataclasses.replace(message, **changes)
+            messages.append((t, f"/cam{camera}/image_raw", changed))
+    messages.sort(key=lambda entry: entry[:2])
+    write_messages(tmp_path / "a.bag", store, messages)
+    return tmp_path / "a.bag"
+
+
+def test_folders_of_bags_and_open_bags_are_told(tmp_path: Path, calibrated: SourceOptions) -> None:
+    path = bag(tmp_path)
+    with pytest.raises(UserError, match=f"it holds {path}$"):
+        open_recording(tmp_path, calibrated)
+    recorded = write_bag(CONTENT, tmp_path / "b.bag").rename(tmp_path / "b.bag.active")
+    with pytest.raises(UserError, match=r"run `rosbag reindex \S*b.bag.active`"):
+        open_recording(recorded, calibrated)
 
 
 def test_each_failure_names_its_remedy(tmp_path: Path, calibrated: SourceOptions) -> None:
