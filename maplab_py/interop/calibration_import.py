@@ -64,6 +64,7 @@ _OPENVINS = "estimator_config.yaml"
 _SAME_POSE = 1e-9
 _ODD_ASPECT, _ODD_DISTANCE_M = 1.2, 5.0
 """Ratio of focal lengths, and distance of a camera, that are noted."""
+_LARGEST_NOISE = (("gyroscope", "rad/s/√Hz", 1.0), ("accelerometer", "m/s²/√Hz", 10.0))
 _ODD_SCALE = 0.1
 """Scales of IMUs that are further from 1 than this are noted: those on the market are within 0.03."""
 
@@ -127,7 +128,7 @@ def import_calibration(
         _parts_of(value, name) if isinstance(value, SensorSet) else value
         for name, value in ((path, cameras), (imu_file, imu))
     )
-    return _finished(path, _joined(cameras, imu, imu_file))
+    return _finished(path, _joined(cameras, imu, imu_file), imu_file)
 
 
 def _takes_no_imu(cameras: Parts | SensorSet) -> bool:
@@ -137,8 +138,8 @@ def _takes_no_imu(cameras: Parts | SensorSet) -> bool:
     return not cameras.cameras or cameras.imu is not None
 
 
-def _finished(path: Path, parts: Parts) -> CalibrationFile:
-    """Return the sensors of a file with ids and the notes on them."""
+def _finished(path: Path, parts: Parts, imu_file: Path | None = None) -> CalibrationFile:
+    """Return the sensors of a file, or of two, with ids and the notes on them."""
     is_turned = np.max(np.abs(parts.T_B_I - se3.identity())) > _SAME_POSE
     if (
         not parts.cameras
@@ -152,7 +153,7 @@ def _finished(path: Path, parts: Parts) -> CalibrationFile:
         )
     T_B_C = parts.T_B_C.reshape(-1, 7)
     T_I_C = T_B_C if parts.imu is None else se3.compose(se3.inverse(parts.T_B_I), T_B_C)
-    notes = [*parts.notes, *(_imu_notes(path, parts.imu) if parts.imu else [])]
+    notes = [*parts.notes, *(_imu_notes(imu_file or path, parts.imu) if parts.imu else [])]
     notes += _camera_notes(path, parts.cameras, T_I_C)
     device = make_device(parts.cameras, T_I_C, parts.imu, notes)
     return _as_file(path, parts.format, device)
@@ -199,10 +200,15 @@ def _camera_notes(path: Path, cameras: Sequence[Camera], T_I_C: F64) -> list[str
 
 
 def _imu_notes(path: Path, imu: Imu) -> list[str]:
-    """Return notes on matrices of the IMU that no IMU has."""
+    """Return notes on noise and matrices of the IMU that no IMU has."""
+    densities = imu.gyro_noise_density, imu.acc_noise_density
+    notes = [
+        f"{path}: noise of {density:g} {unit} is far above that of any {name}: is it in this unit?"
+        for density, (name, unit, largest) in zip(densities, _LARGEST_NOISE, strict=True)
+        if density > largest
+    ]
     if imu.intrinsics is None:
-        return []
-    notes = []
+        return notes
     for name, matrix in (("gyroscope", imu.intrinsics.T_g), ("accelerometer", imu.intrinsics.T_a)):
         scales = np.linalg.svd(matrix, compute_uv=False)
         worst = scales[np.argmax(np.abs(scales - 1.0))]
@@ -371,7 +377,7 @@ def _read_json(path: Path) -> Parts:
     for key, program in _REFUSED_JSON.items():
         if key in entry:
             raise UserError(f"{path}: calibrations of {program} are not read: {KNOWN_FORMATS}")
-    return read_basalt(entry)
+    raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
 
 
 def _read_folder(path: Path) -> Parts:
@@ -406,6 +412,14 @@ _REFUSED_TEXTS = (
     (re.compile(r"\A\s*(?:<\?xml|<opencv_storage)"), "is XML of OpenCV: save it as yaml"),
     (re.compile(r"\A\s*(?:#.*\n\s*)*\[image\]"), "is an ini file of ROS: save it as yaml"),
     (
+        re.compile(r"^\[(?:LEFT|RIGHT)_CAM_", re.MULTILINE),
+        "calibrations of ZED cameras are not read: give kalibr's camera chain, or ROS' CameraInfo",
+    ),
+    (
+        re.compile(r"^P[01]:\s", re.MULTILINE),
+        "projections of KITTI are not read: write pinhole cameras as kalibr's camera chain",
+    ),
+    (
         re.compile(r"^(?:Camera0|Common)\s*\{?\s*$", re.MULTILINE),
         "settings of ROVIO are not read: give the yaml of the camera, or kalibr's camera chain",
     ),
@@ -416,11 +430,13 @@ _REFUSED_TEXTS = (
 )
 _REFUSED_YAML = {
     "target_type": "is a calibration target of kalibr, no calibration: give the camera chain",
+    "M1": "has the intrinsics of OpenCV's stereo sample without poses: write kalibr's camera chain",
     "Gyr": "is a report of imu_utils: give its noise under the keys of kalibr's IMU file",
 }
 _REFUSED_JSON = {
     "CalibrationInformation": "Windows Mixed Reality",
     "CameraCalibrations": "Project Aria",
+    "cameraData": "DepthAI (OAK)",
 }
 _FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] = (
     (is_camera_chain, read_camera_chain),

@@ -226,9 +226,17 @@ def test_sizes_are_compared_with_the_first_images(tmp_path: Path) -> None:
 def test_matrices_far_from_1_are_noted(matrix: str, note: str, tmp_path: Path) -> None:
     text = IMU + f"model: calibrated\nTw: {matrix}\n"
     chain = written(tmp_path / "chain.yaml", CAMERA)
-    result = import_calibration(chain, written(tmp_path / "imu.yaml", text))
+    imu = written(tmp_path / "imu.yaml", text)
+    result = import_calibration(chain, imu)
     assert len(result.notes) == bool(note)
-    assert not note or note in result.notes[0]
+    assert not note or (note in result.notes[0] and result.notes[0].startswith(str(imu)))
+
+
+def test_noise_that_no_imu_has_is_noted_with_its_file(tmp_path: Path) -> None:
+    chain = written(tmp_path / "chain.yaml", CAMERA)
+    imu = written(tmp_path / "imu.yaml", IMU.replace("density: 0.001", "density: 57.3"))
+    (note,) = import_calibration(chain, imu).notes
+    assert note.startswith(f"{imu}: noise of 57.3 rad/s/√Hz is far above that of any gyroscope")
 
 
 def test_files_of_the_first_maplab_are_joined(tmp_path: Path) -> None:
@@ -292,6 +300,19 @@ def test_a_chain_with_a_gap_names_the_missing_camera(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
+        (
+            "oak.json",
+            '{"cameraData": [], "boardName": "OAK-D"}',
+            r"calibrations of DepthAI \(OAK\)",
+        ),
+        ("any.json", '{"cameras": {}}', "the format is not known: files of kalibr"),
+        (
+            "SN1.conf",
+            "[LEFT_CAM_HD]\nfx=700\n[STEREO]\nBaseline=120\n",
+            "calibrations of ZED cameras",
+        ),
+        ("calib.txt", "P0: 718 0 607 0 0 718 185 0 0 0 1 0\n", "projections of KITTI"),
+        ("intrinsics.yml", "M1: {rows: 3, cols: 3, data: []}\nD1: {}\n", "OpenCV's stereo sample"),
         (
             "results.txt",
             "Calibration results\n====\nCamera-system parameters:\n",
