@@ -144,7 +144,7 @@ def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]
     sections: dict[str, list[tuple[int, list[str]]]] = {}
     for number, line in enumerate(lines, 1):
         words = line.split()
-        if not words or words[0].startswith("#"):
+        if not words or words[0].startswith(("#", "PARAMS_")):  # which no edge that is read names
             continue
         kind = words[0]
         if kind not in _WIDTH and kind != "FIX":

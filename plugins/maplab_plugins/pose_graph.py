@@ -75,6 +75,8 @@ def import_g2o(context: CommandContext, file: Path, *, map_key: str = "") -> Mes
         repaired = (
             f"; {edges} without a positive definite information: raised its smallest eigenvalues"
         )
+    if len(graph.fixed):
+        repaired += f"; FIX of {counted(len(graph.fixed), 'pose')} is not kept"
     context.maps.add(key, vi_map)
     return Message(
         f"map '{key}': {counted(len(vi_map.missions), 'mission')}, "

@@ -97,6 +97,13 @@ def test_ids_have_64_bits_without_sign(tmp_path, highest):
     assert len(map_of_graph(graph).transformation_edges) == 1
 
 
+def test_parameters_of_other_edges_are_skipped(tmp_path):
+    path, plain = tmp_path / "a.g2o", tmp_path / "b.g2o"
+    write_g2o(small_graph(), plain)
+    path.write_text("PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n" + plain.read_text())
+    assert read_g2o(path).id.tolist() == small_graph().id.tolist()
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(MapError, match=r"cannot read .*nowhere\.g2o"):
         read_g2o(tmp_path / "nowhere.g2o")

@@ -16,12 +16,12 @@ from maplab_py.algorithms.relaxation.map_edges import (
 )
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.robust import optimize_robustly
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.errors import MapError
 from maplab_py.estimation.kernels.connected_parts import connected_parts
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
-from maplab_py.geometry import so3
+from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import (
@@ -42,14 +42,37 @@ _STEP_NS = 1_000_000_000
 
 
 def is_odometry(graph: PoseGraph) -> Mask:
-    """Tell which edges (E,) join a pose with the next one of the same robot; first of each pair."""
-    a, b = (graph.id[rows].astype(np.uint64) for rows in (graph.first, graph.second))
-    shift = np.uint64(_ROBOT_SHIFT)
-    chain = (b - a == 1) & (a >> shift == b >> shift)
-    _, earliest = np.unique(np.where(chain, graph.first, -1), return_index=True)
-    is_first = np.zeros(len(a), dtype=np.bool_)
+    """Tell which edges (E,) join a pose with the next one of the same robot; first of each pair.
+
+    The next pose is that of the next id in the file: ids may have gaps, and edges may point backwards.
+    """
+    before = np.minimum(graph.first, graph.second)
+    robot = graph.id.astype(np.uint64) >> np.uint64(_ROBOT_SHIFT)
+    chain = np.abs(graph.second - graph.first) == 1
+    chain &= robot[graph.first] == robot[graph.second]
+    _, earliest = np.unique(np.where(chain, before, -1), return_index=True)
+    is_first = np.zeros(len(chain), dtype=np.bool_)
     is_first[earliest] = True
     return np.asarray(chain & is_first)
+
+
+def _turned(graph: PoseGraph, rows: Mask) -> PoseGraph:
+    """Return the graph with some edges (E,) from B to A in place of A to B.
+
+    The error of T_B_A is -Ad(T_A_B) times that of T_A_B.
+    """
+    T_A_B, information = np.array(graph.T_A_B), np.array(graph.information)
+    T_A_B[rows] = se3.inverse(T_A_B[rows])
+    R = so3.to_matrix(T_A_B[rows, :4])
+    adjoint = np.zeros((len(R), 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
+    adjoint[:, :3, 3:] = so3.skew(T_A_B[rows, 4:]) @ R
+    information[rows] = np.swapaxes(adjoint, 1, 2) @ information[rows] @ adjoint
+    first = np.where(rows, graph.second, graph.first)
+    second = np.where(rows, graph.first, graph.second)
+    return dataclasses.replace(
+        graph, first=first, second=second, T_A_B=T_A_B, information=information
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,11 +136,12 @@ def map_of_graph(graph: PoseGraph) -> VIMap:
     """Return a map: odometry along each robot, every other edge a loop closure.
 
     A robot's poses are one mission as far as odometry joins them.
-    Vertices lie one second apart, as the format has no times.
+    Vertices lie one second apart, as the format has no times. Their ids end in those of the file.
     """
     content = hashlib.blake2b(graph.T_G_V.tobytes() + graph.T_A_B.tobytes(), digest_size=16)
     rng = np.random.default_rng(int.from_bytes(content.digest(), "little"))
-    chain, vertices = is_odometry(graph), len(graph.id)
+    chain, vertices, ids = is_odometry(graph), len(graph.id), graph.id.astype(np.uint64)
+    graph = _turned(graph, chain & (graph.first > graph.second))
     follows = np.zeros(vertices, dtype=np.bool_)
     follows[graph.second[chain]] = True
     first = np.flatnonzero(~follows)
@@ -137,7 +161,7 @@ def map_of_graph(graph: PoseGraph) -> VIMap:
         ),
         vertices=Vertices.filled(
             vertices,
-            id=random_ids(vertices, rng),
+            id=np.stack([np.repeat(random_ids(1, rng)[:, 0], vertices), ids], axis=1),
             mission=mission,
             T_M_I=graph.T_G_V,
             timestamp_ns=np.arange(vertices) * _STEP_NS,
@@ -179,6 +203,26 @@ def graph_of_map(vi_map: VIMap, options: RelaxationOptions) -> PoseGraph:
     covariance = np.linalg.inv(np.swapaxes(W, 1, 2) @ W)
     back = _split_covariance(covariance, parts.T_A_B, back=True)
     information = np.asarray(np.linalg.inv(back), dtype=np.float64)
+    return PoseGraph(
+        id=_graph_ids(vi_map),
+        T_G_V=vi_map.T_G_I,
+        first=parts.from_vertex,
+        second=parts.to_vertex,
+        T_A_B=parts.T_A_B,
+        information=0.5 * (information + np.swapaxes(information, 1, 2)),
+        fixed=np.zeros(0, dtype=np.int64),
+    )
+
+
+def _graph_ids(vi_map: VIMap) -> U64:
+    """Return an id of each vertex: that of the file which the map was made of, else its place.
+
+    Raises:
+        MapError: There are more missions than letters for robots.
+    """
+    given = vi_map.vertices.id
+    if len(given) > 1 and np.all(given[:, 0] == given[0, 0]) and np.all(np.diff(given[:, 1]) > 0):
+        return np.asarray(given[:, 1])
     robot = vi_map.vertices.mission
     ids = (np.arange(len(robot)) - vi_map.vertex_start[robot]).astype(np.uint64)
     if len(vi_map.missions) > _MOST_ROBOTS:
@@ -188,12 +232,4 @@ def graph_of_map(vi_map: VIMap, options: RelaxationOptions) -> PoseGraph:
         )
     if len(vi_map.missions) > 1:
         ids += (robot.astype(np.uint64) + np.uint64(ord("a"))) << np.uint64(_ROBOT_SHIFT)
-    return PoseGraph(
-        id=ids,
-        T_G_V=vi_map.T_G_I,
-        first=parts.from_vertex,
-        second=parts.to_vertex,
-        T_A_B=parts.T_A_B,
-        information=0.5 * (information + np.swapaxes(information, 1, 2)),
-        fixed=np.zeros(0, dtype=np.int64),
-    )
+    return np.asarray(ids)

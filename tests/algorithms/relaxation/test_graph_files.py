@@ -98,6 +98,25 @@ def test_export_writes_what_was_imported():
     np.testing.assert_allclose(graph.T_G_V, back.T_G_V)
 
 
+def test_edges_that_point_backwards_and_ids_with_gaps_are_odometry():
+    graph = read_g2o(shared_data("g2o/smallGrid3D.g2o"))
+    turned = is_odometry(graph)
+    T_A_B = np.where(turned[:, None], se3.inverse(graph.T_A_B), graph.T_A_B)
+    first = np.where(turned, graph.second, graph.first)
+    second = np.where(turned, graph.first, graph.second)
+    ids = 10 * graph.id + np.uint64(1 << 63)
+    backwards = dataclasses.replace(graph, id=ids, first=first, second=second, T_A_B=T_A_B)
+    vi_map = map_of_graph(backwards)
+    assert len(vi_map.missions) == 1
+    assert len(vi_map.transformation_edges) == len(graph.id) - 1
+    again = graph_of_map(vi_map, RelaxationOptions())
+    assert again.id.tolist() == ids.tolist()
+    assert np.all(again.second[is_odometry(again)] > again.first[is_odometry(again)])
+    once = dataclasses.replace(PLAIN, num_iterations=1)
+    cost, wanted = (optimize_graph(g, once).cost_before for g in (again, backwards))
+    assert cost == pytest.approx(wanted, rel=1e-9)
+
+
 def _disturbed(graph, seed):
     """Return the graph with three of ten loop edges false, the graph without them, and which they are."""
     rng = np.random.default_rng(seed)
