@@ -7,17 +7,24 @@ tests/fuzz/findings/READER once it is mended.
 from __future__ import annotations
 
 import argparse
+import inspect
 import random
 import sys
 import tempfile
 from pathlib import Path
+from types import ModuleType
 
 import maplab_py
 from tests.fuzz.mutations import mutated
 
+_READING = ("maplab_py.interop.", "maplab_py.storage.")
+
 
 def _compiled_modules() -> list[str]:
-    """Return the modules with functions for numba, which does not compile instrumented ones."""
+    """Return the modules with functions for numba, which does not compile instrumented ones.
+
+    `instrument_rest` does their other functions.
+    """
     root = Path(maplab_py.__file__).parent
     return [
         ".".join(("maplab_py", *path.relative_to(root).with_suffix("").parts))
@@ -26,12 +33,27 @@ def _compiled_modules() -> list[str]:
     ]
 
 
+def instrument_rest(module: ModuleType) -> None:
+    """Instrument the functions and methods of a module that numba does not compile."""
+    import atheris
+
+    scopes = (module, *(value for value in vars(module).values() if inspect.isclass(value)))
+    for scope in scopes:
+        for value in vars(scope).values():
+            if inspect.isfunction(value) and value.__module__ == module.__name__:
+                atheris.instrument_func(value)
+
+
 def main() -> None:
     """Run libFuzzer on a reader; the process ends with its status."""
     import atheris
 
-    with atheris.instrument_imports(include=["maplab_py"], exclude=_compiled_modules()):
+    compiled = _compiled_modules()
+    with atheris.instrument_imports(include=["maplab_py"], exclude=compiled):
         from tests.fuzz.readers import READERS, check
+    for name in compiled:
+        if name in sys.modules and name.startswith(_READING):
+            instrument_rest(sys.modules[name])
 
     parser = argparse.ArgumentParser()
     parser.add_argument("reader", choices=sorted(READERS))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+import struct
 
 WORDS = (
     *(b"nan", b"inf", b"-1", b"0", b"1e308", b"-1e-320", b"1e400", b"abc", b"null", b"true", b"''"),
@@ -19,6 +20,12 @@ WORDS = (
         b"\xff\xff\xff\xff\xff\xff\xff\x7f",
     ),
 )
+NUMBERS = (
+    *(struct.pack("<i", value) for value in (0, 1, 2, -1, 7, 1 << 16, (1 << 31) - 1, -(1 << 31))),
+    *(struct.pack("<q", value) for value in (0, 1, 3, -1, 1 << 32, (1 << 63) - 1, -(1 << 63))),
+    *(struct.pack("<d", value) for value in (0.0, -1.0, 1e-300, 1e200, float("nan"), float("inf"))),
+    *(struct.pack("<f", value) for value in (1.0, 1e30, float("nan"), float("inf"))),
+)
 _WORD = re.compile(rb"[-+.\w]+")
 
 
@@ -27,7 +34,9 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
     head, body = data[:1], data[1:]
     if len(body) < 3:
         return data + rng.choice(WORDS)
-    change = rng.choice((_with_other_word, _with_other_word, _with_other_lines, _with_other_bytes))
+    is_text = b"\0" not in body
+    changes = (_with_other_word, _with_other_word, _with_other_lines, _with_other_bytes)
+    change = rng.choice(changes if is_text else (*changes, _with_other_number, _with_other_number))
     return head + change(rng, body)
 
 
@@ -38,6 +47,12 @@ def _with_other_word(rng: random.Random, data: bytes) -> bytes:
     a, b = rng.choice(words).span()
     other = rng.choice(words).group() if rng.random() < 0.3 else rng.choice(WORDS)
     return data[:a] + other + data[b:]
+
+
+def _with_other_number(rng: random.Random, data: bytes) -> bytes:
+    number = rng.choice(NUMBERS)
+    a = rng.randrange(max(1, len(data) - len(number)))
+    return data[:a] + number + data[a + len(number) :]
 
 
 def _with_other_lines(rng: random.Random, data: bytes) -> bytes:

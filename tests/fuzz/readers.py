@@ -102,7 +102,7 @@ def _named(folder: Path, names: tuple[str, ...], data: bytes) -> Path:
 
 
 def _scene() -> Scene:
-    return Scene(vertices=3, landmarks=12)
+    return Scene(vertices=3, landmarks=150)  # 5 are seen twice or more
 
 
 # -- calibrations -------------------------------------------------------------------------------

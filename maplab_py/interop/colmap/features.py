@@ -87,7 +87,8 @@ class ColmapDatabase:
         if image is None:
             raise MapError(f"{self.path}: has no image {name}: name the database of this model")
         rows, columns, data = self._row("keypoints", "rows, cols, data", image) or (0, 2, b"")
-        values = self._array(data, rows, columns, np.dtype("<f4"), name).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of signalling NaN, which are refused
+            values = self._array(data, rows, columns, np.dtype("<f4"), name).astype(np.float64)
         if columns < 2 or not (np.abs(values) < _LARGEST_KEYPOINT).all():
             raise self._damaged(f"the keypoints of image {name} are no pixels")
         if rows != count:

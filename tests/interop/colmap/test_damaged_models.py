@@ -164,6 +164,15 @@ def test_databases_that_do_not_fit(binary: Path, tmp_path: Path) -> None:
         import_colmap(binary, database=tmp_path / "other.db")
     one_line(error)
     with sqlite3.connect(tmp_path / "other.db") as store:
+        signalling_nan = b"\x01\x00\x80\x7f" * 2
+        store.execute(
+            "UPDATE keypoints SET rows = 1, cols = 2, data = ? WHERE image_id = 1",
+            (signalling_nan,),
+        )
+    store.close()
+    with np.errstate(invalid="raise"), pytest.raises(MapError, match="are no pixels"):
+        import_colmap(binary, database=tmp_path / "other.db")
+    with sqlite3.connect(tmp_path / "other.db") as store:
         store.execute("UPDATE images SET name = 'another' WHERE image_id = 1")
     store.close()
     with pytest.raises(MapError, match="name the database of this model"):
