@@ -31,6 +31,7 @@ LARGEST = 1e100
 """Numbers beyond it, whose squares overflow, are no measurements: readers of text refuse them."""
 RAISE_THE_BOUND = "raise --proto_max_size_megabytes if it is really that large"
 _CHUNK = 1 << 20
+_UTF_16 = b"\xff\xfe", b"\xfe\xff"
 _FIRST_CHUNK = 1 << 12
 _ZIP_DIRECTORY_ENTRIES = 10_000
 
@@ -100,12 +101,15 @@ def read_text(
 ) -> str:
     """Return the text of a file with line ends `\\n`; see `read_bytes`.
 
+    UTF-16 is known by its byte order mark.
+
     Raises:
         OSError: The file cannot be read.
         UnicodeDecodeError: It is not text.
         UserError: It is larger than max_bytes.
     """
-    text = read_bytes(path, max_bytes, remedy=remedy, error=error).decode(encoding)
+    content = read_bytes(path, max_bytes, remedy=remedy, error=error)
+    text = content.decode("utf-16" if content.startswith(_UTF_16) else encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

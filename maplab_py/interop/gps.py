@@ -1,8 +1,8 @@
 """Positions of satellite receivers: CSV with time, latitude, longitude and altitude, and NMEA 0183.
 
-NMEA: sentences GGA of any talker have the fixes, RMC the date (NMEA 0183, v4.11). Altitudes are
-made ellipsoidal: GGA's altitude above the geoid plus its separation. Rows that are no fixes are left out
-and counted by reason.
+NMEA: sentences GGA of any talker have the fixes, or GNS where there are none, RMC and ZDA the date
+(NMEA 0183, v4.11). Altitudes are made ellipsoidal: that above the geoid plus its separation. Rows that are
+no fixes are left out and counted by reason.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ _NAMES = (
 _STATUS = re.compile(r"(.*\.)?(nav_?sat_?)?status(\.status)?")
 _QUALITY = re.compile(r"(gps_?|fix_?)?(quality|fix_?type)")
 _SENTENCE = re.compile(
-    r"\$(?P<body>[A-Z]{2}(?P<kind>GGA|RMC)),(?P<fields>[^*$]*)(\*(?P<sum>[0-9A-F]{2}))?",
+    r"\$(?P<body>[A-Z]{2}(?P<kind>GGA|GNS|RMC|ZDA)),(?P<fields>[^*$]*)(\*(?P<sum>[0-9A-F]{2}))?",
     re.IGNORECASE,
 )
-_NMEA = re.compile(r"^[^,;]{0,80}[$!][A-Z]{2}[A-Z]{3},", re.IGNORECASE | re.MULTILINE)
-_LEAST_FIELDS = {"GGA": 14, "RMC": 9}
+_NMEA = re.compile(r"^.{0,80}[$!][A-Z]{2}[A-Z]{3},", re.IGNORECASE | re.MULTILINE)
+_FIXES = ("GGA", "GNS")
+_LEAST_FIELDS = {"GGA": 14, "GNS": 12, "RMC": 9, "ZDA": 4}
 """Fields of a whole sentence, which is told by them where nothing has a check sum."""
 _REASON = "<U40"
 NO_FIX, ZERO, BEYOND = "without a fix", "latitude 0, longitude 0", "beyond 90 or 180 deg"
@@ -135,7 +136,10 @@ def gps_track(
         ((str(name), int(count)) for name, count in counts), key=lambda item: -item[1]
     )
     if not len(kept):
-        said = ", ".join(f"{count} {reason}" for reason, count in left_out) or "no GGA sentences"
+        said = (
+            ", ".join(f"{count} {reason}" for reason, count in left_out)
+            or "no GGA or GNS sentences"
+        )
         raise MapError(f"{source}: there are no fixes: {said}")
     lat, lon, alt = fixes[kept].T
     # a rectangle in the ocean off Africa
@@ -169,22 +173,22 @@ def _check_order(times_ns: I64, fixes: F64, kept: I64, source: str, places: list
 def _from_csv(text: str, source: str, time_unit: str) -> GpsTrack:
     table = parse_text_table(text, source, FIXES, unit=time_unit, allow_nan=True)
     reasons = np.full(len(table.times_ns), "", dtype=_REASON)
-    if len(table.header) == table.values.shape[1] + 1:
-        for place, name in enumerate(table.header[1:]):
+    if table.names:
+        for place, name in enumerate(table.names):
             if _STATUS.fullmatch(name):
                 reasons[table.values[:, place] < 0.0] = f"{NO_FIX} (status -1)"
             elif _QUALITY.fullmatch(name):
                 reasons[table.values[:, place] <= 0.0] = f"{NO_FIX} (quality 0)"
-    fixes = table.values[:, _columns(table)]
+    places = _columns(table)
+    fixes = np.append(table.values[:, places[:2]], table.columns(places[2:], "length"), axis=1)
     return gps_track(table.times_ns, fixes, source, reasons, table.line_numbers)
 
 
 def _columns(table: TextTable) -> list[int]:
     """Return the columns of latitude, longitude and altitude among the values."""
     width = table.values.shape[1]
-    if len(table.header) == width + 1:
-        names = table.header[1:]
-        places = [[k for k, name in enumerate(names) if p.fullmatch(name)] for p in _NAMES]
+    if table.names:
+        places = [[k for k, name in enumerate(table.names) if p.fullmatch(name)] for p in _NAMES]
         if all(places):
             return [matching[0] for matching in places]
     elif width == 3:
@@ -199,16 +203,18 @@ class _Sentence(NamedTuple):
     """Content of a sentence."""
 
     clock_ns: int | None  # time of day
-    day_ns: int | None = None  # of RMC
-    is_valid: bool = False  # RMC of a receiver with a fix, whose date is therefore right
-    fix: tuple[float, float, float] | None = None  # of GGA
+    day_ns: int | None = None  # of RMC and ZDA
+    is_valid: bool = False  # of a receiver with a fix, whose date is therefore right
+    fix: tuple[float, float, float] | None = None  # of GGA and GNS
     reason: str = ""  # why it is none
 
 
 def _from_nmea(text: str, source: str, date: str) -> GpsTrack:
-    """Read GGA sentences; the days follow their hours from the RMC sentences, or from a given date."""
+    """Read sentences with fixes; the days follow their hours from those with dates, or from a given date."""
     given_ns = _day_ns(date) if date else None
-    lines = [line for line in text.splitlines() if re.search("(GGA|RMC),", line, re.IGNORECASE)]
+    source_kind = next((kind for kind in _FIXES if re.search(f"{kind},", text, re.I)), _FIXES[0])
+    wanted = re.compile(f"({source_kind}|RMC|ZDA),", re.IGNORECASE)
+    lines = [line for line in text.splitlines() if wanted.search(line)]
     matches = [match for line in lines if (match := _SENTENCE.search(line)) is not None]
     summed = {match["kind"].upper() for match in matches if match["sum"]}
     sentences = [s for match in matches if (s := _parse(match, summed)) is not None]
@@ -216,7 +222,9 @@ def _from_nmea(text: str, source: str, date: str) -> GpsTrack:
     is_fix = np.array([s.fix is not None for s in timed], dtype=np.bool_)
     times_ns = _times_ns(timed, is_fix, given_ns)
     if times_ns is None:
-        raise UserError(f"{source}: has no date (no RMC sentences): give --gps_date=YYYY-MM-DD")
+        raise UserError(
+            f"{source}: has no date (no RMC or ZDA sentences): give --gps_date=YYYY-MM-DD"
+        )
     times_ns = times_ns[is_fix]
     fixes = np.array([s.fix for s in timed if s.fix is not None], dtype=np.float64).reshape(-1, 3)
     reasons = np.full(len(fixes), "", dtype=_REASON)
@@ -235,15 +243,19 @@ def _parse(match: re.Match[str], summed: Set[str]) -> _Sentence | None:
     fields, kind = match["fields"].strip().split(","), match["kind"].upper()
     if not (_is_intact(match) if kind in summed else len(fields) >= _LEAST_FIELDS[kind]):
         return None
-    if kind == "GGA" and (len(fields) < 11 or fields[5] in ("", "0")):
+    if kind in _FIXES and (len(fields) < 11 or not fields[5].upper().strip("0N")):
         return _Sentence(None, reason=NO_FIX)
     try:
         clock_ns = _time_of_day_ns(fields[0])
-        if kind == "GGA":
-            return _Sentence(clock_ns, fix=_fix(fields))
+        if kind in _FIXES:
+            return _Sentence(clock_ns, fix=_fix(fields, 10 if kind == "GGA" else 9))
     except ValueError:
-        return None if kind == "GGA" else _Sentence(None)
-    return _Sentence(clock_ns, _rmc_day_ns(fields), fields[1].upper() == "A")
+        return None if kind in _FIXES else _Sentence(None)
+    if kind == "ZDA":
+        return _Sentence(clock_ns, _day_of("".join(fields[1:4])), fields[3] >= "2000")
+    return _Sentence(
+        clock_ns, _day_of(fields[8] if len(fields) > 8 else ""), fields[1].upper() == "A"
+    )
 
 
 def _times_ns(
@@ -279,11 +291,14 @@ def _is_intact(match: re.Match[str]) -> bool:
     return match["sum"] is not None and int(match["sum"], 16) in sums
 
 
-def _fix(fields: list[str]) -> tuple[float, float, float]:
-    """Return latitude, longitude [deg] and ellipsoidal altitude [m] of GGA; ValueError if they are none."""
+def _fix(fields: list[str], separation: int) -> tuple[float, float, float]:
+    """Return latitude, longitude [deg] and ellipsoidal altitude [m]; ValueError if they are none.
+
+    The separation of the geoid is in the field of this number.
+    """
     lat = _degrees(fields[1], fields[2].upper(), "NS")
     lon = _degrees(fields[3], fields[4].upper(), "EW")
-    altitude_m = float(fields[8]) + float(fields[10] or 0.0) if fields[8] else np.nan
+    altitude_m = float(fields[8]) + float(fields[separation] or 0.0) if fields[8] else np.nan
     return lat, lon, altitude_m
 
 
@@ -305,12 +320,12 @@ def _time_of_day_ns(text: str) -> int:
     return whole * 1_000_000_000 + int((fraction or "0").ljust(9, "0")[:9])
 
 
-def _rmc_day_ns(fields: list[str]) -> int | None:
-    """Return the day [ns] of ddmmyy, None where a receiver does not know it."""
+def _day_of(date: str) -> int | None:
+    """Return the day [ns] of ddmmyy or ddmmyyyy, None where a receiver does not know it."""
     try:
-        day, month, year = (int(fields[8][k : k + 2]) for k in (0, 2, 4))
-        return _day_ns(f"{2000 + year}-{month:02d}-{day:02d}")
-    except (ValueError, IndexError, UserError):
+        day, month, year = int(date[:2]), int(date[2:4]), int(date[4:])
+        return _day_ns(f"{year if year >= 100 else year + 2000}-{month:02d}-{day:02d}")
+    except (ValueError, UserError):
         return None
 
 

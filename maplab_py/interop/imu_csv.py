@@ -1,8 +1,9 @@
-"""IMU recordings in EuRoC's form: `t[ns], gyro x y z [rad/s], accel x y z [m/s^2]`."""
+"""IMU recordings in EuRoC's form: `t[ns], gyro x y z [rad/s], accel x y z [m/s^2]`, or with named columns."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,19 @@ from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
 from maplab_py.interop.stamps import IMU
-from maplab_py.interop.text_table import format_rows, read_text_table
+from maplab_py.interop.text_table import TextTable, format_rows, read_text_table
 from maplab_py.output_files import write_text
 
 _HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
 )
+_NAME = re.compile(
+    r"(?:.*?\.)??(?:(?P<accel>a|acc|accel|accelerometer|acceleration|linear[_ ]?acc(?:el(?:eration)?)?|alpha)"
+    r"|(?P<gyro>w|g|gyr|gyro|gyroscope|omega|ang(?:ular)?[_ ]?(?:vel(?:ocity)?|rate)))"
+    r"(?:_[a-z0-9_]*?)?[_. ]?(?P<axis>[xyz])"
+)
+_ORDER = [f"{sensor}{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,7 +37,7 @@ class ImuRecording:
 
 
 def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> ImuRecording:
-    """Read an EuRoC IMU file.
+    """Read a table of IMU samples: columns as their names say, without names those of EuRoC.
 
     Args:
         path: File.
@@ -41,14 +48,11 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
         MapError: The file cannot be read, has other columns, or its stamps do not increase.
     """
     table = read_text_table(path, IMU, unit=time_unit)
-    if table.values.shape[1] != 6:
-        raise MapError(
-            f"{path}: 7 columns are expected (time, gyroscope xyz, accelerometer xyz), "
-            f"not {table.values.shape[1] + 1}"
-        )
-    order = [3, 4, 5, 0, 1, 2]
-    if len(table.header) == 7 and table.header[1].startswith("a"):
-        order = [0, 1, 2, 3, 4, 5]
+    places = _places(table)
+    values = [
+        table.columns(part, quantity)
+        for part, quantity in ((places[:3], "acceleration"), (places[3:], "rate"))
+    ]
     late = np.flatnonzero(np.diff(table.times_ns) <= 0)
     if in_order and len(late):
         line = table.line_numbers[late[0] + 1]
@@ -56,7 +60,33 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
             f"{path}:{line}: the time stamp does not come after that of the row above: sort the rows or "
             "remove this one"
         )
-    return ImuRecording(table.times_ns, table.values[:, order], table.line_numbers, table.note)
+    return ImuRecording(
+        table.times_ns, np.concatenate(values, axis=1), table.line_numbers, table.note
+    )
+
+
+def _places(table: TextTable) -> list[int]:
+    """Return the places of accelerations and rates, x y z each, among the columns of values.
+
+    Raises:
+        MapError: Names or number of the columns do not tell them.
+    """
+    places: dict[str, int] = {}
+    for place, name in enumerate(table.names):
+        if (match := _NAME.fullmatch(name)) is not None:
+            sensor = "accel" if match["accel"] else "gyro"
+            places.setdefault(sensor + match["axis"], place)
+    if all(name in places for name in _ORDER):
+        return [places[name] for name in _ORDER]
+    width = table.values.shape[1]
+    axes = [name for name in table.names if re.search(r"[xyz]$", name)]
+    if width != 6 or axes:
+        raise MapError(
+            f"{table.source}: 7 columns are expected (time, gyroscope xyz, accelerometer xyz), or names as "
+            f"w_x, w_y, w_z, a_x, a_y, a_z in the header; "
+            + (f"it has {', '.join(axes)}" if axes else f"not {width + 1}")
+        )
+    return [3, 4, 5, 0, 1, 2]
 
 
 def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = False) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -20,10 +21,34 @@ from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 _MAX_BYTES = 500_000_000
 _SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
+_DEG, _G = np.pi / 180.0, 9.80665
 _AXIS, _AXES = re.compile(r"(^|[^a-z])[a-z]{0,2}[wxyz]\W*(\[.*)?$"), 3
 _ID = re.compile(r"(^|[-_. ])id$")
 _SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")
-_TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$")
+_TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$|^utc$")
+_DATE = re.compile(
+    r"^(?P<before>[^\d]{0,2})(?P<day>\d{4}([-/])\d\d\3\d\d)[T\s]\s*(?P<clock>\d\d:\d\d:\d\d)(?P<part>[.]\d*)?"
+    r"(?:Z|\s?UTC|[+-]00:?00)?(?=[\s,;\"]|$)"
+)
+"""A date and time of UTC at the beginning of a row, as ISO 8601 and RTKLIB write it."""
+_GPS_TIME = re.compile(r"^gpst$|\bgps[_ ]?time$")
+_UNITS = {
+    "number": ("1 -",),
+    "length": ("m meter meters metre metres", "cm", "mm", "km", "ft"),
+    "angle": ("rad radian radians", "deg degree degrees °"),
+    "velocity": ("m/s ms-1", "cm/s", "mm/s", "km/h kmh"),
+    "rate": ("rad/s rads-1 1/s s-1", "deg/s degs-1 dps °/s"),
+    "acceleration": ("m/s2 ms-2 m/s/s m/s²", "cm/s2", "g", "mg"),
+}
+_SIZES = {
+    "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "deg": _DEG, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6,
+    "deg/s": _DEG, "cm/s2": 1e-2, "g": _G, "mg": 1e-3 * _G,
+}  # fmt: skip
+UNITS_OF = {
+    quantity: {word: _SIZES.get(unit.split()[0], 1.0) for unit in units for word in unit.split()}
+    for quantity, units in _UNITS.items()
+}
+"""Units of each quantity, as they stand in the brackets of a header without blanks and signs of powers."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,6 +63,7 @@ class TextTable:
     unit: str  # of the time stamps as written: s, ms, us or ns
     has_commas: bool
     note: str = ""  # one line on the unit, where it was concluded against header or custom
+    units: tuple[str, ...] = ()  # of the columns in `header`, "" where it tells none
 
     def take(self, rows: NDArray[np.bool_]) -> TextTable:
         """Return some of the rows."""
@@ -52,6 +78,34 @@ class TextTable:
     def is_nanoseconds(self) -> bool:
         """The file's time stamps were nanoseconds."""
         return self.unit == "ns"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns of values; () where the header does not name each."""
+        return self.header[1:] if len(self.header) == self.values.shape[1] + 1 else ()
+
+    def columns(self, places: Sequence[int], quantity: str) -> F64:
+        """Return columns of values (N, k) in SI units.
+
+        Args:
+            places: Among the values.
+            quantity: A key of `UNITS_OF`, whose units are converted.
+
+        Raises:
+            MapError: The header gives a column another unit.
+        """
+        units, known = self.units[1:] if self.names else (), UNITS_OF[quantity]
+        factors = np.ones(len(places))
+        for k, unit in enumerate(units[place] for place in places if units):
+            short = re.sub(r"[\s^*·]", "", unit.lower())
+            factor = known.get(short, known.get(unit.lower().split(" ")[0] if " " in unit else ""))
+            if short and factor is None:
+                raise MapError(
+                    f"{self.source}: the column '{self.names[places[k]]}' is in [{unit}], which is not known "
+                    f"as a unit of {quantity}: wants one of {', '.join(known)}"
+                )
+            factors[k] = 1.0 if factor is None else factor
+        return np.asarray(self.values[:, places] * factors)
 
 
 def read_text_table(
@@ -96,15 +150,30 @@ def parse_text_table(
 
     With `allow_nan` empty cells, infinities and NaN become NaN; else they are refused.
     """
-    lines, numbers, others = _data_lines(text)
+    if '"' in text:
+        text = text.replace('"', "")  # cells of tables have no commas of their own
+    lines, numbers, others, has_dates = _data_lines(text)
     if not lines:
-        raise MapError(f"{source}: there are no rows in the file: write or copy it again")
-    if ";" in lines[0] and "," not in lines[0]:
+        raise MapError(
+            f"{source}: there are no rows that begin with a time stamp: wants a number, or a date as "
+            "2024-05-06T07:08:09.5"
+        )
+    if ";" in lines[0]:
+        if "," in lines[0]:
+            lines = [line.replace(",", ".") for line in lines]  # decimal commas
         lines, others = ([line.replace(";", ",") for line in part] for part in (lines, others))
     has_commas = "," in lines[0]
-    header, time_name, rows = _named_cells(others, lines, source)
+    header, units, time_name, rows = _named_cells(others, lines, source)
+    if has_dates:
+        unit, time_name = "s", ""
+        if header and _GPS_TIME.search(header[0]):
+            raise MapError(
+                f"{source}: has dates of GPS time, which leap seconds part from UTC: write UTC, as RTKLIB's "
+                "time format does"
+            )
     if len(header) > 1 and _SECONDS.fullmatch(header[0]) and _NANOSECONDS.fullmatch(header[1]):
         header, time_name = ("time", *header[2:]), "time [s]"  # the stamp of ROS in two columns
+        units = units[1:]
         rows = [[f"{row[0]}.{row[1]:0>9}", *row[2:]] if len(row) > 1 else row for row in rows]
     widths = np.array([len(row) for row in rows])
     wrong = np.flatnonzero(widths != widths[0])
@@ -116,7 +185,7 @@ def parse_text_table(
         )
     kept = _numeric(header, rows)
     if len(kept) < len(rows[0]):
-        header = tuple(header[k] for k in kept)
+        header, units = (tuple(part[k] for k in kept) for part in (header, units))
         rows = [[row[k] for k in kept] for row in rows]
     if len(kept) < 2:
         raise MapError(f"{source}:{numbers[0]}: a time stamp and values are expected")
@@ -143,6 +212,7 @@ def parse_text_table(
         stamps.unit,
         has_commas,
         stamps.note,
+        units,
     )
 
 
@@ -172,15 +242,18 @@ def seconds_text(times_ns: I64) -> tuple[I64, I64]:
     return seconds, rest
 
 
-def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
-    """Return the rows, their line numbers, and the comments and headers."""
+def _data_lines(text: str) -> tuple[list[str], list[int], list[str], bool]:
+    """Return the rows, their line numbers, the comments and headers, and whether stamps were dates."""
     lines: list[str] = []
     numbers: list[int] = []
     others: list[str] = []
+    has_dates = False
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
         if not line:
             continue
+        if (has_dates or not lines) and (date := _DATE.match(line)) is not None:
+            has_dates, line = True, date["before"] + _seconds(date) + line[date.end() :]
         if line.startswith(("#", "%")) or (
             not lines and not _is_number(_split(line.replace(";", ","))[0])
         ):
@@ -188,13 +261,22 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str]]:
             continue
         lines.append(line)
         numbers.append(number)
-    return lines, numbers, others
+    return lines, numbers, others, has_dates
+
+
+def _seconds(date: re.Match[str]) -> str:
+    """Return the seconds since 1970 of a date, with its digits; the date itself if it is none."""
+    try:
+        day = dt.datetime.fromisoformat(f"{date['day'].replace('/', '-')}T{date['clock']}+00:00")
+    except ValueError:
+        return date[0]
+    return f"{int(day.timestamp())}{date['part'] or ''}"
 
 
 def _named_cells(
     others: list[str], lines: list[str], source: str
-) -> tuple[tuple[str, ...], str, list[list[str]]]:
-    """Return the names of the columns, what tells the unit of the stamps, and the cells of the rows.
+) -> tuple[tuple[str, ...], tuple[str, ...], str, list[list[str]]]:
+    """Return names and units of the columns, what tells the unit of the stamps, and the cells of the rows.
 
     The names are in the line that has as many as the rows have cells, wherever it stands: of several the
     last that begins with a time stamp and names the most axes, as prose does not.
@@ -219,7 +301,9 @@ def _named_cells(
     telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
     names = (re.sub(r"[\[(].*?[\])]", "", word).strip(" \t\"'").lower() for word in chosen)
     header, rows = tuple(names), [cells(line) for line in lines]
-    place = _time_place(header) if fitting and not timed and "," in lines[0] else 0
+    units = tuple("".join(re.findall(r"[\[(](.*?)[\])]", word)[:1]).strip() for word in chosen)
+    is_table = "," in lines[0] or _axes(chosen) >= _AXES  # else it may be prose
+    place = _time_place(header) if fitting and not timed and is_table else 0
     if place:  # the stamp comes first
         about = [chosen[place], *about]
         telling = [name for name in about if header_unit(name)]
@@ -228,7 +312,8 @@ def _named_cells(
             for row in rows
         ]
         header = (header[place], *header[:place], *header[place + 1 :])
-    return header, telling[0] if telling else "", rows
+        units = (units[place], *units[:place], *units[place + 1 :])
+    return header, units, telling[0] if telling else "", rows
 
 
 def _axes(words: list[str]) -> int:

@@ -42,7 +42,7 @@ _KINDS = {
     "ba": "b_a", "b_a": "b_a", "acc bias": "b_a", "accel bias": "b_a",
 }  # fmt: skip
 _NAME = re.compile(
-    r"(?:.*?\.)?(gyro bias|acc(?:el)? bias|orientation quaternion|position|pos|quaternion|quat|orientation"
+    r"(?:.*?\.)??(gyro bias|acc(?:el)? bias|orientation quaternion|position|pos|quaternion|quat|orientation"
     r"|rotation|translation|velocity|vel|b_?[wga]|[ptqv])?(?:_[a-z0-9_]*?)?[_. ]?([wxyz])"
 )
 _TURN = re.compile(r"^q|quat|orient|rotation")
@@ -127,7 +127,7 @@ def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tup
         MapError: As in `read_trajectory`.
     """
     names = _columns(table)
-    p = table.values[:, [names[f"p{i}"] for i in "xyz"]]
+    p = table.columns([names[f"p{i}"] for i in "xyz"], "length")
     q = np.tile(so3.identity(), (len(p), 1))
     if "qw" in names:
         q = table.values[:, [names[f"q{i}"] for i in "xyzw"]]
@@ -135,7 +135,7 @@ def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tup
         _refuse(table, np.abs(norm - 1.0) > _UNIT_TOLERANCE, "the quaternion is not of unit length")
         q = q / norm[:, None]
     rows = np.arange(len(p))
-    v_R = _optional(table, names, "v")
+    v_R = _optional(table, names, "v", "velocity")
     if _VERTEX_TABLE in table.header:  # the program's own table, of missions one after the other
         rows = np.argsort(table.times_ns, kind="stable")
     in_M = [
@@ -146,13 +146,15 @@ def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tup
     if in_M and v_R is not None:  # poses are in G and velocities in M
         v_R = so3.rotate(so3.multiply(q, so3.inverse(table.values[:, in_M[0]])), v_R)
     backwards = np.diff(table.times_ns[rows], prepend=table.times_ns[rows[0]]) < 0
-    _refuse(table, backwards, "the time stamp lies before that of the row above")
+    _refuse(
+        table, backwards, "the time stamp lies before that of the row above: sort the rows by time"
+    )
     trajectory = Trajectory(
         table.times_ns,
         np.concatenate([q, p], axis=1),
         v_R,
-        _optional(table, names, "b_g"),
-        _optional(table, names, "b_a"),
+        _optional(table, names, "b_g", "rate"),
+        _optional(table, names, "b_a", "acceleration"),
         table.source,
         table.note,
         "qw" in names,
@@ -295,9 +297,7 @@ def _columns(table: TextTable) -> dict[str, int]:
 def _named_columns(table: TextTable) -> dict[str, int]:
     """Return the columns that the header names; nothing without one."""
     names: dict[str, int] = {}
-    if len(table.header) != table.values.shape[1] + 1:
-        return names
-    for place, name in enumerate(table.header[1:]):
+    for place, name in enumerate(table.names):
         match = _NAME.fullmatch(name)
         if match is not None:
             prefix = (match[1] or "").replace("orientation quaternion", "q")
@@ -309,10 +309,10 @@ def _named_columns(table: TextTable) -> dict[str, int]:
     return names
 
 
-def _optional(table: TextTable, names: dict[str, int], kind: str) -> F64 | None:
+def _optional(table: TextTable, names: dict[str, int], kind: str, quantity: str) -> F64 | None:
     places = [names.get(f"{kind}{axis}") for axis in "xyz"]
     present = [place for place in places if place is not None]
-    return table.values[:, present] if len(present) == 3 else None
+    return table.columns(present, quantity) if len(present) == 3 else None
 
 
 def _refuse(table: TextTable, wrong: NDArray[np.bool_], reason: str) -> None:

@@ -6,12 +6,14 @@
 | dx, dy, dyaw; or dx, dy, dz, dqx, dqy, dqz, dqw | poses in the frame of the row before |
 | vx, vy, wz; or vx, vy, vz, wx, wy, wz | velocities of the wheels in their own frame |
 
-Columns of movements sideways (y, dy, vy) may be missing. Angles are radians, distances metres.
+Columns of movements sideways (y, dy, vy) may be missing. Angles are radians, distances metres, unless the
+header says otherwise.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,8 @@ _ALIASES = {
     "v": "vx", "v_x": "vx", "v_y": "vy", "v_z": "vz", "linear_x": "vx", "linear_y": "vy",
     "w": "wz", "omega": "wz", "w_x": "wx", "w_y": "wy", "w_z": "wz", "angular_z": "wz",
 }  # fmt: skip
+_ROS = re.compile(r"(?:.*\.)?(position|orientation|linear|angular)\.([wxyz])")
+_ROS_KINDS = {"position": "", "orientation": "q", "linear": "v", "angular": "w"}
 _PLANAR = {
     "poses": ("x", "y", "yaw"),
     "motions": ("dx", "dy", "dyaw"),
@@ -101,20 +105,33 @@ def accumulated(T_A_B: F64) -> F64:
 
 def _columns(table: TextTable) -> tuple[str, bool, F64]:
     """Return what the rows are, whether they are planar, and the columns (N, 3, 6 or 7)."""
-    names = [_ALIASES.get(name, name) for name in table.header[1:]]
-    if len(names) == table.values.shape[1]:
-        for is_planar, kinds in ((False, _SPATIAL), (True, _PLANAR)):
-            for kind, wanted in kinds.items():
-                if set(wanted) - set(names) <= (_OPTIONAL if is_planar else set()):
-                    zero = np.zeros(len(table.times_ns))
-                    values = [
-                        table.values[:, names.index(n)] if n in names else zero for n in wanted
-                    ]
-                    return kind, is_planar, np.stack(values, axis=1)
+    names = [_ALIASES.get(name, _of_ros(name)) for name in table.names]
+    for is_planar, kinds in ((False, _SPATIAL), (True, _PLANAR)):
+        for kind, wanted in kinds.items():
+            if set(wanted) - set(names) <= (_OPTIONAL if is_planar else set()):
+                zero = np.zeros(len(table.times_ns))
+                values = [
+                    table.columns([names.index(n)], _quantity(n))[:, 0] if n in names else zero
+                    for n in wanted
+                ]
+                return kind, is_planar, np.stack(values, axis=1)
     raise MapError(
         f"{table.source}: no wheel odometry: a header is wanted that names, after the time stamp, x, y, yaw "
         "or dx, dy, dyaw or vx, vy, wz"
     )
+
+
+def _of_ros(name: str) -> str:
+    """Return the name of a column of nav_msgs/Odometry or geometry_msgs/Twist; others as they are."""
+    match = _ROS.fullmatch(name)
+    return name if match is None else _ROS_KINDS[match[1]] + match[2]
+
+
+def _quantity(name: str) -> str:
+    """Return which of the quantities of tables a column has."""
+    if name.removeprefix("d").startswith("q"):
+        return "number"
+    return {"v": "velocity", "w": "rate"}.get(name[0], "angle" if "yaw" in name else "length")
 
 
 def _poses(table: TextTable, columns: F64, *, is_planar: bool) -> F64:

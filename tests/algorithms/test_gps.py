@@ -365,6 +365,35 @@ def test_sentences_of_other_programs(tmp_path: Path) -> None:
     assert dict(read_gps(path, day).left_out) == {"damaged": 1}
 
 
+def test_dates_of_zda_and_fixes_of_gns(tmp_path: Path) -> None:
+    path = tmp_path / "track.nmea"
+    zda = [sentence(f"GNZDA,12000{k}.00,14,11,2023,00,00") for k in range(3)]
+    unset = [sentence(f"GNZDA,12000{k}.00,06,01,1980,00,00") for k in range(3)]
+    rmc = [sentence(f"GNRMC,12000{k},A,4700.0,N,00800.0,E,0,0,141123,,,A") for k in range(3)]
+    gga = [clock(f"12000{k}.00") for k in range(3)]
+    gns = "GNGNS,12000{}.00,4700.0,N,00800.0,E,{},9,1.0,1.0,46.0,,"
+    modes = [sentence(gns.format(k, "NN" if k == 1 else "RN")) for k in range(3)]
+    wrapped = [f'17000000{k},"{line}"' for k, line in enumerate([*rmc, *gga])]
+    for lines, count in (
+        ([*zda, *gga], 3),
+        ([unset[0], *zda[1:], *gga], 3),
+        ([*rmc, *modes], 2),
+        ([*rmc, *gga, *modes], 3),
+        (["time,sentence", *wrapped], 3),
+    ):
+        path.write_text("\n".join(lines))
+        track = read_gps(path)
+        assert len(track) == count
+        assert track.times_ns[0] == 1699963200_000_000_000
+        assert dict(track.left_out) == ({} if count == 3 else {"without a fix": 1})
+    assert track.altitude_m[0] == 1.0
+    path.write_text("\n".join([*rmc, *modes]))
+    assert read_gps(path).altitude_m[0] == 47.0
+    path.write_text("\n".join([*rmc, sentence("GNGLL,4700.0,N,00800.0,E,120000.00,A,A")]))
+    with pytest.raises(MaplabError, match="no GGA or GNS sentences"):
+        read_gps(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -92,7 +92,7 @@ class GpsOptions:
         "of the map, or else the median of the fixes",
     )
     date: str = option(
-        "", help="Day of the first fix as YYYY-MM-DD, for NMEA files without RMC sentences"
+        "", help="Day of the first fix as YYYY-MM-DD, for NMEA files without RMC and ZDA sentences"
     )
     topic: str = option("", help="Topic of a bag with sensor_msgs/NavSatFix; empty = the only one")
     align: bool = option(
