@@ -70,7 +70,7 @@ def read_gps(path: Path, date: str = "", time_unit: str = "") -> GpsTrack:
     Args:
         path: File. CSV has a header with latitude, longitude and altitude after the time stamp, or just
             these four columns [s or ns, deg, deg, m].
-        date: Day of the first fix as YYYY-MM-DD, for NMEA without RMC sentences.
+        date: Day of the first fix as YYYY-MM-DD, for NMEA without RMC and ZDA sentences.
         time_unit: Unit of the time stamps of CSV; empty = see `stamps`.
 
     Raises:

@@ -235,7 +235,7 @@ def _check_numbers(vi_map: VIMap, findings: _Findings) -> None:
                 refused=True,
             )
             if name.startswith("T_"):
-                length = np.linalg.norm(values[:, :4], axis=1)
+                length = np.hypot.reduce(values[:, :4], axis=1)  # squares may overflow
                 error = np.abs(length - 1.0)
                 findings.check(
                     f"{noun} whose {name} has a quaternion that is not of unit length",

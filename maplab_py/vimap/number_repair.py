@@ -41,7 +41,7 @@ def without_bad_numbers(vi_map: VIMap) -> tuple[VIMap, list[str]]:
 
     for field, name in _POSES.items():
         table: Any = getattr(vi_map, field)
-        length = np.linalg.norm(table.columns()[name][:, :4], axis=1)
+        length = np.hypot.reduce(table.columns()[name][:, :4], axis=1)
         scaled = (
             np.isfinite(length) & (length > 0.0) & (np.abs(length - 1.0) > LOADED_UNIT_TOLERANCE)
         )

@@ -87,7 +87,7 @@ def check_poses(values: F64, where: str, name: Name) -> None:
         MapError: A pose has a value that is not finite, or no unit quaternion.
     """
     finite(values, where, name)
-    length = np.linalg.norm(values[:, :4], axis=1)
+    length = np.hypot.reduce(values[:, :4], axis=1)  # squares may overflow
     bad = np.flatnonzero(np.abs(length - 1.0) > LOADED_UNIT_TOLERANCE)
     if len(bad) and not _ACCEPTS_ALL.get():
         raise MapError(
