@@ -81,7 +81,7 @@ def test_quaternions_of_another_length_are_scaled(
     with pytest.raises(MapError, match="not of unit length"):
         save_map(bad, tmp_path / "map")
     save_unchecked(bad, tmp_path / "map", monkeypatch)
-    with pytest.raises(MapError, match="has length .*, not 1"):
+    with pytest.raises(MapError, match=r"has length .*, not 1"):
         load_map(tmp_path / "map")
     repaired, report = load_map(tmp_path / "map", repair=True)
     assert "1 quaternion of vertices scaled to unit length" in report.notes
