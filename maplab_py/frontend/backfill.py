@@ -89,7 +89,7 @@ class WaitingFrames:
             if not times_ns[0] <= at_ns <= times_ns[-1]:
                 continue
             from_ns = self.frames[-1].time_ns if self.frames else at_ns
-            cut_ns, cut = _cut(times_ns, samples, from_ns, at_ns)
+            cut_ns, cut = cut_samples(times_ns, samples, from_ns, at_ns)
             self.frames.append(
                 dataclasses.replace(
                     frame, time_ns=at_ns, imu_times_ns=cut_ns, accel_gyro=cut,
@@ -99,7 +99,7 @@ class WaitingFrames:
             self.stamps_ns.append(stamp_ns)
 
 
-def _cut(times_ns: I64, samples: F64, from_ns: int, to_ns: int) -> tuple[I64, F64]:
+def cut_samples(times_ns: I64, samples: F64, from_ns: int, to_ns: int) -> tuple[I64, F64]:
     """Return the samples from one time to another, interpolated at both."""
     inside = slice(
         int(np.searchsorted(times_ns, from_ns, side="right")), int(np.searchsorted(times_ns, to_ns))

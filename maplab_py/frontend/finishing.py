@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.recording_check.doctor import check_map
 from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
@@ -63,7 +64,7 @@ def finish(
     output = mapping.options.output
     problems = [mapping.problem] if mapping.problem else []
     notes = [*mapping.statistics.notes, *_calibration_notes(mapping), *_stream_notes(mapping)]
-    notes += _localization_notes(mapping)
+    notes += [*_tie_notes(mapping), *_localization_notes(mapping)]
     vi_map: VIMap | None = None
     doubts: tuple[str, ...] = ()
     disk_copy: DiskCopy | None = None
@@ -72,6 +73,7 @@ def finish(
         if mapping.builder is not None:
             vi_map, _ = mapping.builder.finish(progress=progress)
             doubts = scale_doubts(vi_map)
+            notes += check_map(vi_map)
             if output.optimize_map_to_localization_map:
                 try:
                     vi_map = localization_map(
@@ -216,6 +218,23 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
                 else "the map keeps the file's"
             )
             notes.append(f"it differs from the file's by more than three deviations: {of_map}")
+    return notes
+
+
+def _tie_notes(mapping: Mapping) -> list[str]:
+    """Return how the missions after restarts are placed."""
+    notes = []
+    for number, tie in enumerate(mapping.builder.ties() if mapping.builder else ()):
+        if tie is not None:
+            use = (
+                "" if tie.is_known else "; too unsure to look for places there: anchor_all_missions"
+            )
+            notes.append(f"mission {number + 1} is tied to mission {number} by {tie.words}{use}")
+        elif number:
+            notes.append(
+                f"mission {number + 1} is not tied to mission {number}: lc and anchor_all_missions do so "
+                "where they see the same places"
+            )
     return notes
 
 

@@ -10,6 +10,7 @@ from maplab_py.frontend.odometry_options import HealthOptions
 
 _TILT = slice(3, 5)
 _VELOCITY = slice(6, 9)
+_BLIND_NS = 500_000_000
 
 
 class HealthMonitor:
@@ -19,11 +20,17 @@ class HealthMonitor:
         """Start with a healthy estimate."""
         self._options = options
         self._tracked_ns = -1
+        self._newest_ns = -1
 
     @property
     def healthy_until_ns(self) -> int:
         """Time of the last frame with enough tracks."""
         return self._tracked_ns
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether tracks, and not the states before, are the reason of a divergence."""
+        return self._newest_ns - self._tracked_ns > _BLIND_NS
 
     def problem(self, state: BodyStates, covariance: F64, tracks: int) -> str:
         """Return why an estimate has diverged, empty if it has not.
@@ -34,6 +41,7 @@ class HealthMonitor:
             tracks: Number of keypoints that were seen in the frame before, too.
         """
         options, time_ns = self._options, int(state.times_ns[0])
+        self._newest_ns = time_ns
         columns = (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias)
         if not all(np.isfinite(column).all() for column in columns):
             return "the estimate is not a number"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError
 from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.dead_reckoning import Tie, tied
 from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
@@ -85,6 +87,16 @@ class MapBuilder:
         """
         self._missions[-1].add_imu(times_ns, accel_gyro)
 
+    def add_imu_after_end(self, times_ns: I64, accel_gyro: F64) -> None:
+        """Add samples that lead from the end of the present mission towards the next one."""
+        if self._missions:
+            self._missions[-1].add_imu_after_end(times_ns, accel_gyro)
+
+    def doubt_end(self) -> None:
+        """Say that the present mission has diverged: the next one is not tied to it."""
+        if self._missions:
+            self._missions[-1].is_doubtful = True
+
     def is_due(self, time_ns: int) -> bool:
         """Tell whether a frame of this time becomes a vertex."""
         last_ns = self._missions[-1].last_ns
@@ -132,6 +144,7 @@ class MapBuilder:
         state: BodyStates,
         frames: Sequence[TrackedFrame | None],
         images: Sequence[U8 | None] = (),
+        covariance: F64 | None = None,
     ) -> None:
         """Add a vertex at the time up to which samples have been added.
 
@@ -139,11 +152,13 @@ class MapBuilder:
             state: The state of the body then.
             frames: Keypoints by camera; None where a camera has none. Descriptors are required.
             images: Images by camera, kept as resources if the options say so.
+            covariance: Of the state (15, 15), order [p, theta, v, b_g, b_a]; None = not known.
 
         Raises:
             UserError: An image cannot be written.
         """
-        self._missions[-1].add_vertex(state, tuple(frames), self._image_rows(frames, images))
+        rows = self._image_rows(frames, images)
+        self._missions[-1].add_vertex(state, tuple(frames), rows, covariance)
 
     def _image_rows(
         self, frames: Sequence[TrackedFrame | None], images: Sequence[U8 | None]
@@ -164,24 +179,32 @@ class MapBuilder:
         """Remove the vertices of the present mission after a time: their states are doubtful."""
         self._missions[-1].drop_after(time_ns)
 
+    def ties(self) -> list[Tie | None]:
+        """Return how each mission of the map is tied to the one before; None = it is not, as the first."""
+        imu, missions = self._device.imu, self._used_missions()
+        assert imu is not None
+        return [None, *(a.tie_to(b, imu) for a, b in itertools.pairwise(missions))]
+
+    def _used_missions(self) -> list[RecordedMission]:
+        return [mission for mission in self._missions if len(mission) >= _MIN_VERTICES]
+
     def make_map(self) -> VIMap:
         """Return the map so far, without landmarks; missions of fewer than two vertices are left out.
+
+        Missions that IMU samples lead to are placed by them, beside a loop closure edge that says how surely.
 
         Raises:
             EstimationError: No mission has two vertices.
         """
-        parts = [
-            mission_map(self._device, mission, self._images)
-            for mission in self._missions
-            if len(mission) >= _MIN_VERTICES
-        ]
-        if not parts:
+        missions = self._used_missions()
+        if not missions:
             raise EstimationError(
                 "there is no map: the odometry has estimated fewer than two vertices"
             )
-        result = parts[0]
-        for part in parts[1:]:
-            result = stack(result, part)
+        result = mission_map(self._device, missions[0], self._images)
+        for mission, tie in zip(missions[1:], self.ties()[1:], strict=True):
+            part = mission_map(self._device, mission, self._images)
+            result = stack(result, part) if tie is None else tied(result, part, tie)
         return result
 
     def make_part(self, mission: int, first: int) -> VIMap | None:

@@ -238,6 +238,11 @@ class Mapping:
     def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
         if update.healthy_until_ns:
             builder.drop_after(update.healthy_until_ns)
+        if update.has_diverged:
+            builder.doubt_end()
+        is_between = update.state is None or update.mission != self._mission
+        if is_between and update.since_last is not None:
+            builder.add_imu_after_end(update.since_last.times_ns, update.since_last.accel_gyro)
         if update.state is None:
             self._keep_before_start(update, builder)
             return
@@ -249,7 +254,8 @@ class Mapping:
         if update.released is not None:
             builder.refine(update.released)
         if builder.is_due(update.time_ns):
-            builder.add_vertex(update.state, _frames(update), update.images)
+            covariance = None if update.window is None else update.window.covariance
+            builder.add_vertex(update.state, _frames(update), update.images, covariance)
         if update.backfill is not None:
             builder.fill(update.backfill)
 

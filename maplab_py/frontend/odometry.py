@@ -259,13 +259,13 @@ class Odometry:
 
     def _process(self, frame_set: FrameSet | TrackedFrameSet) -> OdometryUpdate:
         note = ""
-        interval = None
+        interval = since_last = None
         self._apply_delay()
         time_ns = frame_set.time_ns + self._delay_ns
         if self._last_ns is None:
             self._buffer.forget_before(time_ns)
         else:
-            interval = self._buffer.cut(self._last_ns, time_ns)
+            interval = since_last = self._buffer.cut(self._last_ns, time_ns)
             if interval.largest_step_ns > self.options.max_imu_gap_s * 1e9:
                 note = self._in_gap(interval)
                 interval = None
@@ -295,6 +295,7 @@ class Odometry:
             note=note,
             images=images,
             tracks=frame_set if isinstance(frame_set, TrackedFrameSet) else None,
+            since_last=since_last,
         )
         if self._gap_end_ns >= 0:
             return update
@@ -466,10 +467,10 @@ class Odometry:
             problem = str(error)
         update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
         if problem:
-            healthy_until_ns = self._health.healthy_until_ns
+            healthy_until_ns, is_blind = self._health.healthy_until_ns, self._health.is_blind
             return dataclasses.replace(
                 update, interval=None, note=self._start_again(problem),
-                healthy_until_ns=healthy_until_ns,
+                healthy_until_ns=healthy_until_ns, has_diverged=not is_blind,
             )  # fmt: skip
         self._gyro_bias = result.gyro_bias
         self._speed_mps = float(np.linalg.norm(result.v_M))

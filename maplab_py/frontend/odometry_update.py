@@ -62,6 +62,10 @@ class OdometryUpdate:
     window: WindowSummary | None = None
     note: str = ""  # why the estimator waits, or why it was started again
     healthy_until_ns: int = 0  # states after this time are doubtful; 0 = none is
+    has_diverged: bool = False  # the states before that time may be wrong, too
+    since_last: ImuInterval | None = (
+        None  # all samples since the frame before, whatever has happened
+    )
     images: tuple[U8, ...] = ()  # grey, by camera; empty for tracks of a replay
     tracks: TrackedFrameSet | None = None  # of a replay
     stamp_ns: int = 0  # of the images, without a delay that was estimated

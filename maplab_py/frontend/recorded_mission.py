@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import collections
 import hashlib
 from collections.abc import Sequence
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
+from maplab_py.frontend.backfill import cut_samples
 from maplab_py.frontend.body_states import BodyStates
+from maplab_py.frontend.dead_reckoning import LONGEST_S, Tie
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
+from maplab_py.sensors import Imu
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import DescriptorBlock
@@ -28,6 +32,8 @@ from maplab_py.vimap.tables import (
 )
 
 Frame = TrackedFrame | None
+_KEPT = 128
+"""Vertices at the end whose covariances are kept: a few seconds without tracks are removed again."""
 
 _PRESENT = FrameField.SIGMA | FrameField.SCALE | FrameField.TRACK_ID
 """Optional fields of keypoints that frames have; `LANDMARK_ID` follows with the landmarks."""
@@ -42,7 +48,9 @@ class RecordedMission:
         self.frames: list[tuple[Frame, ...]] = []
         self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none
         self.edges: list[tuple[I64, F64]] = []  # times and samples between vertices
+        self.is_doubtful = False  # it has diverged: nothing can be tied to its end
         self._samples: list[tuple[I64, F64]] = []  # since the last vertex
+        self._covariances: collections.deque[tuple[int, F64]] = collections.deque(maxlen=_KEPT)
         self._row_of_time: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -58,8 +66,34 @@ class RecordedMission:
         if self.states:
             self._samples.append((times_ns, accel_gyro))
 
+    def add_imu_after_end(self, times_ns: I64, accel_gyro: F64) -> None:
+        """Add samples that lead from the last vertex to the next mission, unless they are too many."""
+        last_ns = self.last_ns
+        if last_ns is None or self.is_doubtful:
+            return
+        self.add_imu(times_ns, accel_gyro)
+        if times_ns[-1] - last_ns > LONGEST_S * 1e9:
+            self.is_doubtful, self._samples = True, []
+
+    def tie_to(self, following: RecordedMission, imu: Imu) -> Tie | None:
+        """Return where the first vertex of the following mission is; None = nobody knows."""
+        if not self.states or not following.states or self.is_doubtful:
+            return None
+        last, first_ns = self.states[-1], int(following.states[0].times_ns[0])
+        times_ns, samples = merged_samples(self._samples)
+        last_ns = int(last.times_ns[0])
+        if not len(times_ns) or not times_ns[0] <= last_ns < first_ns <= times_ns[-1]:
+            return None
+        times_ns, samples = cut_samples(times_ns, samples, last_ns, first_ns)
+        covariance = next((c for at_ns, c in self._covariances if at_ns == last_ns), None)
+        return Tie.by_samples(imu, last, covariance, times_ns, samples)
+
     def add_vertex(
-        self, state: BodyStates, frames: tuple[Frame, ...], image_rows: Sequence[int]
+        self,
+        state: BodyStates,
+        frames: tuple[Frame, ...],
+        image_rows: Sequence[int],
+        covariance: F64 | None = None,
     ) -> None:
         """Add a vertex; see `MapBuilder.add_vertex`.
 
@@ -73,7 +107,10 @@ class RecordedMission:
                 raise ValueError(f"IMU samples do not reach from {ends[0]} to {ends[1]} ns")
             self.edges.append((times_ns, accel_gyro))
             self._samples = []
-        self._row_of_time[int(state.times_ns[0])] = len(self.states)
+        time_ns = int(state.times_ns[0])
+        self._row_of_time[time_ns] = len(self.states)
+        if covariance is not None:
+            self._covariances.append((time_ns, covariance))
         self.states.append(state)
         self.frames.append(frames)
         self.image_rows.append(image_rows)
@@ -96,12 +133,13 @@ class RecordedMission:
         self._row_of_time = {time_ns: row for row, time_ns in enumerate(times_ns)}
 
     def drop_after(self, time_ns: int) -> None:
-        """Remove vertices after a time, with the samples that lead to them."""
+        """Remove vertices after a time; the samples that lead to them lead to the next mission."""
         kept = sum(int(state.times_ns[0]) <= time_ns for state in self.states)
         for column in (self.states, self.frames, self.image_rows):
             del column[kept:]
-        del self.edges[max(kept - 1, 0) :]
-        self._samples = []
+        first = max(kept - 1, 0)
+        self._samples = [*self.edges[first:], *self._samples] if kept else []
+        del self.edges[first:]
         self._row_of_time = {t: row for t, row in self._row_of_time.items() if row < kept}
 
     def forget_before(self, first: int) -> None:
@@ -130,6 +168,13 @@ class RecordedMission:
                     states.gyro_bias[index],
                     states.accel_bias[index],
                 )
+
+
+def merged_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
+    """Join pieces in the order of time, each time once; images that got another delay let pieces overlap."""
+    times_ns, samples = joined_samples(parts)
+    times_ns, rows = np.unique(times_ns, return_index=True)
+    return times_ns, samples[rows]
 
 
 def joined_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:

@@ -11,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
+from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.finishing import finish, scale_verdict
+from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
@@ -205,18 +208,24 @@ def test_a_full_disk_leaves_the_map_in_memory(
     assert "in memory as 'walk'" in finished.report.failure
 
 
-def test_divergence_makes_a_second_mission_and_drops_doubtful_vertices() -> None:
-    recording, start = recording_of()
+def covered(recording: EditedRecording, first: int = 25, last: int = 50) -> EditedRecording:
+    """Return a recording whose cameras see nothing for some frames."""
     sets = [item for item in recording.items_of if isinstance(item, TrackedFrameSet)]
-    dark = {item.time_ns for item in sets[25:50]}
+    dark = {item.time_ns for item in sets[first:last]}
     items = tuple(
         dataclasses.replace(item, frames=(None, None))
         if isinstance(item, TrackedFrameSet) and item.time_ns in dark
         else item
         for item in recording.items_of
     )
+    return dataclasses.replace(recording, items_of=items)
+
+
+def test_divergence_makes_a_second_mission_and_drops_doubtful_vertices() -> None:
+    recording, start = recording_of()
+    sets = [item for item in recording.items_of if isinstance(item, TrackedFrameSet)]
     progress = Interrupting(-1)
-    mapping = Mapping(dataclasses.replace(recording, items_of=items), make_starter=start)
+    mapping = Mapping(covered(recording), make_starter=start)
     mapping.run(progress)
     report = finish(mapping, recording.name).report
     assert report.missions >= 2
@@ -232,6 +241,47 @@ def test_divergence_makes_a_second_mission_and_drops_doubtful_vertices() -> None
         position_errors(start.truth, vi_map.vertices.timestamp_ns, vi_map.vertices.T_M_I).max()
         < 0.2
     )
+
+
+def test_missions_after_darkness_are_tied() -> None:
+    """The known start gives states in the true frame, so that true base frames are the identity."""
+    recording, start = recording_of()
+    mapping = Mapping(covered(recording), make_starter=start)
+    mapping.run()
+    finished = finish(mapping, recording.name)
+    vi_map = finished.vi_map
+    assert vi_map is not None
+    assert vi_map.baseframes.is_known.all()
+    edges = vi_map.loop_closure_edges
+    assert len(edges) == len(vi_map.missions) - 1 == 1
+    assert vi_map.vertices.mission[[edges.from_vertex[0], edges.to_vertex[0]]].tolist() == [0, 1]
+    sigma_m = np.sqrt(np.trace(edges.covariance[0, :3, :3]))
+    assert np.linalg.norm(vi_map.T_G_M[1, 4:]) < 3.0 * sigma_m < 1.5
+    assert abs(vi_map.T_G_M[1, 2]) < 0.01
+    assert check_consistency(vi_map).failure == ""
+    assert any("mission 2 is tied to mission 1 by " in note for note in finished.report.notes)
+
+
+def test_a_mission_after_a_wrong_state_is_not_tied() -> None:
+    recording, start = recording_of()
+    mapping = Mapping(recording, make_starter=start)
+    frames = [item for item in recording.items_of if isinstance(item, TrackedFrameSet)]
+    middle_ns = frames[len(frames) // 2].time_ns
+    problem = HealthMonitor.problem
+
+    def wrong_once(self: HealthMonitor, state: BodyStates, covariance: F64, tracks: int) -> str:
+        text = problem(self, state, covariance, tracks)
+        return "speed 30.0 m/s" if state.times_ns[0] == middle_ns else text
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HealthMonitor, "problem", wrong_once)
+        mapping.run()
+    finished = finish(mapping, recording.name)
+    assert finished.vi_map is not None
+    assert len(finished.vi_map.missions) == 2
+    assert len(finished.vi_map.loop_closure_edges) == 0
+    assert not finished.vi_map.baseframes.is_known.any()
+    assert any("mission 2 is not tied" in note for note in finished.report.notes)
 
 
 def test_a_run_that_never_starts_says_why() -> None:

@@ -42,12 +42,18 @@ from maplab_py.algorithms.recording_check.turn_checks import (
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import VIMap
 
 QUICK_S = 4.0
 """Seconds at the beginning that a run looks at before it starts."""
+_OF_CALIBRATION = (
+    "unit", "axes", "sign", "time offset", "rotation", "cameras", "scale", "shutter"
+)  # fmt: skip
+"""Beginnings of the checks that a map's tracks and samples allow, and that bend a map."""
 _STEREO_PX, _SWAPPED_SHARE, _FITS_PX, _UNLIKE_SCALE = 1.2, 0.5, 0.4, 0.015
 
 
@@ -146,6 +152,24 @@ def explain_refusal(recording: Recording, stream: StreamOptions, reason: str) ->
     return (
         f"{recording.name}: the odometry has not started: {first.line} (check_recording tells more)"
     )
+
+
+def check_map(vi_map: VIMap) -> tuple[str, ...]:
+    """Return a line on what the tracks and samples of the longest mission say against the calibration.
+
+    The first seconds of a recording may not show it, and a map bends by it. None if all is well.
+    """
+    counts = np.bincount(vi_map.vertices.mission, minlength=len(vi_map.missions))
+    try:
+        recording = MapRecording(vi_map, int(np.argmax(counts)))
+        if recording.device.imu is None:
+            return ()
+        findings = diagnose(recording).findings
+    except MapError:
+        return ()
+    chosen = [f for f in findings if f.check.startswith(_OF_CALIBRATION)]
+    first = cause(chosen)
+    return () if first is None else (f"this recording shows: {first.line}",)
 
 
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from maplab_py.frontend.initialization.segment import History
 from maplab_py.frontend.initialization.standstill import motionlessness, start_at_rest
 from maplab_py.frontend.starting import Start
 from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.vision.tracking.views import focal_length_px
 
 _MOST_LENIENT = 3.0
 """Limits grow no further than by this factor while nothing better comes."""
@@ -65,6 +66,7 @@ class Initializer:
         self._options = options or InitializationOptions()
         self._options.check()
         self._imu = device.imu
+        self._focal_px = min(focal_length_px(camera) for camera in device.cameras)
         self._history = History(self._options.longest_s + 1e-3)
         self._motion = MotionStart(device.cameras, device.T_I_C, device.imu, self._options)
         self._first_ns: int | None = None
@@ -86,10 +88,12 @@ class Initializer:
         duration_s = (frames[-1].time_ns - frames[0].time_ns) * 1e-9
         if duration_s >= options.rest_s - 0.5 * duration_s / max(len(frames) - 1, 1):
             times_ns, accel_gyro = history.samples(options.rest_s + 1e-3)
-            if motionlessness(frames, accel_gyro).is_rest(options):
+            seen = motionlessness(frames, accel_gyro)
+            if seen.is_rest(options):
                 self.reason = ""
                 sigma = accel_bias_sigma(self._imu, options)
-                state = start_at_rest(self._imu, times_ns, accel_gyro, sigma)
+                rate_radps = seen.rate_radps(self._focal_px)
+                state = start_at_rest(self._imu, times_ns, accel_gyro, sigma, rate_radps=rate_radps)
                 return Start(frame, state, is_resting=True)
         if self._pending is None:
             self._pending = self._begin(frame)

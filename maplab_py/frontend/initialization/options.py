@@ -19,8 +19,8 @@ class InitializationOptions:
     rest_disparity_px: float = option(
         0.5,
         unit="px",
-        help="Largest median disparity in 0.1 s at rest, turns included; or half of it over half a second "
-        "and longer, noise of the tracks removed",
+        help="Largest median disparity in 0.1 s at rest, turns included; half of it over half a second and "
+        "longer, noise of the tracks removed, where there are so many images",
     )
     rest_accel_deviation_mps2: float = option(
         0.25, unit="m/s^2", help="Largest deviation of the accelerometer at rest"

@@ -23,6 +23,8 @@ _LONG_SHARE = 0.5
 _VELOCITY_SIGMA_MPS = 0.02
 _POSITION_SIGMA_M = 1e-4
 _LEAST_GYRO_SIGMA_RADPS = 2e-4
+_DISTANCE_M = 3.0
+"""Distance of the keypoints, to tell a velocity from their motion while nothing is known of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,13 +37,24 @@ class Motionlessness:
     gyro_deviation_radps: float
 
     def is_rest(self, options: InitializationOptions) -> bool:
-        """Tell whether the device rests."""
+        """Tell whether the device rests.
+
+        A slow steady turn is below the limit of 0.1 s, and the samples do not show it: only the longer
+        times do.
+        """
         limit = options.rest_disparity_px
+        is_slow = self.rate_px < _LONG_SHARE * limit
+        if np.isnan(self.rate_px):
+            is_slow = self.disparity_px < limit
         return (
-            (self.disparity_px < limit or self.rate_px < _LONG_SHARE * limit)
+            is_slow
             and self.accel_deviation_mps2 < options.rest_accel_deviation_mps2
             and self.gyro_deviation_radps < options.rest_gyro_deviation_radps
         )
+
+    def rate_radps(self, focal_px: float) -> float:
+        """Return the angular velocity with which keypoints move; 0 where nothing can be said."""
+        return 0.0 if np.isnan(self.rate_px) else self.rate_px / _COMPARED_S / focal_px
 
 
 def motionlessness(frames: list[WindowFrame], accel_gyro: F64) -> Motionlessness:
@@ -63,17 +76,21 @@ def motionlessness(frames: list[WindowFrame], accel_gyro: F64) -> Motionlessness
     )
 
 
-def start_at_rest(imu: Imu, times_ns: I64, accel_gyro: F64, accel_bias_sigma: float) -> StartState:
-    """Return the state of a device that rests.
+def start_at_rest(
+    imu: Imu, times_ns: I64, accel_gyro: F64, accel_bias_sigma: float, *, rate_radps: float = 0.0
+) -> StartState:
+    """Return the state of a device that rests, or nearly so.
 
     What the accelerometer measures is gravity and bias; of the bias only the part along gravity can be told,
-    so that the tilt is as uncertain as the rest of it.
+    so that the tilt is as uncertain as the rest of it. Keypoints that move slowly may show a turn, which is
+    in the mean of the gyroscope, or a translation.
 
     Args:
         imu: For gravity, scale and misalignment.
         times_ns: Times (S,) of samples at rest.
         accel_gyro: The samples (S, 6).
         accel_bias_sigma: Standard deviation of a component of the accelerometer's bias [m/s^2].
+        rate_radps: Angular velocity with which keypoints move.
     """
     mean = np.mean(accel_gyro, axis=0)
     force, gyro_bias = mean[:3], mean[3:]
@@ -93,8 +110,8 @@ def start_at_rest(imu: Imu, times_ns: I64, accel_gyro: F64, accel_bias_sigma: fl
         [
             _POSITION_SIGMA_M,
             accel_bias_sigma / gravity,
-            _VELOCITY_SIGMA_MPS,
-            gyro_sigma,
+            max(_VELOCITY_SIGMA_MPS, _DISTANCE_M * rate_radps),
+            max(gyro_sigma, rate_radps),
             accel_bias_sigma,
         ],
         3,

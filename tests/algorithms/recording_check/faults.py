@@ -48,6 +48,7 @@ class FaultyRecording:
     edit_imu: Callable[[np.ndarray], np.ndarray] = lambda values: values
     edit_image: Callable[[int, int, CameraImage], CameraImage | None] | None = None
     imu_shift_ns: int = 0
+    repeat_ns: int = 0  # every sample is given again so much later; 0 = it is not
     notes: tuple[str, ...] = ()
     kind: str = "edited recording"
 
@@ -68,8 +69,12 @@ class FaultyRecording:
         counts = [0] * len(self.device.cameras)
         for item in self.plain.items():
             if isinstance(item, ImuBatch):
-                values = self.edit_imu(item.accel_gyro.copy())
-                imu.append(ImuBatch(item.times_ns + self.imu_shift_ns, values, item.is_saturated))
+                values, times_ns = self.edit_imu(item.accel_gyro.copy()), item.times_ns
+                is_saturated = item.is_saturated
+                if self.repeat_ns:
+                    times_ns = (times_ns[:, None] + [0, self.repeat_ns]).ravel()
+                    values, is_saturated = (np.repeat(c, 2, axis=0) for c in (values, is_saturated))
+                imu.append(ImuBatch(times_ns + self.imu_shift_ns, values, is_saturated))
             elif isinstance(item, CameraImage) and self.edit_image is not None:
                 edited = self.edit_image(item.camera, counts[item.camera], item)
                 counts[item.camera] += 1
@@ -118,10 +123,11 @@ def with_rig(
     recording: Recording,
     *,
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    move_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     rows: tuple[int, ...] = (),
     camera: Callable[[Camera], Camera] = lambda camera: camera,
 ) -> FaultyRecording:
-    """Turn cameras on the body, or change their models, in the calibration; () = all rows."""
+    """Turn and move cameras on the body, or change their models, in the calibration; () = all rows."""
     device = recording.device
     rig, T = device.rig, device.rig.T_B_C.copy()
     rows = rows or tuple(range(len(rig.cameras)))
@@ -129,6 +135,7 @@ def with_rig(
     cameras = list(rig.cameras)
     for row in rows:
         T[row] = se3.compose(T[row], wrong)
+        T[row, 4:] += move_m
         cameras[row] = camera(cameras[row])
     changed = dataclasses.replace(rig, cameras=tuple(cameras), T_B_C=T)
     known = {**device.sensors.sensors, rig.id: changed}

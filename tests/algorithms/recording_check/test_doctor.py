@@ -12,6 +12,7 @@ import pytest
 from maplab_py.algorithms.recording_check.correction import correct
 from maplab_py.algorithms.recording_check.doctor import (
     check_first_seconds,
+    check_map,
     diagnose,
     explain_refusal,
     first_cause,
@@ -141,6 +142,17 @@ def test_a_refused_start_is_explained_by_its_cause():
     assert explain_refusal(mission(), stream, "move more") == "move more"
     reason = explain_refusal(faults.with_imu(mission(), EYE, np.degrees(EYE)), stream, "move more")
     assert "the odometry has not started: unit of the gyroscope" in reason
+
+
+def test_a_map_tells_what_contradicts_its_calibration():
+    vi_map, device = replayed(MOTION)[0], mission().device
+    assert check_map(vi_map) == ()
+    turned = faults.with_rig(mission(), turn_deg=(0.0, 8.0, 0.0)).device
+    (line,) = check_map(vi_map.replace(sensors=turned.sensors))
+    assert line.startswith("this recording shows: rotation of the extrinsics")
+    assert "--vio_estimate=extrinsics" in line
+    alone = dataclasses.replace(device.sensors, sensors={device.rig_id: device.rig})
+    assert check_map(vi_map.replace(sensors=alone)) == ()
 
 
 def test_a_recording_without_imu_cannot_work():

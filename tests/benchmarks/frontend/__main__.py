@@ -1,7 +1,8 @@
 """Accuracy and time of the online front-end: `python -m tests.benchmarks.frontend [FOLDER ...]`.
 
-Folders are EuRoC folders with ground truth (run with all cameras and with the first alone), or maps
-(replayed, and compared with `optvi` of the recorded map). Without folders: the shared data.
+`strangers` as the first word runs that benchmark. Folders are EuRoC folders with ground truth (run with
+all cameras and with the first alone), or maps (replayed, and compared with `optvi` of the recorded map).
+Without folders: the shared data.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import sys
 from pathlib import Path
 
+from tests.benchmarks.frontend import strangers
 from tests.benchmarks.frontend.sequences import TRUTH, SequenceResult, run
 from tests.support.data import shared_data_folder
 
@@ -35,6 +37,9 @@ COLUMNS = (
 
 def main() -> None:
     """Run the sequences and print a table; write JSON if asked to."""
+    if sys.argv[1:2] == ["strangers"]:
+        strangers.main(sys.argv[2:])
+        return
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--json", type=Path)

@@ -40,14 +40,14 @@ class Flight:
     accel_bias: F64  # (F, 3)
 
 
-def device(cameras: int = 1) -> RecordedSensors:
+def device(cameras: int = 1, focal_px: float = 458.0) -> RecordedSensors:
     rig_id, imu_id = "a" * 32, "b" * 32
     models = tuple(
         Camera(
             f"{row + 1:032x}",
             Projection.PINHOLE,
             Distortion.RADTAN,
-            np.array([458.0, 457.0, 367.0, 248.0]),
+            np.array([focal_px, focal_px - 1.0, 367.0, 248.0]),
             np.array([-0.28, 0.07, 2e-4, 2e-5]),
             752,
             480,
@@ -82,6 +82,15 @@ def resting(seed: int, seconds: float) -> PoseSpline:
     return PoseSpline(np.tile(start, (int(np.ceil(seconds / _SPACING_S)) + 4, 1)), _SPACING_S)
 
 
+def creeping(seed: int, seconds: float, speed_mps: float, rate_radps: float) -> PoseSpline:
+    """Return a slow steady motion: to the side, turning about the optical axis."""
+    start = lively(seed, 0.2).control[1]
+    time_s = np.arange(int(np.ceil(seconds / _SPACING_S)) + 4) * _SPACING_S
+    turned = so3.exp(rate_radps * time_s[:, None] * np.array([1.0, 0.0, 0.0]))
+    moved = speed_mps * time_s[:, None] * np.array([0.0, 1.0, 0.0])
+    return PoseSpline(se3.compose(start, se3.make(turned, moved)), _SPACING_S)
+
+
 def fly(
     spline: PoseSpline,
     *,
@@ -90,9 +99,10 @@ def fly(
     imu: ImuOptions | None = None,
     outlier_share: float = 0.03,
     points: int = 4000,
+    focal_px: float = 458.0,
 ) -> Flight:
     """Record a motion: keypoints of points on a sphere shell, IMU samples with biases and noise."""
-    rng, rig = np.random.default_rng([seed, 8]), device(cameras)
+    rng, rig = np.random.default_rng([seed, 8]), device(cameras, focal_px)
     options = imu or ImuOptions(gyro_bias_sigma=0.03)
     count = int(spline.duration_s * IMU_HZ)
     sample_s = np.arange(count) / IMU_HZ

@@ -19,6 +19,7 @@ from maplab_py.simulation.scenario import ImuOptions
 from tests.frontend.initialization.flights import (
     Flight,
     body_velocity,
+    creeping,
     fly,
     lively,
     resting,
@@ -138,6 +139,24 @@ def test_at_rest_it_starts_after_a_second(cameras: int, noise_px: float) -> None
     assert np.abs(state.gyro_bias - flight.gyro_bias[0]).max() < 3.0 * state.sigma[9]
     up = so3.rotate(so3.inverse(state.T_M_I[:4]), [0.0, 0.0, 1.0])
     assert state.accel_bias @ up == pytest.approx(bias @ up, abs=0.02)
+
+
+def test_a_slow_turn_does_not_become_bias_of_the_gyroscope() -> None:
+    """A wide lens: 0.4 px in 0.1 s are 0.04 rad/s about the optical axis, and 1.5 cm/s."""
+    flight = fly(creeping(3, 2.0, 0.015, 0.04), seed=3, points=800, focal_px=90.0)
+    assert start(flight).state is None
+
+
+@pytest.mark.parametrize("rate_radps", [0.0, 0.01])
+def test_what_hardly_moves_starts_with_the_deviations_that_it_has(rate_radps: float) -> None:
+    flight = fly(creeping(3, 1.6, rate_radps, rate_radps), seed=3, points=800, focal_px=90.0)
+    result = start(flight)
+    state = result.state
+    assert state is not None
+    errors = np.abs(state.gyro_bias - flight.gyro_bias[result.frame])
+    assert errors.max() < 3.0 * state.sigma[9]
+    assert np.linalg.norm(flight.truth.v_G[result.frame]) < 3.0 * state.sigma[6]
+    assert state.sigma[9] < 0.008 + rate_radps
 
 
 def test_motion_after_a_short_rest_does_not_pass_for_rest() -> None:
