@@ -6,7 +6,6 @@ or because its parts become objects. Everything that is read from outside passes
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import stat
 import zlib
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 if TYPE_CHECKING:
     import zipfile
@@ -36,13 +35,11 @@ _FIRST_CHUNK = 1 << 12
 _ZIP_DIRECTORY_ENTRIES = 10_000
 
 
-@dataclasses.dataclass(frozen=True)
-class SizeOptions:
+class SizeOptions(Options):
     """Bound of what is read."""
 
-    proto_max_size_megabytes: int = option(
-        DEFAULT_MAX_MEGABYTES, help="Refuse files that unpack to more than this.", unit="MB"
-    )
+    proto_max_size_megabytes: int = option(DEFAULT_MAX_MEGABYTES, unit="MB")
+    """Refuse files that unpack to more than this."""
 
     @property
     def max_bytes(self) -> int:

@@ -20,7 +20,7 @@ from maplab_py.console.session.importing import importer
 from maplab_py.console.session.maps import key_of_folder
 from maplab_py.console.session.missions import ALL_MISSIONS, MissionChoice
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, MaplabError, UserError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import Progress
 from maplab_py.report import Message, Report
@@ -43,7 +43,7 @@ _IMPORTED_ON_USE = {
 }
 """Modules that commands without such a need, and `help`, do not wait for."""
 
-API_VERSION = (1, 5)
+API_VERSION = (1, 6)
 """Version of what this file exports: (breaking changes, additions)."""
 
 __all__ = [
@@ -60,6 +60,7 @@ __all__ = [
     "MaplabError",
     "Message",
     "MissionChoice",
+    "Options",
     "Progress",
     "Report",
     "ResidualRows",

@@ -3,43 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.errors import FlagError
 from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.vision.tracking.options import TrackingOptions
 
 
-@dataclasses.dataclass(frozen=True)
-class RestOptions:
+class RestOptions(Options, prefix="vio_rest_"):
     """Conditions of standstill: all must hold."""
 
-    flag_prefix: ClassVar[str] = "vio_rest_"
-
-    max_disparity_px: float = option(
-        0.5,
-        help="Standing still: largest median disparity in 0.1 s, turn removed; half of it over half a "
-        "second, noise of the tracks removed",
-        unit="px",
-    )
-    max_acceleration_deviation: float = option(
-        0.25,
-        help="Standing still: largest deviation of the accelerometer from its mean over 0.5 s",
-        unit="m/s^2",
-    )
-    max_turn_rate: float = option(
-        0.01,
-        help="Standing still: largest mean angular velocity between two images",
-        unit="rad/s",
-    )
-    max_speed: float = option(0.1, help="Standing still: largest estimated speed", unit="m/s")
-    imu_time_s: float = option(
-        0.5, help="Standing still: time over which the accelerometer is compared", unit="s"
-    )
+    max_disparity_px: float = 0.5
+    """Standing still: largest median disparity in 0.1 s, turn removed; half of it over half a second, noise
+    of the tracks removed"""
+    max_acceleration_deviation: float = option(0.25, unit="m/s^2")
+    """Standing still: largest deviation of the accelerometer from its mean over 0.5 s"""
+    max_turn_rate: float = option(0.01, unit="rad/s")
+    """Standing still: largest mean angular velocity between two images"""
+    max_speed: float = option(0.1, unit="m/s")
+    """Standing still: largest estimated speed"""
+    imu_time_s: float = 0.5
+    """Standing still: time over which the accelerometer is compared"""
 
     def check(self) -> None:
         """Check the values.
@@ -53,31 +40,24 @@ class RestOptions:
                 raise FlagError(f"--{self.flag_prefix}{field.name}={value:g}: must be positive")
 
 
-@dataclasses.dataclass(frozen=True)
-class HealthOptions:
+class HealthOptions(Options, prefix="vio_health_"):
     """Criteria of divergence, after which the estimator starts again."""
 
-    flag_prefix: ClassVar[str] = "vio_health_"
-
-    min_tracks: int = option(
-        8,
-        help="Diverged: fewer keypoints than this are tracked, for longer than "
-        "--vio_health_max_time_without_tracks_s",
-    )
-    max_time_without_tracks_s: float = option(
-        2.0, help="Diverged: longest time with too few tracked keypoints", unit="s"
-    )
-    max_speed: float = option(25.0, help="Diverged: largest estimated speed", unit="m/s")
-    max_velocity_sigma: float = option(
-        1.0, help="Diverged: largest standard deviation of the velocity", unit="m/s"
-    )
-    max_tilt_sigma_deg: float = option(
-        10.0, help="Diverged: largest standard deviation of the direction of gravity", unit="deg"
-    )
-    max_accel_bias: float = option(
-        3.0, help="Diverged: largest bias of the accelerometer", unit="m/s^2"
-    )
-    max_gyro_bias: float = option(0.6, help="Diverged: largest bias of the gyroscope", unit="rad/s")
+    min_tracks: int = 8
+    """Diverged: fewer keypoints than this are tracked, for longer than
+    --vio_health_max_time_without_tracks_s"""
+    max_time_without_tracks_s: float = 2.0
+    """Diverged: longest time with too few tracked keypoints"""
+    max_speed: float = option(25.0, unit="m/s")
+    """Diverged: largest estimated speed"""
+    max_velocity_sigma: float = option(1.0, unit="m/s")
+    """Diverged: largest standard deviation of the velocity"""
+    max_tilt_sigma_deg: float = 10.0
+    """Diverged: largest standard deviation of the direction of gravity"""
+    max_accel_bias: float = option(3.0, unit="m/s^2")
+    """Diverged: largest bias of the accelerometer"""
+    max_gyro_bias: float = option(0.6, unit="rad/s")
+    """Diverged: largest bias of the gyroscope"""
 
     def check(self) -> None:
         """Check the values.
@@ -91,42 +71,27 @@ class HealthOptions:
                 raise FlagError(f"--{self.flag_prefix}{field.name}={value:g}: wants 0 or more")
 
 
-@dataclasses.dataclass(frozen=True)
-class OdometryOptions:
+class OdometryOptions(Options, prefix="vio_"):
     """Options of all stages of the odometry."""
-
-    flag_prefix: ClassVar[str] = "vio_"
 
     tracking: TrackingOptions = TrackingOptions()
     initialization: InitializationOptions = InitializationOptions()
     window: WindowOptions = WindowOptions()
     rest: RestOptions = RestOptions()
     health: HealthOptions = HealthOptions()
-    max_imu_gap_s: float = option(
-        0.2,
-        help="Start again after an interval between IMU samples that is longer than this",
-        unit="s",
-    )
+    max_imu_gap_s: float = 0.2
+    """Start again after an interval between IMU samples that is longer than this"""
 
-    estimate: str = option(
-        "time_offset",
-        help="Calibration that is estimated beside the motion, separated by commas: extrinsics, time_offset "
-        "(of the images on the clock of the IMU), intrinsics, line_delay; or none",
-    )
-    apply_calibration: bool = option(
-        True, help="Give the map the calibration that was estimated, where it differs significantly"
-    )
-    imu_noise: str = option(
-        "auto",
-        choices=("auto", "file"),
-        help="Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that "
-        "it cannot be",
-    )
-    backfill: bool = option(
-        True,
-        help="Read the frames before the start backwards from it, so that the map begins with the first "
-        "image",
-    )
+    estimate: str = "time_offset"
+    """Calibration that is estimated beside the motion, separated by commas: extrinsics, time_offset (of the
+    images on the clock of the IMU), intrinsics, line_delay; or none"""
+    apply_calibration: bool = True
+    """Give the map the calibration that was estimated, where it differs significantly"""
+    imu_noise: str = option("auto", choices=("auto", "file"))
+    """Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that it
+    cannot be"""
+    backfill: bool = True
+    """Read the frames before the start backwards from it, so that the map begins with the first image"""
 
     @property
     def estimates_time_offset(self) -> bool:

@@ -11,14 +11,14 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F32, I64, U8
 from maplab_py.interop.text_table import format_rows
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -62,30 +62,25 @@ class DescriptorProjector(Protocol):
         """Return descriptors (N, bytes) as points (N, dimensions)."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CsvExportOptions:
+class CsvExportOptions(Options, prefix="csv_export_"):
     """Tables to write."""
 
-    flag_prefix: ClassVar[str] = "csv_export_"
-
-    vertices: bool = option(True, help="Write vertices.csv")
-    imu_data: bool = option(True, help="Write imu.csv")
-    tracks_and_keypoints: bool = option(True, help="Write tracks.csv")
-    descriptors: bool = option(
-        True, help="Write descriptors.csv (binary descriptors; else empty rows)"
-    )
-    landmarks: bool = option(True, help="Write landmarks.csv")
-    observations: bool = option(True, help="Write observations.csv")
-    absolute_time: bool = option(
-        False,
-        help="Write time stamps as they are; else relative to the mission's first vertex",
-        flag="export_absolute_time",
-    )
-    only_high_quality_landmarks: bool = option(
-        False,
-        help="Leave out landmarks that are not rated good, and their observations",
-        flag="only_export_high_quality_landmarks",
-    )
+    vertices: bool = True
+    """Write vertices.csv"""
+    imu_data: bool = True
+    """Write imu.csv"""
+    tracks_and_keypoints: bool = True
+    """Write tracks.csv"""
+    descriptors: bool = True
+    """Write descriptors.csv (binary descriptors; else empty rows)"""
+    landmarks: bool = True
+    """Write landmarks.csv"""
+    observations: bool = True
+    """Write observations.csv"""
+    absolute_time: bool = option(False, flag="export_absolute_time")
+    """Write time stamps as they are; else relative to the mission's first vertex"""
+    only_high_quality_landmarks: bool = option(False, flag="only_export_high_quality_landmarks")
+    """Leave out landmarks that are not rated good, and their observations"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,14 +6,13 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
 from maplab_py.sensors.sensor_set import Sensor
 
@@ -63,18 +62,13 @@ class RecordedSensors:
         return dataclasses.replace(self, sensors=known)
 
 
-@dataclasses.dataclass(frozen=True)
-class DeviceOptions:
+class DeviceOptions(Options, prefix="selected_"):
     """Choice of the sensors of the device from a sensors.yaml that has several of a kind."""
 
-    flag_prefix: ClassVar[str] = "selected_"
-
-    ncamera_sensor_id: str = option(
-        "", help="Camera rig to use, if sensors.yaml has several: id or unambiguous prefix"
-    )
-    imu_sensor_id: str = option(
-        "", help="IMU to use, if sensors.yaml has several: id or unambiguous prefix"
-    )
+    ncamera_sensor_id: str = ""
+    """Camera rig to use, if sensors.yaml has several: id or unambiguous prefix"""
+    imu_sensor_id: str = ""
+    """IMU to use, if sensors.yaml has several: id or unambiguous prefix"""
 
     def check_unused(self, source: str) -> None:
         """Check that nothing is chosen.

@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 
 
-@dataclasses.dataclass(frozen=True)
-class PipelineOptions:
+class PipelineOptions(Options):
     """Workers of a pipeline, and treatment of tasks that fail."""
 
-    scheduler: str = option(
-        "none",
-        help="Where tasks run: none (one after another), local:N (N processes of this machine) or "
-        "tcp://HOST:PORT (a Dask scheduler with its workers).",
-    )
-    retries: int = option(
-        1, help="How often a task is tried again that failed other than by wrong usage."
-    )
-    resume: bool = option(
-        False, help="Keep the tasks that an earlier run finished; run only the others."
-    )
-    redo_changed: bool = option(
-        False, help="With --resume, run tasks again whose commands, flags or version have changed."
-    )
-    restart: bool = option(False, help="Replace the results of an earlier run.")
-    results_folder: Path | None = option(
-        None, help="Folder of results, logs and reports; empty = the file's name with _results."
-    )
-    task_memory_gb: float = option(
-        0.0,
-        help="A task that takes more is stopped and run once more alone; 0 = its share of the memory.",
-        unit="GB",
-    )
-    task_threads: int = option(0, help="Threads of a task; 0 = its share of the processors.")
+    scheduler: str = "none"
+    """Where tasks run: none (one after another), local:N (N processes of this machine) or tcp://HOST:PORT (a
+    Dask scheduler with its workers)."""
+    retries: int = 1
+    """How often a task is tried again that failed other than by wrong usage."""
+    resume: bool = False
+    """Keep the tasks that an earlier run finished; run only the others."""
+    redo_changed: bool = False
+    """With --resume, run tasks again whose commands, flags or version have changed."""
+    restart: bool = False
+    """Replace the results of an earlier run."""
+    results_folder: Path | None = None
+    """Folder of results, logs and reports; empty = the file's name with _results."""
+    task_memory_gb: float = 0.0
+    """A task that takes more is stopped and run once more alone; 0 = its share of the memory."""
+    task_threads: int = 0
+    """Threads of a task; 0 = its share of the processors."""
 
     def __post_init__(self) -> None:
         """Check the values.

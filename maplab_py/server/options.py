@@ -4,82 +4,60 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class SubmapOptions:
+class SubmapOptions(Options):
     """Preparation of a submap before it is merged."""
 
-    remove_outliers_in_absolute_pose_constraints: bool = option(
-        True, help="Leave out absolute poses that contradict their neighbours (see optvi)."
-    )
-    stationary_submaps_fix_with_lc_edge: bool = option(
-        False,
-        help="Tie the first and the last vertex of a submap that stands still by a loop closure edge.",
-    )
-    submap_loading_thread_pool_size: int = option(
-        4, help="Submaps that are prepared at the same time, each in a process."
-    )
+    remove_outliers_in_absolute_pose_constraints: bool = True
+    """Leave out absolute poses that contradict their neighbours (see optvi)."""
+    stationary_submaps_fix_with_lc_edge: bool = False
+    """Tie the first and the last vertex of a submap that stands still by a loop closure edge."""
+    submap_loading_thread_pool_size: int = 4
+    """Submaps that are prepared at the same time, each in a process."""
 
 
-@dataclasses.dataclass(frozen=True)
-class MergingOptions:
+class MergingOptions(Options):
     """Merging of submaps into one map."""
 
-    enable_visual_loop_closure: bool = option(True, help="Close loops within and between missions.")
-    enable_lidar_loop_closure: bool = option(
-        False,
-        help="Before joint optimisations, register clouds of lidars that are near one another, and use the "
-        "relative poses; needs the extra lidar. Clouds are registered again each time.",
-    )
-    enable_visual_loop_closure_based_map_anchoring: bool = option(
-        True, help="Anchor missions of unknown base frame to known ones by loop closures."
-    )
-    set_first_robot_map_baseframe_to_known: bool = option(
-        True, help="The first mission of the map defines the global frame."
-    )
-    spatially_distribute_missions: bool = option(
-        True, help="Set missions that are not anchored yet apart from the others."
-    )
-    preserve_trust_region_radius_across_merging: bool = option(
-        True, help="A joint optimisation starts with the trust region of the one before."
-    )
-    reset_trust_region_radius_if_new_robot: bool = option(
-        True, help="Not where a new robot has come since."
-    )
-    reset_trust_region_radius_every_nth_submap: int = option(
-        0, help="Nor where so many submaps were merged since the last reset; 0 = never."
-    )
+    enable_visual_loop_closure: bool = True
+    """Close loops within and between missions."""
+    enable_lidar_loop_closure: bool = False
+    """Before joint optimisations, register clouds of lidars that are near one another, and use the relative
+    poses; needs the extra lidar. Clouds are registered again each time."""
+    enable_visual_loop_closure_based_map_anchoring: bool = True
+    """Anchor missions of unknown base frame to known ones by loop closures."""
+    set_first_robot_map_baseframe_to_known: bool = True
+    """The first mission of the map defines the global frame."""
+    spatially_distribute_missions: bool = True
+    """Set missions that are not anchored yet apart from the others."""
+    preserve_trust_region_radius_across_merging: bool = True
+    """A joint optimisation starts with the trust region of the one before."""
+    reset_trust_region_radius_if_new_robot: bool = True
+    """Not where a new robot has come since."""
+    reset_trust_region_radius_every_nth_submap: int = 0
+    """Nor where so many submaps were merged since the last reset; 0 = never."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PublishingOptions:
+class PublishingOptions(Options):
     """Destination of the map."""
 
-    merged_map_folder: str = option(
-        "", help="Folder of the merged map, replaced after every change; required."
-    )
-    resource_folder: str = option(
-        "", help="Folder for the resources of the map; empty = the map's own."
-    )
-    backup_interval_s: int = option(
-        300, help="Keep a copy of the map beside it every so often; 0 = never.", unit="s"
-    )
-    dense_map_resource_type: int = option(
-        21, help="Type of the resources that get_dense_map_in_range looks into (number)."
-    )
+    merged_map_folder: str = ""
+    """Folder of the merged map, replaced after every change; required."""
+    resource_folder: str = ""
+    """Folder for the resources of the map; empty = the map's own."""
+    backup_interval_s: int = 300
+    """Keep a copy of the map beside it every so often; 0 = never."""
+    dense_map_resource_type: int = 21
+    """Type of the resources that get_dense_map_in_range looks into (number)."""
 
 
-@dataclasses.dataclass(frozen=True)
-class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions):
+class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions, prefix="maplab_server_"):
     """All flags of the server that maplab has, too."""
-
-    flag_prefix: ClassVar[str] = "maplab_server_"
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -94,27 +72,20 @@ class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions):
             raise FlagError("--maplab_server_submap_loading_thread_pool_size must be at least 1")
 
 
-@dataclasses.dataclass(frozen=True)
-class IncrementalOptions:
+class IncrementalOptions(Options):
     """Optimisation after each submap, and of the whole map."""
 
-    full_optimization_every_nth: int = option(
-        10,
-        help="Close all loops and optimise the whole map jointly after so many submaps, and when the "
-        "server stops; 0 = when it stops only.",
-    )
-    local_free_vertices: int = option(
-        150, help="Vertices besides those of a new submap that are optimised with it."
-    )
-    local_fixed_vertices: int = option(
-        150, help="Vertices that are held fixed and observe landmarks of the optimised ones."
-    )
-    similar_stretches: int = option(
-        5, help="Submaps that look most like a new one and are searched for loop closures."
-    )
-    near_vertices: int = option(
-        100, help="Vertices nearest to a new submap that are searched for loop closures as well."
-    )
+    full_optimization_every_nth: int = 10
+    """Close all loops and optimise the whole map jointly after so many submaps, and when the server stops; 0
+    = when it stops only."""
+    local_free_vertices: int = 150
+    """Vertices besides those of a new submap that are optimised with it."""
+    local_fixed_vertices: int = 150
+    """Vertices that are held fixed and observe landmarks of the optimised ones."""
+    similar_stretches: int = 5
+    """Submaps that look most like a new one and are searched for loop closures."""
+    near_vertices: int = 100
+    """Vertices nearest to a new submap that are searched for loop closures as well."""
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -127,35 +98,24 @@ class IncrementalOptions:
                 raise FlagError(f"--{field.name} must not be negative")
 
 
-@dataclasses.dataclass(frozen=True)
-class ServiceOptions:
+class ServiceOptions(Options, prefix="serve_"):
     """Address of the service, and the data that the server keeps."""
 
-    flag_prefix: ClassVar[str] = "serve_"
-
-    address: str = option(
-        "127.0.0.1",
-        help="Address at which requests are answered; at another than loopback they need the token "
-        "that is in server.json of the spool.",
-    )
-    port: int = option(0, help="Its port; 0 = any.")
-    stop_when_idle_s: float = option(
-        0.0, help="Stop after so long without anything to do; 0 = never.", unit="s"
-    )
-    keep_submaps: bool = option(
-        True, help="Keep submaps in the spool's folder merged, so that the map can be built again."
-    )
-    save_on_shutdown: bool = option(
-        True,
-        help="At its end the server optimises jointly and publishes; otherwise it ends at once, and what it "
-        "has not published is merged again after the next start.",
-    )
-    visualization_interval_s: float = option(
-        10.0,
-        help="With --serve_visualize_map, show the published map at most every so often, and at the end; "
-        "0 = after every publication.",
-        unit="s",
-    )
+    address: str = "127.0.0.1"
+    """Address at which requests are answered; at another than loopback they need the token that is in
+    server.json of the spool."""
+    port: int = 0
+    """Its port; 0 = any."""
+    stop_when_idle_s: float = 0.0
+    """Stop after so long without anything to do; 0 = never."""
+    keep_submaps: bool = True
+    """Keep submaps in the spool's folder merged, so that the map can be built again."""
+    save_on_shutdown: bool = True
+    """At its end the server optimises jointly and publishes; otherwise it ends at once, and what it has not
+    published is merged again after the next start."""
+    visualization_interval_s: float = 10.0
+    """With --serve_visualize_map, show the published map at most every so often, and at the end; 0 = after
+    every publication."""
 
     def __post_init__(self) -> None:
         """Check the times.
@@ -168,17 +128,15 @@ class ServiceOptions:
                 raise FlagError(f"--serve_{name} must not be negative")
 
 
-@dataclasses.dataclass(frozen=True)
-class SubmapOutput:
+class SubmapOutput(Options):
     """Destination of submaps while a recording is read."""
 
-    flag_prefix: ClassVar[str] = ""
-
-    submap_spool: Path | None = option(
-        None, help="Spool of a map server that gets the map in parts; empty = none"
-    )
-    submap_interval_s: float = option(20.0, help="Length of a part", unit="s")
-    robot_name: str = option("robot", help="Name of this robot in the spool")
+    submap_spool: Path | None = None
+    """Spool of a map server that gets the map in parts; empty = none"""
+    submap_interval_s: float = 20.0
+    """Length of a part"""
+    robot_name: str = "robot"
+    """Name of this robot in the spool"""
 
     def __post_init__(self) -> None:
         """Check the interval.
@@ -190,16 +148,13 @@ class SubmapOutput:
             raise FlagError(f"--submap_interval_s={self.submap_interval_s:g}: must be positive")
 
 
-@dataclasses.dataclass(frozen=True)
-class PlayOptions:
+class PlayOptions(Options, prefix="robots_"):
     """Division of sessions into submaps, and their playback rate."""
 
-    flag_prefix: ClassVar[str] = "robots_"
-
-    submap_s: float = option(10.0, help="Length of a submap.", unit="s")
-    rate: float = option(
-        1.0, help="Speed relative to real time; 0 = push everything as fast as it can be written."
-    )
+    submap_s: float = 10.0
+    """Length of a submap."""
+    rate: float = 1.0
+    """Speed relative to real time; 0 = push everything as fast as it can be written."""
 
     def __post_init__(self) -> None:
         """Check the ranges.

@@ -7,8 +7,7 @@ measurements may miss; it needs no random samples.
 
 from __future__ import annotations
 
-import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from maplab_py.algorithms.external_poses.alignment import (
 from maplab_py.array_types import F64, I32, I64, U64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
@@ -32,27 +31,18 @@ _KNOWN_ORIENTATION_RAD = 1.0
 """Orientations of larger deviations were not measured, as those of satellite receivers."""
 
 
-@dataclasses.dataclass(frozen=True)
-class AbsoluteAnchoringOptions:
+class AbsoluteAnchoringOptions(Options, prefix="abs_constraints_baseframe_"):
     """Conditions under which absolute poses determine a mission's base frame, with maplab's names."""
 
-    flag_prefix: ClassVar[str] = "abs_constraints_baseframe_"
-
-    min_number_of_constraints: int = option(
-        3, help="Absolute poses that a mission must have to be anchored by them"
-    )
-    min_inlier_ratio: float = option(
-        0.5, help="Ratio of the absolute poses of a mission that must agree"
-    )
-    ransac_max_position_error_m: float = option(
-        2.0,
-        help="Largest error of positions that agree, beyond three standard deviations; as large as the drift "
-        "of the mission",
-        unit="m",
-    )
-    ransac_max_orientation_error_rad: float = option(
-        0.0872, help="Largest error of measured orientations, likewise", unit="rad"
-    )
+    min_number_of_constraints: int = 3
+    """Absolute poses that a mission must have to be anchored by them"""
+    min_inlier_ratio: float = 0.5
+    """Ratio of the absolute poses of a mission that must agree"""
+    ransac_max_position_error_m: float = 2.0
+    """Largest error of positions that agree, beyond three standard deviations; as large as the drift of the
+    mission"""
+    ransac_max_orientation_error_rad: float = 0.0872
+    """Largest error of measured orientations, likewise"""
 
 
 class AbsoluteAnchoring(NamedTuple):

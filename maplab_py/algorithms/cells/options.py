@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import ClassVar
-
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 
 
-@dataclasses.dataclass(frozen=True)
-class CellOptions:
+class CellOptions(Options, prefix="cell_"):
     """Number of cells and their overlap."""
 
-    flag_prefix: ClassVar[str] = "cell_"
-
-    count: int = option(4, help="Number of cells; each has about as many vertices of its own.")
-    overlap_m: float = option(
-        5.0,
-        help="Horizontal distance from a cell up to which its neighbours' vertices are in it, too.",
-        unit="m",
-    )
+    count: int = 4
+    """Number of cells; each has about as many vertices of its own."""
+    overlap_m: float = 5.0
+    """Horizontal distance from a cell up to which its neighbours' vertices are in it, too."""
 
     def __post_init__(self) -> None:
         """Check the ranges.

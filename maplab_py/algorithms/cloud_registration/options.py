@@ -3,87 +3,56 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class CloudClosureOptions:
+class CloudClosureOptions(Options, prefix="lidar_lc_"):
     """Candidates, registration and gates."""
 
-    flag_prefix: ClassVar[str] = "lidar_lc_"
-
-    search_globally: bool = option(
-        False,
-        help="Compare clouds wherever the map has them, and register them without an initial pose "
-        "(KISS-Matcher); for missions of unknown base frame",
-        flag="lidar_lc_global",
-    )
-    from_closures: bool = option(
-        False,
-        help="Compare only the clouds at the ends of accepted closures that the map records; they give "
-        "the initial poses",
-    )
-    max_distance_m: float = option(
-        5.0, help="Clouds that are farther apart in the map are not compared", unit="m"
-    )
-    min_time_gap_s: float = option(
-        10.0, help="Clouds of one mission that are closer in time are not compared", unit="s"
-    )
-    sequence_gap_s: float = option(
-        1.0,
-        help="Compare each cloud also with those of its mission about this long, and twice as long, before "
-        "it: they limit the drift between places that are visited once; 0 = none",
-        unit="s",
-    )
-    max_candidates: int = option(3, help="Clouds of each mission that a cloud is compared with")
-    every_nth: int = option(1, help="Use every n-th cloud of a sensor only")
-    voxel_size_m: float = option(
-        0.1, help="Clouds are thinned to a point per voxel of this side", unit="m"
-    )
-    max_correspondence_m: float = option(
-        0.3,
-        help="Largest distance of corresponding points at the end of the registration; it starts with "
-        "eight times this",
-        unit="m",
-    )
-    min_overlap: float = option(
-        0.5, help="Share of the points of either cloud that must lie on surfaces of the other"
-    )
-    max_conflict: float = option(
-        0.05,
-        help="Largest share of points of either cloud in space that the other has seen to be free",
-    )
-    max_residual_m: float = option(
-        0.04,
-        help="Largest root mean square distance of corresponding points from the surface",
-        unit="m",
-    )
-    min_constraint: float = option(
-        0.02,
-        help="Smallest share of points that fix the position along the worst direction: a bare corridor "
-        "does not fix it along its axis",
-    )
-    max_gravity_deviation_deg: float = option(
-        3.0, help="Largest angle between gravity at the query and in the found pose", unit="deg"
-    )
-    max_drift_ratio: float = option(
-        0.1,
-        help="Largest drift of a mission relative to the arc length between both clouds; a closure with a "
-        "larger correction (plus 0.5 m) is implausible",
-    )
-    min_support: int = option(
-        2, help="Number of nearby clouds whose closures must agree in yaw and position"
-    )
-    covariance_scaler: float = option(
-        4.0,
-        help="Factor on the inverse Hessian of the registration: errors of neighbouring points are alike",
-    )
-    switch_variable_variance: float = option(
-        1e-2, help="Variance of the prior of an edge's switch variable at 1"
-    )
+    search_globally: bool = option(False, flag="lidar_lc_global")
+    """Compare clouds wherever the map has them, and register them without an initial pose (KISS-Matcher); for
+    missions of unknown base frame"""
+    from_closures: bool = False
+    """Compare only the clouds at the ends of accepted closures that the map records; they give the initial
+    poses"""
+    max_distance_m: float = 5.0
+    """Clouds that are farther apart in the map are not compared"""
+    min_time_gap_s: float = 10.0
+    """Clouds of one mission that are closer in time are not compared"""
+    sequence_gap_s: float = 1.0
+    """Compare each cloud also with those of its mission about this long, and twice as long, before it: they
+    limit the drift between places that are visited once; 0 = none"""
+    max_candidates: int = 3
+    """Clouds of each mission that a cloud is compared with"""
+    every_nth: int = 1
+    """Use every n-th cloud of a sensor only"""
+    voxel_size_m: float = 0.1
+    """Clouds are thinned to a point per voxel of this side"""
+    max_correspondence_m: float = 0.3
+    """Largest distance of corresponding points at the end of the registration; it starts with eight times
+    this"""
+    min_overlap: float = 0.5
+    """Share of the points of either cloud that must lie on surfaces of the other"""
+    max_conflict: float = 0.05
+    """Largest share of points of either cloud in space that the other has seen to be free"""
+    max_residual_m: float = 0.04
+    """Largest root mean square distance of corresponding points from the surface"""
+    min_constraint: float = 0.02
+    """Smallest share of points that fix the position along the worst direction: a bare corridor does not fix
+    it along its axis"""
+    max_gravity_deviation_deg: float = 3.0
+    """Largest angle between gravity at the query and in the found pose"""
+    max_drift_ratio: float = 0.1
+    """Largest drift of a mission relative to the arc length between both clouds; a closure with a larger
+    correction (plus 0.5 m) is implausible"""
+    min_support: int = 2
+    """Number of nearby clouds whose closures must agree in yaw and position"""
+    covariance_scaler: float = 4.0
+    """Factor on the inverse Hessian of the registration: errors of neighbouring points are alike"""
+    switch_variable_variance: float = 1e-2
+    """Variance of the prior of an edge's switch variable at 1"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 MESH_MIN_WEIGHT = 2.5
 """Weight from which a voxel counts as observed, in measurements at a depth of 2 m."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FusionOptions:
+class FusionOptions(Options, prefix="dense_tsdf_"):
     """Grid of truncated signed distances, and the weights of measurements."""
 
-    flag_prefix: ClassVar[str] = "dense_tsdf_"
-
-    voxel_size_m: float = option(0.10, help="Side of a voxel", unit="m")
-    truncation_distance_m: float = option(
-        0.0, help="Distances are limited to this; 0 = three voxels", unit="m"
-    )
-    min_ray_length_m: float = option(0.2, help="Smallest depth that is used", unit="m")
-    max_ray_length_m: float = option(6.0, help="Largest depth that is used", unit="m")
-    weight_depth_power: int = option(
-        4,
-        help="The weight of a measurement falls with this power of its depth: 4 for stereo, whose "
-        "variance grows with it, 2 or 0 for depth sensors",
-    )
-    max_weight: float = option(10000.0, help="Largest weight of a voxel")
-    integrate_every_nth: int = option(1, help="Integrate every n-th depth map only")
+    voxel_size_m: float = 0.10
+    """Side of a voxel"""
+    truncation_distance_m: float = 0.0
+    """Distances are limited to this; 0 = three voxels"""
+    min_ray_length_m: float = 0.2
+    """Smallest depth that is used"""
+    max_ray_length_m: float = 6.0
+    """Largest depth that is used"""
+    weight_depth_power: int = 4
+    """The weight of a measurement falls with this power of its depth: 4 for stereo, whose variance grows with
+    it, 2 or 0 for depth sensors"""
+    max_weight: float = 10000.0
+    """Largest weight of a voxel"""
+    integrate_every_nth: int = 1
+    """Integrate every n-th depth map only"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -57,25 +54,21 @@ class FusionOptions:
         return self.truncation_distance_m or 3.0 * self.voxel_size_m
 
 
-@dataclasses.dataclass(frozen=True)
-class DistanceOptions:
+class DistanceOptions(Options, prefix="dense_esdf_"):
     """Reach of distances, and free space near the robot."""
 
-    flag_prefix: ClassVar[str] = "dense_esdf_"
-
-    max_distance_m: float = option(2.0, help="Distances are limited to this", unit="m")
-    use_clear_sphere: bool = option(
-        False,
-        help="Around every camera, count voxels that no depth map has observed as free inside the inner "
-        "radius, and as occupied between it and the outer radius",
-    )
-    clear_sphere_inner_radius: float = option(0.3, help="Inner radius", unit="m")
-    clear_sphere_outer_radius: float = option(1.0, help="Outer radius", unit="m")
-    export_map_for_panning_path: Path | None = option(
-        None,
-        help="Also write the voxels for a path planner: a .ply cloud of their centres in the global frame "
-        "with the distance as intensity",
-    )
+    max_distance_m: float = 2.0
+    """Distances are limited to this"""
+    use_clear_sphere: bool = False
+    """Around every camera, count voxels that no depth map has observed as free inside the inner radius, and
+    as occupied between it and the outer radius"""
+    clear_sphere_inner_radius: float = option(0.3, unit="m")
+    """Inner radius"""
+    clear_sphere_outer_radius: float = option(1.0, unit="m")
+    """Outer radius"""
+    export_map_for_panning_path: Path | None = None
+    """Also write the voxels for a path planner: a .ply cloud of their centres in the global frame with the
+    distance as intensity"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -91,98 +84,94 @@ class DistanceOptions:
 _SGBM_MODES = 4
 
 
-@dataclasses.dataclass(frozen=True)
-class SgbmOptions:
+class SgbmOptions(Options, prefix="dense_stereo_sgbm_"):
     """Semi-global block matching: Hirschmueller, PAMI 2008; OpenCV's StereoSGBM."""
 
-    flag_prefix: ClassVar[str] = "dense_stereo_sgbm_"
+    mode: int = 0
+    """0 = SGBM, 1 = HH, 2 = SGBM_3WAY, 3 = HH4"""
+    min_disparity: int = option(0, unit="px")
+    """Smallest disparity"""
+    num_disparities: int = option(128, unit="px")
+    """Number of disparities, a multiple of 16"""
+    sad_window_size: int = option(3, unit="px")
+    """Side of the blocks that are compared, odd"""
+    p1: int = 72
+    """Penalty for a disparity that changes by one pixel"""
+    p2: int = 288
+    """Penalty for a disparity that changes by more"""
+    disp12_max_diff: int = option(1, unit="px")
+    """Tolerance of the left-right check"""
+    pre_filter_cap: int = 31
+    """Bound of the gradients that are compared"""
+    uniqueness_ratio: int = 10
+    """Margin to the second best disparity, in percent"""
+    speckle_window_size: int = 500
+    """Smaller regions are removed; in pixels of area"""
+    speckle_range: int = option(3, unit="px")
+    """Difference of disparities inside a region"""
 
-    mode: int = option(0, help="0 = SGBM, 1 = HH, 2 = SGBM_3WAY, 3 = HH4")
-    min_disparity: int = option(0, help="Smallest disparity", unit="px")
-    num_disparities: int = option(128, help="Number of disparities, a multiple of 16", unit="px")
-    sad_window_size: int = option(3, help="Side of the blocks that are compared, odd", unit="px")
-    p1: int = option(72, help="Penalty for a disparity that changes by one pixel")
-    p2: int = option(288, help="Penalty for a disparity that changes by more")
-    disp12_max_diff: int = option(1, help="Tolerance of the left-right check", unit="px")
-    pre_filter_cap: int = option(31, help="Bound of the gradients that are compared")
-    uniqueness_ratio: int = option(10, help="Margin to the second best disparity, in percent")
-    speckle_window_size: int = option(500, help="Smaller regions are removed; in pixels of area")
-    speckle_range: int = option(3, help="Difference of disparities inside a region", unit="px")
 
-
-@dataclasses.dataclass(frozen=True)
-class BmOptions:
+class BmOptions(Options, prefix="dense_stereo_bm_"):
     """Block matching: Konolige, ISRR 1997; OpenCV's StereoBM."""
 
-    flag_prefix: ClassVar[str] = "dense_stereo_bm_"
+    min_disparity: int = option(0, unit="px")
+    """Smallest disparity"""
+    num_disparities: int = option(128, unit="px")
+    """Number of disparities, a multiple of 16"""
+    sad_window_size: int = option(9, unit="px")
+    """Side of the blocks that are compared, odd"""
+    disp12_max_diff: int = option(1, unit="px")
+    """Tolerance of the left-right check"""
+    pre_filter_cap: int = 31
+    """Bound of the filtered values"""
+    pre_filter_size: int = option(9, unit="px")
+    """Side of the filter's window, odd"""
+    prefilter_type: str = option("xsobel", choices=("xsobel", "normalized_response"))
+    """Filter of the images"""
+    texture_threshold: int = 10
+    """Blocks with less texture have no disparity"""
+    uniqueness_ratio: int = 15
+    """Margin to the second best disparity, in percent"""
+    speckle_window_size: int = 500
+    """Smaller regions are removed; in pixels of area"""
+    speckle_range: int = option(3, unit="px")
+    """Difference of disparities inside a region"""
 
-    min_disparity: int = option(0, help="Smallest disparity", unit="px")
-    num_disparities: int = option(128, help="Number of disparities, a multiple of 16", unit="px")
-    sad_window_size: int = option(9, help="Side of the blocks that are compared, odd", unit="px")
-    disp12_max_diff: int = option(1, help="Tolerance of the left-right check", unit="px")
-    pre_filter_cap: int = option(31, help="Bound of the filtered values")
-    pre_filter_size: int = option(9, help="Side of the filter's window, odd", unit="px")
-    prefilter_type: str = option(
-        "xsobel", help="Filter of the images", choices=("xsobel", "normalized_response")
-    )
-    texture_threshold: int = option(10, help="Blocks with less texture have no disparity")
-    uniqueness_ratio: int = option(15, help="Margin to the second best disparity, in percent")
-    speckle_window_size: int = option(500, help="Smaller regions are removed; in pixels of area")
-    speckle_range: int = option(3, help="Difference of disparities inside a region", unit="px")
 
-
-@dataclasses.dataclass(frozen=True)
-class StereoOptions:
+class StereoOptions(Options, prefix="dense_stereo_"):
     """Choice of stereo pairs, preparation of images, and checks."""
 
-    flag_prefix: ClassVar[str] = "dense_stereo_"
+    use_sgbm: bool = True
+    """Semi-global block matching; else plain block matching"""
+    downscaling_factor: float = 1.0
+    """Images are matched at this fraction of their size"""
+    adapt_params_to_image_size: bool = True
+    """Take an eighth of the image's width as the number of disparities"""
+    min_baseline: float = option(0.02, unit="m")
+    """Pairs of cameras nearer to each other are left out"""
+    max_angle_between_opt_axes: float = option(0.785, unit="rad")
+    """Pairs whose optical axes differ by more are left out"""
+    depth_check: bool = option(True, flag="dense_depth_check")
+    """Remove what the right image does not confirm"""
+    median_window: int = option(5, unit="px")
+    """Side of the median filter of disparities, 0 (none), 3 or 5"""
+    bilateral_window: int = option(15, unit="px")
+    """Side of the bilateral filter of disparities, which keeps edges; 0 = none"""
+    edge_margin: int = option(3, unit="px")
+    """Pixels so near to a step of the depth are removed: they belong to either side"""
+    multi_view: bool = True
+    """Remove what neighbouring vertices do not confirm"""
+    multi_view_min_agreeing: int = 2
+    """Neighbouring vertices that must confirm a pixel"""
+    multi_view_max_difference: float = option(1.0, unit="px")
+    """Difference of disparities that counts as confirmation"""
+    multi_view_interval_s: float = 0.2
+    """Time between the neighbours that are asked, three before and three after"""
 
-    use_sgbm: bool = option(True, help="Semi-global block matching; else plain block matching")
-    downscaling_factor: float = option(
-        1.0, help="Images are matched at this fraction of their size"
-    )
-    adapt_params_to_image_size: bool = option(
-        True, help="Take an eighth of the image's width as the number of disparities"
-    )
-    min_baseline: float = option(
-        0.02, help="Pairs of cameras nearer to each other are left out", unit="m"
-    )
-    max_angle_between_opt_axes: float = option(
-        0.785, help="Pairs whose optical axes differ by more are left out", unit="rad"
-    )
-    depth_check: bool = option(
-        True, help="Remove what the right image does not confirm", flag="dense_depth_check"
-    )
-    median_window: int = option(
-        5, help="Side of the median filter of disparities, 0 (none), 3 or 5", unit="px"
-    )
-    bilateral_window: int = option(
-        15,
-        help="Side of the bilateral filter of disparities, which keeps edges; 0 = none",
-        unit="px",
-    )
-    edge_margin: int = option(
-        3,
-        help="Pixels so near to a step of the depth are removed: they belong to either side",
-        unit="px",
-    )
-    multi_view: bool = option(True, help="Remove what neighbouring vertices do not confirm")
-    multi_view_min_agreeing: int = option(2, help="Neighbouring vertices that must confirm a pixel")
-    multi_view_max_difference: float = option(
-        1.0, help="Difference of disparities that counts as confirmation", unit="px"
-    )
-    multi_view_interval_s: float = option(
-        0.2,
-        help="Time between the neighbours that are asked, three before and three after",
-        unit="s",
-    )
-
-    debug_reconstruction_start_fraction_of_trajectory: float = option(
-        0.0, help="Part of each mission's vertices before the first that is used"
-    )
-    debug_reconstruction_end_fraction_of_trajectory: float = option(
-        1.0, help="Part of each mission's vertices up to the last that is used"
-    )
+    debug_reconstruction_start_fraction_of_trajectory: float = 0.0
+    """Part of each mission's vertices before the first that is used"""
+    debug_reconstruction_end_fraction_of_trajectory: float = 1.0
+    """Part of each mission's vertices up to the last that is used"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

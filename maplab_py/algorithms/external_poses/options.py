@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -12,50 +11,36 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import FlagError
 from maplab_py.geometry import se3
 from maplab_py.interop.stamps import time_unit_option
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 _UNIT_TOLERANCE = 1e-2
 """By which the length of a quaternion in a flag may differ from one."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TrajectoryOptions:
+class TrajectoryOptions(Options):
     """Use of a trajectory, and its uncertainty."""
 
-    kind: str = option(
-        "absolute",
-        help="Absolute pose measurements or odometry edges of a mission of the map, or a mission of its own",
-        choices=("absolute", "odometry", "mission"),
-        flag="as",
-    )
-    position_sigma_m: float = option(
-        0.05,
-        help="Standard deviation per axis of absolute positions; of odometry: after one second, growing "
-        "with the root of time",
-        unit="m",
-    )
-    orientation_sigma_deg: float = option(
-        1.0, help="Standard deviation per axis of orientations, likewise", unit="deg"
-    )
-    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    kind: str = option("absolute", choices=("absolute", "odometry", "mission"), flag="as")
+    """Absolute pose measurements or odometry edges of a mission of the map, or a mission of its own"""
+    position_sigma_m: float = 0.05
+    """Standard deviation per axis of absolute positions; of odometry: after one second, growing with the root
+    of time"""
+    orientation_sigma_deg: float = 1.0
+    """Standard deviation per axis of orientations, likewise"""
+    time_offset_s: float = 0.0
+    """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = option(
-        0.5, help="Poses of the file are not interpolated over longer gaps", unit="s"
-    )
-    sensor_id: str = option(
-        "", help="Sensor or camera of the map whose poses the file has; empty = the IMU"
-    )
-    times_file: Path | None = option(
-        None, help="Time stamps of a KITTI trajectory, one per line (times.txt)"
-    )
-    align: bool = option(
-        True,
-        help="Move the base frame of the mission by yaw and position so that it fits the absolute poses",
-    )
-    replace: bool = option(
-        False, help="Replace the measurements of the same kind that the mission has"
-    )
+    max_gap_s: float = 0.5
+    """Poses of the file are not interpolated over longer gaps"""
+    sensor_id: str = ""
+    """Sensor or camera of the map whose poses the file has; empty = the IMU"""
+    times_file: Path | None = None
+    """Time stamps of a KITTI trajectory, one per line (times.txt)"""
+    align: bool = True
+    """Move the base frame of the mission by yaw and position so that it fits the absolute poses"""
+    replace: bool = False
+    """Replace the measurements of the same kind that the mission has"""
 
     def check(self) -> None:
         """Check the values.
@@ -70,36 +55,31 @@ class TrajectoryOptions:
             raise FlagError(f"--time_offset_s={self.time_offset_s:g}: wants seconds below 1e9")
 
 
-@dataclasses.dataclass(frozen=True)
-class GpsOptions:
+class GpsOptions(Options, prefix="gps_"):
     """Use of the positions of a satellite receiver."""
 
-    flag_prefix: ClassVar[str] = "gps_"
-
-    sigma_m: float = option(1.0, help="Standard deviation of east and of north", unit="m")
-    sigma_vertical_m: float = option(
-        0.0, help="Standard deviation of the altitude; 0 = twice that of east", unit="m"
-    )
-    lever_arm_m: str = option("0,0,0", help="Position x,y,z of the antenna on the IMU", unit="m")
-    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    sigma_m: float = 1.0
+    """Standard deviation of east and of north"""
+    sigma_vertical_m: float = 0.0
+    """Standard deviation of the altitude; 0 = twice that of east"""
+    lever_arm_m: str = "0,0,0"
+    """Position x,y,z of the antenna on the IMU"""
+    time_offset_s: float = 0.0
+    """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = option(
-        2.0, help="Fixes between vertices that are further apart are left out", unit="s"
-    )
-    origin: str = option(
-        "",
-        help="Origin of east, north and up: latitude,longitude [deg],ellipsoidal altitude [m]; empty = that "
-        "of the map, or else the median of the fixes",
-    )
-    date: str = option(
-        "", help="Day of the first fix as YYYY-MM-DD, for NMEA files without RMC and ZDA sentences"
-    )
-    topic: str = option("", help="Topic of a bag with sensor_msgs/NavSatFix; empty = the only one")
-    align: bool = option(
-        True,
-        help="Move the base frame of the mission by yaw and position so that it fits the fixes",
-    )
-    replace: bool = option(False, help="Replace the absolute poses that the mission has")
+    max_gap_s: float = 2.0
+    """Fixes between vertices that are further apart are left out"""
+    origin: str = ""
+    """Origin of east, north and up: latitude,longitude [deg],ellipsoidal altitude [m]; empty = that of the
+    map, or else the median of the fixes"""
+    date: str = ""
+    """Day of the first fix as YYYY-MM-DD, for NMEA files without RMC and ZDA sentences"""
+    topic: str = ""
+    """Topic of a bag with sensor_msgs/NavSatFix; empty = the only one"""
+    align: bool = True
+    """Move the base frame of the mission by yaw and position so that it fits the fixes"""
+    replace: bool = False
+    """Replace the absolute poses that the mission has"""
 
     def check(self) -> None:
         """Check the values.
@@ -136,47 +116,31 @@ class GpsOptions:
         return times_ns + round(self.time_offset_s * 1e9)
 
 
-@dataclasses.dataclass(frozen=True)
-class WheelOptions:
+class WheelOptions(Options, prefix="wheel_"):
     """Uncertainty of wheel odometry, and the pose of its sensor."""
 
-    flag_prefix: ClassVar[str] = "wheel_"
-
-    position_sigma_m: float = option(
-        0.02,
-        help="Standard deviation along and across after one metre, growing with the root of the distance",
-        unit="m",
-    )
-    yaw_sigma_deg: float = option(
-        0.5, help="Standard deviation of the heading, likewise", unit="deg"
-    )
-    vertical_sigma_m: float = option(
-        0.05, help="Standard deviation of height, likewise, where the file has none", unit="m"
-    )
-    tilt_sigma_deg: float = option(
-        2.0,
-        help="Standard deviation of roll and pitch, likewise, where the file has none",
-        unit="deg",
-    )
-    sensor_id: str = option(
-        "",
-        help="Sensor WHEEL_ODOMETRY of sensors.yaml, of which extrinsics and covariance are taken; empty = "
-        "a new one",
-    )
-    position_m: str = option(
-        "0,0,0", help="Position x,y,z of a new sensor, the middle of the axle, on the IMU", unit="m"
-    )
-    orientation_xyzw: str = option(
-        "0,0,0,1",
-        help="Orientation of a new sensor on the IMU as a quaternion x,y,z,w; its x points forwards, its z "
-        "upwards",
-    )
-    time_offset_s: float = option(0.0, help="Added to the time stamps of the file", unit="s")
+    position_sigma_m: float = 0.02
+    """Standard deviation along and across after one metre, growing with the root of the distance"""
+    yaw_sigma_deg: float = 0.5
+    """Standard deviation of the heading, likewise"""
+    vertical_sigma_m: float = 0.05
+    """Standard deviation of height, likewise, where the file has none"""
+    tilt_sigma_deg: float = 2.0
+    """Standard deviation of roll and pitch, likewise, where the file has none"""
+    sensor_id: str = ""
+    """Sensor WHEEL_ODOMETRY of sensors.yaml, of which extrinsics and covariance are taken; empty = a new
+    one"""
+    position_m: str = "0,0,0"
+    """Position x,y,z of a new sensor, the middle of the axle, on the IMU"""
+    orientation_xyzw: str = "0,0,0,1"
+    """Orientation of a new sensor on the IMU as a quaternion x,y,z,w; its x points forwards, its z upwards"""
+    time_offset_s: float = 0.0
+    """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = option(
-        0.5, help="Rows of the file are not interpolated over longer gaps", unit="s"
-    )
-    replace: bool = option(False, help="Replace the wheel odometry edges that the mission has")
+    max_gap_s: float = 0.5
+    """Rows of the file are not interpolated over longer gaps"""
+    replace: bool = False
+    """Replace the wheel odometry edges that the mission has"""
 
     def check(self) -> None:
         """Check the values.

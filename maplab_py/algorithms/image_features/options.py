@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 from maplab_py.vimap.descriptors import type_of_name
 from maplab_py.vision.features.extension import plugin_extractor
@@ -17,27 +16,21 @@ PLUGIN = "plugin:"
 _MAX_FEATURES = 100_000
 
 
-@dataclasses.dataclass(frozen=True)
-class ExtractionOptions:
+class ExtractionOptions(Options):
     """Extraction of features from images."""
 
-    flag_prefix: ClassVar[str] = ""
-
-    feature_type: str = option(
-        "sift",
-        help="Detector and descriptor: sift (SIFT, 128 bytes), orb (Binary, 32 bytes), brisk (Binary, 64), "
-        "akaze (Binary, 61), or plugin:NAME, a feature extractor of a plugin",
-    )
-    feature_model: str = option(
-        "", help="File of a plugin's extractor, such as a network in the ONNX format"
-    )
-    max_features: int = option(1000, help="Largest number of keypoints of an image")
-    feature_sigma_px: float = option(0.8, help="Standard deviation of the new keypoints", unit="px")
-    replace: bool = option(
-        False,
-        help="Replace the keypoints of frames that have such features, or keypoints without descriptors, "
-        "with their observations; else those frames stay as they are",
-    )
+    feature_type: str = "sift"
+    """Detector and descriptor: sift (SIFT, 128 bytes), orb (Binary, 32 bytes), brisk (Binary, 64), akaze
+    (Binary, 61), or plugin:NAME, a feature extractor of a plugin"""
+    feature_model: str = ""
+    """File of a plugin's extractor, such as a network in the ONNX format"""
+    max_features: int = 1000
+    """Largest number of keypoints of an image"""
+    feature_sigma_px: float = 0.8
+    """Standard deviation of the new keypoints"""
+    replace: bool = False
+    """Replace the keypoints of frames that have such features, or keypoints without descriptors, with their
+    observations; else those frames stay as they are"""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -57,36 +50,24 @@ class ExtractionOptions:
             )
 
 
-@dataclasses.dataclass(frozen=True)
-class FeatureTrackOptions:
+class FeatureTrackOptions(Options, prefix="track_"):
     """Links between keypoints of neighbouring frames."""
 
-    flag_prefix: ClassVar[str] = "track_"
-
-    feature_type: str = option(
-        "sift",
-        help="Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, plugin:NAME) or by "
-        "their type (Binary, SuperPoint, R2D2, SIFT or a number)",
-        flag="feature_type",
-    )
-    neighbors: int = option(2, help="Following frames of the camera that a frame is matched with")
-    epipolar_gate_px: float = option(
-        4.0,
-        help="Largest distance of a keypoint from the epipolar line that the map's poses predict",
-        unit="px",
-    )
-    min_depth_m: float = option(
-        0.3, help="Smallest distance of a point, which limits its parallax", unit="m"
-    )
-    max_ratio: float = option(
-        0.9, help="Largest ratio of the differences of the best and the second best match"
-    )
-    max_bit_fraction: float = option(
-        0.25, help="Largest fraction of bits in which matched Binary descriptors differ"
-    )
-    max_descriptor_distance: float = option(
-        0.45, help="Largest distance of other matched descriptors, scaled to unit length"
-    )
+    feature_type: str = option("sift", flag="feature_type")
+    """Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, plugin:NAME) or by their
+    type (Binary, SuperPoint, R2D2, SIFT or a number)"""
+    neighbors: int = 2
+    """Following frames of the camera that a frame is matched with"""
+    epipolar_gate_px: float = 4.0
+    """Largest distance of a keypoint from the epipolar line that the map's poses predict"""
+    min_depth_m: float = 0.3
+    """Smallest distance of a point, which limits its parallax"""
+    max_ratio: float = 0.9
+    """Largest ratio of the differences of the best and the second best match"""
+    max_bit_fraction: float = 0.25
+    """Largest fraction of bits in which matched Binary descriptors differ"""
+    max_descriptor_distance: float = 0.45
+    """Largest distance of other matched descriptors, scaled to unit length"""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class KeyframingOptions:
+class KeyframingOptions(Options, prefix="kf_"):
     """Criteria for keyframes."""
 
-    flag_prefix: ClassVar[str] = "kf_"
-
-    distance_threshold_m: float = option(
-        0.75, help="Distance from the last keyframe that makes a new one.", unit="m"
-    )
-    rotation_threshold_deg: float = option(
-        20.0, help="Rotation from the last keyframe that makes a new one.", unit="deg"
-    )
-    every_nth_vertex: int = option(10, help="Make at least every n-th vertex a keyframe.")
-    min_shared_landmarks_obs: int = option(
-        20, help="Make a keyframe where fewer landmarks are shared with the last one."
-    )
+    distance_threshold_m: float = 0.75
+    """Distance from the last keyframe that makes a new one."""
+    rotation_threshold_deg: float = 20.0
+    """Rotation from the last keyframe that makes a new one."""
+    every_nth_vertex: int = 10
+    """Make at least every n-th vertex a keyframe."""
+    min_shared_landmarks_obs: int = 20
+    """Make a keyframe where fewer landmarks are shared with the last one."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -3,53 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class LandmarkQualityOptions:
+class LandmarkQualityOptions(Options, prefix="elq_"):
     """Criteria for well-constrained landmarks."""
 
-    flag_prefix: ClassVar[str] = "elq_"
-
-    min_observers: int = option(2, help="Smallest number of vertices that observe a landmark.")
-    min_observation_angle_deg: float = option(
-        2.0, help="Smallest angle between the two most different rays.", unit="deg"
-    )
-    max_relative_sigma: float = option(
-        0.05,
-        help="Largest standard deviation of a landmark along its worst axis, relative to its distance from "
-        "the closest observer; predicted from its rays and reprojection errors; negative = not checked.",
-    )
-    min_distance_from_closest_observer: float = option(
-        0.05, help="Smallest distance of a landmark from its closest observer.", unit="m"
-    )
-    max_distance_from_closest_observer: float = option(
-        40.0, help="Largest distance of a landmark from its closest observer.", unit="m"
-    )
-    max_reprojection_error_px: float = option(
-        -1.0,
-        help="Largest reprojection error of any observation; negative = not checked.",
-        unit="px",
-    )
-    lidar_min_observers: int = option(
-        1, help="Smallest number of vertices that observe a lidar landmark."
-    )
-    lidar_min_distance_from_closest_observer: float = option(
-        1.0, help="Smallest distance of a lidar landmark from its closest observer.", unit="m"
-    )
-    lidar_max_distance_from_closest_observer: float = option(
-        60.0, help="Largest distance of a lidar landmark from its closest observer.", unit="m"
-    )
-    lidar_max_observation_error_m: float = option(
-        -1.0,
-        help="Largest distance of any lidar observation from its landmark; negative = not checked.",
-        unit="m",
-    )
+    min_observers: int = 2
+    """Smallest number of vertices that observe a landmark."""
+    min_observation_angle_deg: float = 2.0
+    """Smallest angle between the two most different rays."""
+    max_relative_sigma: float = 0.05
+    """Largest standard deviation of a landmark along its worst axis, relative to its distance from the
+    closest observer; predicted from its rays and reprojection errors; negative = not checked."""
+    min_distance_from_closest_observer: float = option(0.05, unit="m")
+    """Smallest distance of a landmark from its closest observer."""
+    max_distance_from_closest_observer: float = option(40.0, unit="m")
+    """Largest distance of a landmark from its closest observer."""
+    max_reprojection_error_px: float = -1.0
+    """Largest reprojection error of any observation; negative = not checked."""
+    lidar_min_observers: int = 1
+    """Smallest number of vertices that observe a lidar landmark."""
+    lidar_min_distance_from_closest_observer: float = option(1.0, unit="m")
+    """Smallest distance of a lidar landmark from its closest observer."""
+    lidar_max_distance_from_closest_observer: float = option(60.0, unit="m")
+    """Largest distance of a lidar landmark from its closest observer."""
+    lidar_max_observation_error_m: float = -1.0
+    """Largest distance of any lidar observation from its landmark; negative = not checked."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -66,18 +49,13 @@ class LandmarkQualityOptions:
                 )
 
 
-@dataclasses.dataclass(frozen=True)
-class InvalidObservationOptions:
+class InvalidObservationOptions(Options, prefix="rio_"):
     """Criteria for invalid observations."""
 
-    flag_prefix: ClassVar[str] = "rio_"
-
-    max_reprojection_error_px: float = option(
-        50.0, help="Largest reprojection error of a valid observation.", unit="px"
-    )
-    make_new_landmarks: bool = option(
-        True, help="Make new landmarks from detached observations of one feature track."
-    )
+    max_reprojection_error_px: float = 50.0
+    """Largest reprojection error of a valid observation."""
+    make_new_landmarks: bool = True
+    """Make new landmarks from detached observations of one feature track."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -3,57 +3,46 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class LocalizationOptions:
+class LocalizationOptions(Options, prefix="localization_"):
     """Matching of images with a map and acceptance of poses."""
 
-    flag_prefix: ClassVar[str] = "localization_"
-
-    num_neighbors: int = option(3, help="Landmarks to retrieve per keypoint.")
-    num_words_for_nn_search: int = option(
-        24, help="Cells of the multi-index that are searched per keypoint."
-    )
-    max_bit_fraction: float = option(
-        0.26,
-        help="Largest fraction of descriptor bits in which a match may differ; full maps only.",
-    )
-    max_descriptor_distance: float = option(
-        0.45,
-        help="Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit "
-        "length; full maps only.",
-    )
-    max_projected_distance: float = option(
-        40.0, help="Largest squared distance of projected descriptors of a match; summary maps."
-    )
-    places: int = option(6, help="Places of the map that are tried for each query.")
-    min_shared_landmarks: int = option(
-        5, help="Number of shared landmarks above which observers of the map belong to one place."
-    )
-    min_matches: int = option(5, help="Smallest number of matches with a place for verification.")
-    ransac_pixel_sigma: float = option(
-        2.0, help="Largest reprojection error of an inlier.", unit="px"
-    )
-    num_ransac_iters: int = option(500, help="Largest number of samples of two matches per place.")
-    min_inlier_count: int = option(8, help="Landmarks that must agree with the pose.")
-    min_inlier_ratio: float = option(
-        0.03, help="Fraction of the keypoints matched in the place that must agree."
-    )
-    max_gravity_misalignment_deg: float = option(
-        5.0,
-        help="Largest angle between gravity in the query's frame and in the estimated pose.",
-        unit="deg",
-    )
-    max_position_sigma_m: float = option(
-        0.5, help="Largest standard deviation of the position of an accepted pose.", unit="m"
-    )
-    seed: int = option(0, help="Seed of all random choices.")
+    num_neighbors: int = 3
+    """Landmarks to retrieve per keypoint."""
+    num_words_for_nn_search: int = 24
+    """Cells of the multi-index that are searched per keypoint."""
+    max_bit_fraction: float = 0.26
+    """Largest fraction of descriptor bits in which a match may differ; full maps only."""
+    max_descriptor_distance: float = 0.45
+    """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length; full
+    maps only."""
+    max_projected_distance: float = 40.0
+    """Largest squared distance of projected descriptors of a match; summary maps."""
+    places: int = 6
+    """Places of the map that are tried for each query."""
+    min_shared_landmarks: int = 5
+    """Number of shared landmarks above which observers of the map belong to one place."""
+    min_matches: int = 5
+    """Smallest number of matches with a place for verification."""
+    ransac_pixel_sigma: float = option(2.0, unit="px")
+    """Largest reprojection error of an inlier."""
+    num_ransac_iters: int = 500
+    """Largest number of samples of two matches per place."""
+    min_inlier_count: int = 8
+    """Landmarks that must agree with the pose."""
+    min_inlier_ratio: float = 0.03
+    """Fraction of the keypoints matched in the place that must agree."""
+    max_gravity_misalignment_deg: float = 5.0
+    """Largest angle between gravity in the query's frame and in the estimated pose."""
+    max_position_sigma_m: float = 0.5
+    """Largest standard deviation of the position of an accepted pose."""
+    seed: int = 0
+    """Seed of all random choices."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import FlagError
 from maplab_py.geometry import se3, so3
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 from maplab_py.vimap import VIMap
 
 
-@dataclasses.dataclass(frozen=True)
-class LayoutOptions:
+class LayoutOptions(Options, prefix="spatially_distribute_missions_"):
     """Layout of missions with unknown base frame; maplab's names and defaults."""
 
-    flag_prefix: ClassVar[str] = "spatially_distribute_missions_"
-
-    meters: float = option(20.0, help="Distance of neighbours, or radius of the circle.", unit="m")
-    dimension: int = option(0, help="Axis to shift along: 0 = x, 1 = y, 2 = z.")
-    around_circle: bool = option(False, help="Spread the missions around a circle instead.")
+    meters: float = option(20.0, unit="m")
+    """Distance of neighbours, or radius of the circle."""
+    dimension: int = 0
+    """Axis to shift along: 0 = x, 1 = y, 2 = z."""
+    around_circle: bool = False
+    """Spread the missions around a circle instead."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -54,23 +53,19 @@ def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, i
     return vi_map.replace(baseframes=frames.replace(T_G_M=T_G_M)), len(rows)
 
 
-@dataclasses.dataclass(frozen=True)
-class DisturbanceOptions:
+class DisturbanceOptions(Options, prefix="disturb_"):
     """Magnitude of the disturbance; maplab's names and defaults."""
 
-    flag_prefix: ClassVar[str] = "disturb_"
-
-    max_translational_disturbance_norm_m: float = option(
-        0.05, help="Largest shift of a vertex.", unit="m"
-    )
-    max_yaw_angle_rad: float = option(0.05, help="Largest turn of a vertex.", unit="rad")
-    translation_random_walk_sigma_m: float = option(
-        0.005, help="Standard deviation by which the shift changes per vertex and axis.", unit="m"
-    )
-    yaw_angle_stddev_rad: float = option(
-        0.0005, help="Standard deviation by which the turn changes per vertex.", unit="rad"
-    )
-    random_generator_seed: int = option(0, help="Seed of the disturbance.")
+    max_translational_disturbance_norm_m: float = 0.05
+    """Largest shift of a vertex."""
+    max_yaw_angle_rad: float = 0.05
+    """Largest turn of a vertex."""
+    translation_random_walk_sigma_m: float = 0.005
+    """Standard deviation by which the shift changes per vertex and axis."""
+    yaw_angle_stddev_rad: float = 0.0005
+    """Standard deviation by which the turn changes per vertex."""
+    random_generator_seed: int = 0
+    """Seed of the disturbance."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class RelaxationOptions:
+class RelaxationOptions(Options, prefix="relax_"):
     """Flags of pose-graph relaxation.
 
     The drift rates say how far a mission's own trajectory is trusted between loop closures. They
@@ -19,48 +17,32 @@ class RelaxationOptions:
     too large a one lets false ones deform the trajectory.
     """
 
-    flag_prefix: ClassVar[str] = "relax_"
-
-    robustness: str = option(
-        "gnc",
-        help="How false loop closures are kept from doing harm: 'gnc' (graduated non-convexity) "
-        "finds those that agree with one another, trusts them fully and the others not at all; "
-        "'switchable' estimates a switch variable for each one, 'dcs' (dynamic covariance scaling) "
-        "reduces their weights in closed form, 'cauchy' is a Cauchy loss, 'none' trusts all of them.",
-        choices=("gnc", "switchable", "dcs", "cauchy", "none"),
-    )
-    switch_prior: float = option(
-        20.0,
-        help="Cost of switching a loop closure off: closures whose squared normalised error (six "
-        "degrees of freedom) is above it lose their weight. With 'gnc' it is multiplied by the "
-        "variance factor that the closures show, so wrong covariances do less harm.",
-    )
-    position_drift: float = option(
-        0.03, help="Position random walk of the trajectories.", unit="m/sqrt(m)"
-    )
-    yaw_drift_deg: float = option(
-        0.4, help="Heading random walk of the trajectories.", unit="deg/sqrt(s)"
-    )
-    tilt_drift_deg: float = option(
-        0.1, help="Roll and pitch random walk of the trajectories.", unit="deg/sqrt(s)"
-    )
-    tilt_sigma_deg: float = option(
-        0.5, help="Uncertainty of roll and pitch: gravity shows them at every vertex.", unit="deg"
-    )
-    loop_sigma_m: float = option(
-        0.05, help="Position uncertainty of loop closures that come without a covariance.", unit="m"
-    )
-    loop_sigma_deg: float = option(
-        1.0, help="Angular uncertainty of loop closures that come without a covariance.", unit="deg"
-    )
-    num_iterations: int = option(
-        30, help="Iterations of the last optimisation, at most; those before it take a few each."
-    )
-    function_tolerance: float = option(
-        1e-7,
-        help="Share of the cost that further iterations of the last optimisation may be expected to "
-        "save when it ends.",
-    )
+    robustness: str = option("gnc", choices=("gnc", "switchable", "dcs", "cauchy", "none"))
+    """How false loop closures are kept from doing harm: 'gnc' (graduated non-convexity) finds those that
+    agree with one another, trusts them fully and the others not at all; 'switchable' estimates a switch
+    variable for each one, 'dcs' (dynamic covariance scaling) reduces their weights in closed form, 'cauchy'
+    is a Cauchy loss, 'none' trusts all of them."""
+    switch_prior: float = 20.0
+    """Cost of switching a loop closure off: closures whose squared normalised error (six degrees of freedom)
+    is above it lose their weight. With 'gnc' it is multiplied by the variance factor that the closures show,
+    so wrong covariances do less harm."""
+    position_drift: float = option(0.03, unit="m/sqrt(m)")
+    """Position random walk of the trajectories."""
+    yaw_drift_deg: float = option(0.4, unit="deg/sqrt(s)")
+    """Heading random walk of the trajectories."""
+    tilt_drift_deg: float = option(0.1, unit="deg/sqrt(s)")
+    """Roll and pitch random walk of the trajectories."""
+    tilt_sigma_deg: float = 0.5
+    """Uncertainty of roll and pitch: gravity shows them at every vertex."""
+    loop_sigma_m: float = 0.05
+    """Position uncertainty of loop closures that come without a covariance."""
+    loop_sigma_deg: float = 1.0
+    """Angular uncertainty of loop closures that come without a covariance."""
+    num_iterations: int = 30
+    """Iterations of the last optimisation, at most; those before it take a few each."""
+    function_tolerance: float = 1e-7
+    """Share of the cost that further iterations of the last optimisation may be expected to save when it
+    ends."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Self
+from typing import Self
 
 from maplab_py.errors import UserError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 STATES = (
     "intrinsics",
@@ -39,8 +39,7 @@ _MINIMUM = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class SelfCalibrationOptions:
+class SelfCalibrationOptions(Options, prefix="sc_"):
     """Estimated parameters, data and priors.
 
     The prior deviations say how far a device may be from its nominal calibration. A direction that
@@ -48,98 +47,75 @@ class SelfCalibrationOptions:
     the information of a segment.
     """
 
-    flag_prefix: ClassVar[str] = "sc_"
-
     states: str = option(
         "intrinsics,extrinsics_rotation,extrinsics_translation,imu",
         help="What to estimate, separated by commas: " + ", ".join(STATES) + ".",
     )
-    groups: str = option(
-        "imu,camera,extrinsics",
-        help="Parameter groups that each keep their own segments, separated by commas; several "
-        "joined by + are one group (imu+camera+extrinsics: a single one).",
-    )
-    metric: str = option(
-        "a_optimality", help="How a group's covariance becomes one number.", choices=METRICS
-    )
-    selection: str = option("informative", help="Which segments to take.", choices=SELECTIONS)
-    segments_per_group: int = option(8, help="How many segments each group keeps.")
-    segment_keyframes: int = option(40, help="Keyframes of a segment.")
-    seed: int = option(1, help="Seed of the random selection.")
-    min_information_gain: float = option(
-        0.2, help="Selection by information gain keeps a segment above this.", unit="nat"
-    )
-    min_shared_landmarks: int = option(
-        15, help="Segments that share more landmarks than this form one partition."
-    )
-    min_parallax_deg: float = option(
-        1.0,
-        help="Landmarks seen under a smaller parallax are not used.",
-        unit="deg",
-    )
-    num_iterations: int = option(40, help="Largest number of iterations.")
-    function_tolerance: float = option(
-        1e-6, help="Stop when an iteration lowers the cost by less than this share of it."
-    )
+    groups: str = "imu,camera,extrinsics"
+    """Parameter groups that each keep their own segments, separated by commas; several joined by + are one
+    group (imu+camera+extrinsics: a single one)."""
+    metric: str = option("a_optimality", choices=METRICS)
+    """How a group's covariance becomes one number."""
+    selection: str = option("informative", choices=SELECTIONS)
+    """Which segments to take."""
+    segments_per_group: int = 8
+    """How many segments each group keeps."""
+    segment_keyframes: int = 40
+    """Keyframes of a segment."""
+    seed: int = 1
+    """Seed of the random selection."""
+    min_information_gain: float = option(0.2, unit="nat")
+    """Selection by information gain keeps a segment above this."""
+    min_shared_landmarks: int = 15
+    """Segments that share more landmarks than this form one partition."""
+    min_parallax_deg: float = 1.0
+    """Landmarks seen under a smaller parallax are not used."""
+    num_iterations: int = 40
+    """Largest number of iterations."""
+    function_tolerance: float = 1e-6
+    """Stop when an iteration lowers the cost by less than this share of it."""
     loss: str = option(
-        "cauchy",
-        help="Robust loss of reprojection errors until outliers are rejected.",
-        choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"),
+        "cauchy", choices=("none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs")
     )
-    inconsistent_probability: float = option(
-        0.01,
-        help="Landmarks whose residuals are less probable than this are rejected; the others then "
-        "have their full weight. 0 = keep the robust loss to the end.",
-    )
-    imu_curvature: bool = option(
-        True,
-        help="Correct inertial samples for the bias of linear interpolation between them.",
-    )
-    gate_reprojection_error_px: float = option(
-        40.0, help="Observations with a larger initial reprojection error are not used.", unit="px"
-    )
-    keep_unobservable_at_prior: bool = option(
-        False,
-        help="Accept data that leave directions undetermined and keep those at their prior; "
-        "otherwise such data are refused.",
-    )
-    prior_focal_relative: float = option(0.05, help="Prior deviation of focal lengths, relative.")
-    prior_centre_px: float = option(15.0, help="Prior deviation of the centre.", unit="px")
-    prior_distortion: float = option(0.05, help="Prior deviation of distortion parameters.")
-    prior_rotation_deg: float = option(
-        5.0, help="Prior deviation of the camera's orientation.", unit="deg"
-    )
-    prior_position_m: float = option(
-        0.05, help="Prior deviation of the camera's position.", unit="m"
-    )
-    prior_imu_scale: float = option(0.05, help="Prior deviation of IMU scales.")
-    prior_imu_misalignment: float = option(0.05, help="Prior deviation of IMU misalignments.")
-    prior_imu_rotation_deg: float = option(
-        5.0, help="Prior deviation of the accelerometer's orientation.", unit="deg"
-    )
-    prior_time_offset_s: float = option(
-        0.03, help="Prior deviation of the delay of the images.", unit="s"
-    )
+    """Robust loss of reprojection errors until outliers are rejected."""
+    inconsistent_probability: float = 0.01
+    """Landmarks whose residuals are less probable than this are rejected; the others then have their full
+    weight. 0 = keep the robust loss to the end."""
+    imu_curvature: bool = True
+    """Correct inertial samples for the bias of linear interpolation between them."""
+    gate_reprojection_error_px: float = 40.0
+    """Observations with a larger initial reprojection error are not used."""
+    keep_unobservable_at_prior: bool = False
+    """Accept data that leave directions undetermined and keep those at their prior; otherwise such data are
+    refused."""
+    prior_focal_relative: float = 0.05
+    """Prior deviation of focal lengths, relative."""
+    prior_centre_px: float = 15.0
+    """Prior deviation of the centre."""
+    prior_distortion: float = 0.05
+    """Prior deviation of distortion parameters."""
+    prior_rotation_deg: float = 5.0
+    """Prior deviation of the camera's orientation."""
+    prior_position_m: float = 0.05
+    """Prior deviation of the camera's position."""
+    prior_imu_scale: float = 0.05
+    """Prior deviation of IMU scales."""
+    prior_imu_misalignment: float = 0.05
+    """Prior deviation of IMU misalignments."""
+    prior_imu_rotation_deg: float = 5.0
+    """Prior deviation of the accelerometer's orientation."""
+    prior_time_offset_s: float = 0.03
+    """Prior deviation of the delay of the images."""
 
-    prior_line_delay_us: float = option(
-        100.0, help="Prior deviation of the time between two rows.", unit="us"
-    )
+    prior_line_delay_us: float = 100.0
+    """Prior deviation of the time between two rows."""
 
-    prior_gyro_bias_radps: float = option(
-        0.2,
-        help="Prior deviation of the gyroscope's bias at the beginning of a run of segments.",
-        unit="rad/s",
-    )
-    prior_accel_bias_mps2: float = option(
-        2.0,
-        help="Prior deviation of the accelerometer's bias at the beginning of a run of segments.",
-        unit="m/s^2",
-    )
-    prior_velocity_mps: float = option(
-        20.0,
-        help="Prior deviation of the velocity at the beginning of a run of segments.",
-        unit="m/s",
-    )
+    prior_gyro_bias_radps: float = 0.2
+    """Prior deviation of the gyroscope's bias at the beginning of a run of segments."""
+    prior_accel_bias_mps2: float = 2.0
+    """Prior deviation of the accelerometer's bias at the beginning of a run of segments."""
+    prior_velocity_mps: float = 20.0
+    """Prior deviation of the velocity at the beginning of a run of segments."""
 
     def checked(self) -> Self:
         """Return the options if they can be used.

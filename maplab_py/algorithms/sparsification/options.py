@@ -3,52 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 METHODS = ("ilp", "greedy", "most_observed", "random")
 
 
-@dataclasses.dataclass(frozen=True)
-class SparsificationOptions:
+class SparsificationOptions(Options, prefix="sparsification_"):
     """Method and parameters of the selection of landmarks."""
 
-    flag_prefix: ClassVar[str] = "sparsification_"
-
-    method: str = option(
-        "ilp",
-        help="ilp (integer programme), greedy (cover), or, for comparison, most_observed or random.",
-        choices=METHODS,
-    )
-    min_keypoints_per_keyframe: int = option(
-        30, help="Number of landmarks that every keyframe should still observe"
-    )
-    weighted: bool = option(
-        False,
-        help="Weight a landmark by the probability of matching it again, which increases with the number "
-        "of observing vertices; otherwise all weights are equal (Schneider 2019, section 4)",
-    )
-    slack_levels: int = option(
-        2,
-        help="Number of levels of the cost of missing landmarks, which doubles from level to level; "
-        "1 = constant cost, as in Schneider 2019",
-    )
-    descriptor_dev_scoring_threshold: float = option(
-        10.0,
-        help="Mean distance of a landmark's descriptors from their majority, in bits of 384, above "
-        "which its score falls.",
-    )
-    exact_up_to: int = option(
-        2000, help="Largest number of landmarks for which the integer programme is solved exactly"
-    )
-    landmarks_per_part: int = option(
-        60000,
-        help="Largest number of landmarks of a part; larger maps are split along the co-visibility graph",
-    )
-    seed: int = option(0, help="Seed of the random choice.")
+    method: str = option("ilp", choices=METHODS)
+    """ilp (integer programme), greedy (cover), or, for comparison, most_observed or random."""
+    min_keypoints_per_keyframe: int = 30
+    """Number of landmarks that every keyframe should still observe"""
+    weighted: bool = False
+    """Weight a landmark by the probability of matching it again, which increases with the number of observing
+    vertices; otherwise all weights are equal (Schneider 2019, section 4)"""
+    slack_levels: int = 2
+    """Number of levels of the cost of missing landmarks, which doubles from level to level; 1 = constant
+    cost, as in Schneider 2019"""
+    descriptor_dev_scoring_threshold: float = 10.0
+    """Mean distance of a landmark's descriptors from their majority, in bits of 384, above which its score
+    falls."""
+    exact_up_to: int = 2000
+    """Largest number of landmarks for which the integer programme is solved exactly"""
+    landmarks_per_part: int = 60000
+    """Largest number of landmarks of a part; larger maps are split along the co-visibility graph"""
+    seed: int = 0
+    """Seed of the random choice."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -4,40 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.report import Report
 
 
-@dataclasses.dataclass(frozen=True)
-class SummaryMapOptions:
+class SummaryMapOptions(Options, prefix="summary_map_"):
     """Content of a summary map."""
 
-    flag_prefix: ClassVar[str] = "summary_map_"
-
-    descriptor_step: float = option(
-        1.0 / 32.0,
-        help="Projected descriptors are rounded to multiples of this, which makes the file half as "
-        "large; noise within a track is about 1; 0 = not rounded.",
-    )
-    max_observations_per_landmark: int = option(
-        0, help="Observations that are kept of a landmark, spread over all of them; 0 = all."
-    )
-    position_step_m: float = option(
-        1.0 / 1024.0,
-        help="Positions are rounded to multiples of this; 0 = not rounded.",
-        unit="m",
-    )
-    covariances: bool = option(
-        False, help="Write a covariance for every landmark, 24 bytes that hardly compress."
-    )
-    landmark_ids: bool = option(
-        False,
-        help="Write the ids of the landmarks, 16 bytes that do not compress; those of the observing "
-        "vertices are written in any case.",
-    )
+    descriptor_step: float = 1.0 / 32.0
+    """Projected descriptors are rounded to multiples of this, which makes the file half as large; noise
+    within a track is about 1; 0 = not rounded."""
+    max_observations_per_landmark: int = 0
+    """Observations that are kept of a landmark, spread over all of them; 0 = all."""
+    position_step_m: float = 1.0 / 1024.0
+    """Positions are rounded to multiples of this; 0 = not rounded."""
+    covariances: bool = False
+    """Write a covariance for every landmark, 24 bytes that hardly compress."""
+    landmark_ids: bool = False
+    """Write the ids of the landmarks, 16 bytes that do not compress; those of the observing vertices are
+    written in any case."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

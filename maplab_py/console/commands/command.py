@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from maplab_py.console.commands.flag_types import flag_type
 from maplab_py.console.commands.flags import COMMON_FLAGS, REQUIRED, Flag, normalise
 from maplab_py.errors import FlagError
+from maplab_py.options import help_of, unit_of
 
 COMMAND_ATTRIBUTE = "maplab_command"
 
@@ -218,7 +219,7 @@ def _flags_of(
         normalise(parameter.name).rstrip("_"),
         flag_type(hint),
         REQUIRED if parameter.default is parameter.empty else parameter.default,
-        _flag_help(documentation.get(parameter.name, "")),
+        documentation.get(parameter.name, ""),
         path=(parameter.name,),
     )
 
@@ -242,8 +243,8 @@ def _group_flags(group: Any, path: tuple[str, ...]) -> Iterator[Flag]:
             field.metadata.get("flag") or prefix + field.name,
             flag_type(hints[field.name], field.metadata.get("choices", ())),
             value,
-            _flag_help(field.metadata.get("help", "")),
-            field.metadata.get("unit", ""),
+            functools.partial(help_of, group.__class__, field),
+            unit_of(field),
             (*path, field.name),
         )
 
@@ -251,11 +252,6 @@ def _group_flags(group: Any, path: tuple[str, ...]) -> Iterator[Flag]:
 @functools.cache
 def _field_types(group: type) -> dict[str, Any]:
     return typing.get_type_hints(group)
-
-
-def _flag_help(text: str) -> str:
-    """Return the help of a flag; like an entry of a table it ends without a full stop."""
-    return text.strip().removesuffix(".")
 
 
 def _is_options(hint: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from maplab_py.console.commands.flag_types import BOOL, FlagType, format_value
@@ -28,9 +28,15 @@ class Flag:
     name: str
     type: FlagType
     default: Any
-    help: str = ""
+    documentation: str | Callable[[], str] = ""  # read when the help is asked for
     unit: str = ""
     path: tuple[str, ...] = ()  # parameter, then the fields of option groups down to the value
+
+    @property
+    def help(self) -> str:
+        """Help of the flag; like an entry of a table it ends without a full stop."""
+        text = self.documentation if isinstance(self.documentation, str) else self.documentation()
+        return text.strip().removesuffix(".")
 
     @property
     def is_required(self) -> bool:

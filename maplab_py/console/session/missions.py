@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.options import option
+from maplab_py.options import Options
 
 if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 
-@dataclasses.dataclass(frozen=True)
-class MissionChoice:
+class MissionChoice(Options):
     """Missions to work on; all if none is given."""
 
-    map_mission: str = option("", help="Mission id or unambiguous prefix; empty = all missions")
-    map_mission_list: str = option("", help="Several missions, separated by commas")
+    map_mission: str = ""
+    """Mission id or unambiguous prefix; empty = all missions"""
+    map_mission_list: str = ""
+    """Several missions, separated by commas"""
 
     def rows(self, vi_map: VIMap) -> I64 | None:
         """Return the rows of the chosen missions in ascending order, None if none is given (all).

@@ -8,23 +8,19 @@ from collections.abc import Sequence
 from maplab_py.console.session.maps import MapEntry, Step
 from maplab_py.console.session.settings import Settings
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.vimap import VIMap
 
 _FLAG = "undo_max_gb"
 _GB = 1e9
 
 
-@dataclasses.dataclass(frozen=True)
-class UndoOptions:
+class UndoOptions(Options):
     """Bound of the values that undo and redo keep."""
 
-    undo_max_gb: float = option(
-        4.0,
-        help="Memory for the former values of each map, columns that the present value shares left out; the "
-        "oldest values beyond it are dropped and cannot be restored by undo.",
-        unit="GB",
-    )
+    undo_max_gb: float = 4.0
+    """Memory for the former values of each map, columns that the present value shares left out; the oldest
+    values beyond it are dropped and cannot be restored by undo."""
 
     def __post_init__(self) -> None:
         """Check the range.

@@ -3,108 +3,70 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 
-@dataclasses.dataclass(frozen=True)
-class InitializationOptions:
+class InitializationOptions(Options, prefix="vio_initialization_"):
     """Conditions for the start of the estimator."""
 
-    flag_prefix: ClassVar[str] = "vio_initialization_"
-
-    rest_s: float = option(1.0, unit="s", help="Time at rest from which the estimator starts")
-    rest_disparity_px: float = option(
-        0.5,
-        unit="px",
-        help="Largest median disparity in 0.1 s at rest, turns included; half of it over half a second and "
-        "longer, noise of the tracks removed, where there are so many images",
-    )
-    rest_accel_deviation_mps2: float = option(
-        0.25, unit="m/s^2", help="Largest deviation of the accelerometer at rest"
-    )
-    rest_gyro_deviation_radps: float = option(
-        0.05, unit="rad/s", help="Largest deviation of the gyroscope at rest"
-    )
-    min_rig_s: float = option(
-        1.5, unit="s", help="Shortest time in motion for cameras that see the same points"
-    )
-    min_mono_s: float = option(1.5, unit="s", help="Shortest time in motion for a single camera")
-    longest_s: float = option(4.0, unit="s", help="Time in motion that is used, the latest part")
-    retry_s: float = option(
-        0.25,
-        unit="s",
-        help="Shortest time between two attempts; it grows where the scale is far from known, and with "
-        "the time that has passed",
-    )
-    keyframe_interval_s: float = option(
-        0.1, unit="s", help="Shortest time between the frames that are used"
-    )
-    most_keyframes: int = option(
-        16, help="Largest number of frames that are used of cameras that see the same points"
-    )
-    most_mono_keyframes: int = option(
-        28, help="Largest number of frames that are used of a single camera"
-    )
-    min_landmarks: int = option(20, help="Smallest number of landmarks")
-    max_scale_sigma: float = option(
-        0.03, help="Largest standard deviation of the scale, as a share of it"
-    )
-    early_scale_sigma: float = option(
-        0.015, help="The same for a single camera before --vio_initialization_early_s has passed"
-    )
-    early_s: float = option(
-        3.75, unit="s", help="Time during which a single camera waits for the better scale"
-    )
-    max_rig_sigma_m: float = option(
-        0.01,
-        unit="m",
-        help="Cameras that see the same points need not move when the distance moved is known so well",
-    )
-    max_tilt_sigma_deg: float = option(
-        1.5, unit="deg", help="Largest standard deviation of the direction of gravity"
-    )
-    patience_s: float = option(
-        5.0,
-        unit="s",
-        help="Time after which the limits of scale and gravity grow with the time that has passed",
-    )
-    provisional_s: float = option(
-        2.5,
-        unit="s",
-        help="Time after which the estimator starts with what is known, and follows scale, velocity and "
-        "biases once they show",
-    )
-    provisional_scale_sigma: float = option(
-        0.06,
-        help="Standard deviation of the scale, as a share of it, below which it waits up to "
-        "--vio_initialization_promising_s instead",
-    )
-    promising_s: float = option(
-        4.0, unit="s", help="Longest time to wait for a scale that is nearly known"
-    )
-    max_error_px: float = option(
-        1.5, unit="px", help="Largest median reprojection error after the refinement"
-    )
-    gyro_bias_sigma_radps: float = option(
-        0.1, unit="rad/s", help="Standard deviation of the gyroscope's bias before the start"
-    )
-    accel_bias_sigma_mps2: float = option(
-        0.2,
-        unit="m/s^2",
-        help="Standard deviation of the accelerometer's bias before the start, unless it walks "
-        "farther in an hour",
-    )
-    least_gyro_noise_density: float = option(
-        7e-4, unit="rad/s/sqrt(Hz)", help="Noise of the gyroscope, if the calibration says less"
-    )
-    least_accel_noise_density: float = option(
-        0.016,
-        unit="m/s^2/sqrt(Hz)",
-        help="Noise of the accelerometer, if the calibration says less",
-    )
+    rest_s: float = 1.0
+    """Time at rest from which the estimator starts"""
+    rest_disparity_px: float = 0.5
+    """Largest median disparity in 0.1 s at rest, turns included; half of it over half a second and longer,
+    noise of the tracks removed, where there are so many images"""
+    rest_accel_deviation_mps2: float = 0.25
+    """Largest deviation of the accelerometer at rest"""
+    rest_gyro_deviation_radps: float = 0.05
+    """Largest deviation of the gyroscope at rest"""
+    min_rig_s: float = 1.5
+    """Shortest time in motion for cameras that see the same points"""
+    min_mono_s: float = 1.5
+    """Shortest time in motion for a single camera"""
+    longest_s: float = 4.0
+    """Time in motion that is used, the latest part"""
+    retry_s: float = 0.25
+    """Shortest time between two attempts; it grows where the scale is far from known, and with the time that
+    has passed"""
+    keyframe_interval_s: float = 0.1
+    """Shortest time between the frames that are used"""
+    most_keyframes: int = 16
+    """Largest number of frames that are used of cameras that see the same points"""
+    most_mono_keyframes: int = 28
+    """Largest number of frames that are used of a single camera"""
+    min_landmarks: int = 20
+    """Smallest number of landmarks"""
+    max_scale_sigma: float = 0.03
+    """Largest standard deviation of the scale, as a share of it"""
+    early_scale_sigma: float = 0.015
+    """The same for a single camera before --vio_initialization_early_s has passed"""
+    early_s: float = 3.75
+    """Time during which a single camera waits for the better scale"""
+    max_rig_sigma_m: float = 0.01
+    """Cameras that see the same points need not move when the distance moved is known so well"""
+    max_tilt_sigma_deg: float = 1.5
+    """Largest standard deviation of the direction of gravity"""
+    patience_s: float = 5.0
+    """Time after which the limits of scale and gravity grow with the time that has passed"""
+    provisional_s: float = 2.5
+    """Time after which the estimator starts with what is known, and follows scale, velocity and biases once
+    they show"""
+    provisional_scale_sigma: float = 0.06
+    """Standard deviation of the scale, as a share of it, below which it waits up to
+    --vio_initialization_promising_s instead"""
+    promising_s: float = 4.0
+    """Longest time to wait for a scale that is nearly known"""
+    max_error_px: float = 1.5
+    """Largest median reprojection error after the refinement"""
+    gyro_bias_sigma_radps: float = 0.1
+    """Standard deviation of the gyroscope's bias before the start"""
+    accel_bias_sigma_mps2: float = 0.2
+    """Standard deviation of the accelerometer's bias before the start, unless it walks farther in an hour"""
+    least_gyro_noise_density: float = option(7e-4, unit="rad/s/sqrt(Hz)")
+    """Noise of the gyroscope, if the calibration says less"""
+    least_accel_noise_density: float = option(0.016, unit="m/s^2/sqrt(Hz)")
+    """Noise of the accelerometer, if the calibration says less"""
 
     def check(self) -> None:
         """Check the values.

@@ -2,108 +2,64 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.errors import FlagError
 from maplab_py.estimation.window.map_rule import MapRule
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 MODES = ("vil", "swl", "pose", "odo")
 LANDMARK_UNCERTAINTIES = ("none", "map")
 
 
-@dataclasses.dataclass(frozen=True)
-class OnlineLocalizationOptions:
+class OnlineLocalizationOptions(Options, prefix="localization_"):
     """Localisation of the odometry in a map."""
 
-    flag_prefix: ClassVar[str] = "localization_"
-
     matching: LocalizationOptions = LocalizationOptions()
-    map_folder: Path | None = option(
-        None,
-        help="Map folder, or summary map, in which the recording is localised",
-        flag="vio_localization_map_folder",
-    )
-    mode: str = option(
-        "vil",
-        choices=MODES,
-        help="vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, "
-        "poses fixed; pose = T_G_M from poses of single images; odo = T_G_M from the first matches "
-        "only",
-    )
-    max_frequency_hz: float = option(
-        2.0,
-        help="Largest rate at which images are matched with the map",
-        unit="Hz",
-        flag="vio_max_localization_frequency_hz",
-    )
-    map_tracking: bool = option(
-        True, help="Once localised, match landmarks near their predicted places before all others"
-    )
-    max_num_constraints: int = option(
-        25,
-        help="Tracks per camera that observe the map at a time; 0 = any number",
-        flag="rovioli_max_num_localization_constraints",
-    )
-    min_num_constraints: int = option(
-        5,
-        help="Matches that an answer must have to be used",
-        flag="rovioli_min_number_of_structure_constraints",
-    )
-    max_tilt_deg: float = option(
-        5.0,
-        help="Largest angle between gravity in the map and in the odometry",
-        unit="deg",
-        flag="rovioli_localization_max_gravity_misalignment_deg",
-    )
+    map_folder: Path | None = option(None, flag="vio_localization_map_folder")
+    """Map folder, or summary map, in which the recording is localised"""
+    mode: str = option("vil", choices=MODES)
+    """vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, poses fixed; pose =
+    T_G_M from poses of single images; odo = T_G_M from the first matches only"""
+    max_frequency_hz: float = option(2.0, flag="vio_max_localization_frequency_hz")
+    """Largest rate at which images are matched with the map"""
+    map_tracking: bool = True
+    """Once localised, match landmarks near their predicted places before all others"""
+    max_num_constraints: int = option(25, flag="rovioli_max_num_localization_constraints")
+    """Tracks per camera that observe the map at a time; 0 = any number"""
+    min_num_constraints: int = option(5, flag="rovioli_min_number_of_structure_constraints")
+    """Matches that an answer must have to be used"""
+    max_tilt_deg: float = option(5.0, flag="rovioli_localization_max_gravity_misalignment_deg")
+    """Largest angle between gravity in the map and in the odometry"""
     init_position_covariance_msq: float = option(
-        20.0,
-        help="Variance of the position of T_G_M before anything is matched",
-        unit="m^2",
-        flag="rovioli_baseframe_init_position_covariance_msq",
+        20.0, unit="m^2", flag="rovioli_baseframe_init_position_covariance_msq"
     )
+    """Variance of the position of T_G_M before anything is matched"""
     init_rotation_covariance_radsq: float = option(
         float(np.radians(90.0)),
-        help="Variance of the orientation of T_G_M before anything is matched",
         unit="rad^2",
         flag="rovioli_baseframe_init_rotation_covariance_radsq",
     )
-    min_num_estimates: int = option(
-        2,
-        help="Answers in a row that must agree before T_G_M is set, or set again; four times as many "
-        "where they differ by more than the odometry drifts and have fewer than 80 matches together",
-        flag="rovioli_min_num_baseframe_estimates_before_init",
-    )
+    """Variance of the orientation of T_G_M before anything is matched"""
+    min_num_estimates: int = option(2, flag="rovioli_min_num_baseframe_estimates_before_init")
+    """Answers in a row that must agree before T_G_M is set, or set again; four times as many where they
+    differ by more than the odometry drifts and have fewer than 80 matches together"""
     max_mean_error_px: float = option(
-        20.0,
-        help="Mean reprojection error at the estimated pose above which an answer disagrees",
-        unit="px",
-        flag="rovioli_max_mean_localization_reprojection_error_px",
+        20.0, flag="rovioli_max_mean_localization_reprojection_error_px"
     )
-    keypoint_sigma_px: float = option(
-        1.0,
-        help="Standard deviation of a keypoint that observes the map",
-        unit="px",
-        flag="vil_keypoint_sigma_px",
-    )
-    tilt_sigma_deg: float = option(
-        0.5,
-        help="Standard deviation of the tilt of the map against the odometry",
-        unit="deg",
-        flag="vil_map_tilt_sigma_deg",
-    )
+    """Mean reprojection error at the estimated pose above which an answer disagrees"""
+    keypoint_sigma_px: float = option(1.0, flag="vil_keypoint_sigma_px")
+    """Standard deviation of a keypoint that observes the map"""
+    tilt_sigma_deg: float = option(0.5, flag="vil_map_tilt_sigma_deg")
+    """Standard deviation of the tilt of the map against the odometry"""
     landmark_uncertainty: str = option(
-        "none",
-        choices=LANDMARK_UNCERTAINTIES,
-        help="none = landmarks of the map are exact; map = they are estimated, with the map's "
-        "covariances (mode vil)",
-        flag="vil_landmark_uncertainty",
+        "none", choices=LANDMARK_UNCERTAINTIES, flag="vil_landmark_uncertainty"
     )
+    """none = landmarks of the map are exact; map = they are estimated, with the map's covariances (mode
+    vil)"""
 
     def check(self) -> None:
         """Check the values.

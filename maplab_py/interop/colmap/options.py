@@ -7,36 +7,29 @@ import math
 from pathlib import Path
 
 from maplab_py.interop.stamps import time_unit_option
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 QUALITIES = ("good", "not_bad", "all")
 TIME_SOURCES = ("name", "file", "order")
 
 
-@dataclasses.dataclass(frozen=True)
-class ColmapExportOptions:
+class ColmapExportOptions(Options):
     """Parts of a map to write."""
 
-    quality: str = option("not_bad", help="Landmarks to write, by their quality", choices=QUALITIES)
-    colmap_feature_type: str = option(
-        "",
-        help="Write keypoints of this feature type only, and what they observe: Binary, SIFT, ... or a "
-        "number; a database has one kind of descriptors in an image; empty = all keypoints",
-    )
-    undistort: bool = option(
-        False,
-        help="Write perspective cameras and undistorted keypoints, as omni cameras need it",
-    )
-    colmap_format: str = option(
-        "binary", help="Format of the model's files", choices=("binary", "text")
-    )
-    colmap_database: bool = option(
-        False, help="Write database.db with keypoints, descriptors and the matches of landmarks"
-    )
-    colmap_pose_priors: bool = option(
-        False, help="Write the positions of the cameras to database.db as priors"
-    )
+    quality: str = option("not_bad", choices=QUALITIES)
+    """Landmarks to write, by their quality"""
+    colmap_feature_type: str = ""
+    """Write keypoints of this feature type only, and what they observe: Binary, SIFT, ... or a number; a
+    database has one kind of descriptors in an image; empty = all keypoints"""
+    undistort: bool = False
+    """Write perspective cameras and undistorted keypoints, as omni cameras need it"""
+    colmap_format: str = option("binary", choices=("binary", "text"))
+    """Format of the model's files"""
+    colmap_database: bool = False
+    """Write database.db with keypoints, descriptors and the matches of landmarks"""
+    colmap_pose_priors: bool = False
+    """Write the positions of the cameras to database.db as priors"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,51 +48,36 @@ class ColmapExportReport(Report):
     files: tuple[Path, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class ColmapImportOptions:
+class ColmapImportOptions(Options):
     """Conversion of a model to a map."""
 
-    timestamps_from: str = option(
-        "name",
-        help="Source of the images' times: their names, a file, or their order",
-        choices=TIME_SOURCES,
-    )
-    timestamps_file: str = option(
-        "", help="File of lines `image name, time stamp` for --timestamps_from=file"
-    )
+    timestamps_from: str = option("name", choices=TIME_SOURCES)
+    """Source of the images' times: their names, a file, or their order"""
+    timestamps_file: str = ""
+    """File of lines `image name, time stamp` for --timestamps_from=file"""
     time_unit: str = time_unit_option()
-    order_interval_s: float = option(
-        1.0, help="Time between frames for --timestamps_from=order", unit="s"
-    )
-    scale: float = option(0.0, help="Metres per unit of the model; 0 = unknown", unit="m")
-    align_to: str = option(
-        "",
-        help="Trajectory in metres, with gravity along -z, that the model is aligned with (Sim(3))",
-    )
-    gravity: str = option(
-        "", help="Direction of gravity in the model, x,y,z; `upright` = as the images stand"
-    )
-    undistort: bool = option(
-        False, help="Import cameras that maplab has no model of as perspective cameras"
-    )
-    colmap_poses: str = option(
-        "",
-        help="Poses that hold where images differ from rigs and frames; empty = the images, with a note",
-        choices=("", "images", "frames"),
-    )
-    images: str = option("", help="Folder of the images, which become resources; empty = none")
-    link_images: bool = option(
-        False, help="Refer to the images by symbolic links instead of copying them"
-    )
-    colmap_keypoint_sigma_px: float = option(
-        0.8, help="Standard deviation of the keypoints", unit="px"
-    )
-    colmap_odometry_sigma_m: float = option(
-        0.02, help="Standard deviation of the position of odometry edges", unit="m"
-    )
-    colmap_odometry_sigma_deg: float = option(
-        0.2, help="Standard deviation of the rotation of odometry edges", unit="deg"
-    )
+    order_interval_s: float = 1.0
+    """Time between frames for --timestamps_from=order"""
+    scale: float = option(0.0, unit="m")
+    """Metres per unit of the model; 0 = unknown"""
+    align_to: str = ""
+    """Trajectory in metres, with gravity along -z, that the model is aligned with (Sim(3))"""
+    gravity: str = ""
+    """Direction of gravity in the model, x,y,z; `upright` = as the images stand"""
+    undistort: bool = False
+    """Import cameras that maplab has no model of as perspective cameras"""
+    colmap_poses: str = option("", choices=("", "images", "frames"))
+    """Poses that hold where images differ from rigs and frames; empty = the images, with a note"""
+    images: str = ""
+    """Folder of the images, which become resources; empty = none"""
+    link_images: bool = False
+    """Refer to the images by symbolic links instead of copying them"""
+    colmap_keypoint_sigma_px: float = 0.8
+    """Standard deviation of the keypoints"""
+    colmap_odometry_sigma_m: float = 0.02
+    """Standard deviation of the position of odometry edges"""
+    colmap_odometry_sigma_deg: float = 0.2
+    """Standard deviation of the rotation of odometry edges"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 from maplab_py.errors import FlagError, UserError
 from maplab_py.interop.live.opening import open_transport
@@ -29,7 +28,7 @@ from maplab_py.interop.recordings.bag_writing import (
     format_of_path,
     write_bag,
 )
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
 
@@ -38,14 +37,13 @@ _MAX_WAITING = 20_000
 _MAX_WAITING_BYTES = 1 << 30
 
 
-@dataclasses.dataclass(frozen=True)
-class RecordingOptions:
+class RecordingOptions(Options, prefix="record_"):
     """Topics and length of a recording."""
 
-    flag_prefix: ClassVar[str] = "record_"
-
-    topics: str = option("", help="Topics, separated by commas; empty = all of standard types")
-    duration_s: float = option(0.0, help="End after so long; 0 = until Ctrl-C or silence", unit="s")
+    topics: str = ""
+    """Topics, separated by commas; empty = all of standard types"""
+    duration_s: float = 0.0
+    """End after so long; 0 = until Ctrl-C or silence"""
 
     @property
     def names(self) -> list[str]:

@@ -2,39 +2,31 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 TRANSPORTS = ("ros2", "ros1", "foxglove")
 _HIGHEST_DOMAIN = 232
 _DEFAULT_MASTER = "http://127.0.0.1:11311"
 
 
-@dataclasses.dataclass(frozen=True)
-class NetworkOptions:
+class NetworkOptions(Options):
     """Place of the topics."""
 
-    flag_prefix: ClassVar[str] = ""
-
-    ros_domain_id: int | None = option(
-        None, help="Domain of ROS 2; empty = ROS_DOMAIN_ID of the environment, else 0"
-    )
+    ros_domain_id: int | None = None
+    """Domain of ROS 2; empty = ROS_DOMAIN_ID of the environment, else 0"""
     ros_master_uri: str = option(
         "",
         help=f"Master of ROS 1; empty = ROS_MASTER_URI of the environment, else {_DEFAULT_MASTER}",
     )
-    foxglove_url: str = option(
-        "ws://127.0.0.1:8765", help="WebSocket of foxglove_bridge, or of what speaks its protocol"
-    )
-    live_interface: str = option(
-        "",
-        help="Network interface or IP address to listen on; empty = this computer only (loopback)",
-    )
-    live_wait_s: float = option(10.0, help="Wait so long for the first publishers", unit="s")
+    foxglove_url: str = "ws://127.0.0.1:8765"
+    """WebSocket of foxglove_bridge, or of what speaks its protocol"""
+    live_interface: str = ""
+    """Network interface or IP address to listen on; empty = this computer only (loopback)"""
+    live_wait_s: float = 10.0
+    """Wait so long for the first publishers"""
 
     def check(self) -> None:
         """Check the values.
@@ -65,31 +57,23 @@ class NetworkOptions:
         return self.ros_master_uri or os.environ.get("ROS_MASTER_URI", "") or _DEFAULT_MASTER
 
 
-@dataclasses.dataclass(frozen=True)
-class LiveOptions:
+class LiveOptions(Options, prefix="live_"):
     """Reading of a live source, and publishing."""
 
-    flag_prefix: ClassVar[str] = "live_"
-
-    silence_s: float = option(
-        10.0, help="End when nothing has arrived for so long; 0 = only Ctrl-C ends", unit="s"
-    )
-    max_delay_s: float = option(
-        1.0,
-        help="Leave out the oldest images when they have waited longer than this; IMU samples are "
-        "never left out",
-        unit="s",
-    )
-    publish: bool = option(
-        True,
-        help="Publish /maplab/odometry, /maplab/pose_in_map and /tf where the images come from",
-    )
-    publish_landmarks: bool = option(
-        False, help="Publish the landmarks of the window as /maplab/landmarks (PointCloud2), too"
-    )
-    world_frame: str = option("map", help="Name of the global frame G in what is published")
-    odom_frame: str = option("odom", help="Name of the frame M of the mission in what is published")
-    base_frame: str = option("imu", help="Name of the body frame I in what is published")
+    silence_s: float = 10.0
+    """End when nothing has arrived for so long; 0 = only Ctrl-C ends"""
+    max_delay_s: float = 1.0
+    """Leave out the oldest images when they have waited longer than this; IMU samples are never left out"""
+    publish: bool = True
+    """Publish /maplab/odometry, /maplab/pose_in_map and /tf where the images come from"""
+    publish_landmarks: bool = False
+    """Publish the landmarks of the window as /maplab/landmarks (PointCloud2), too"""
+    world_frame: str = "map"
+    """Name of the global frame G in what is published"""
+    odom_frame: str = "odom"
+    """Name of the frame M of the mission in what is published"""
+    base_frame: str = "imu"
+    """Name of the body frame I in what is published"""
 
     def check(self) -> None:
         """Check the values.

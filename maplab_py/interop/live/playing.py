@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from typing import ClassVar
 
 from maplab_py.errors import FlagError, UserError
 from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
@@ -15,7 +14,7 @@ from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
 from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bags import IMU_TYPE
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Recording
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
@@ -25,19 +24,15 @@ _SETTLE_S = 0.5
 _DRAIN_S = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
-class PlayingOptions:
+class PlayingOptions(Options, prefix="play_"):
     """Playback of a recording."""
 
-    flag_prefix: ClassVar[str] = "play_"
-
-    rate: float = option(1.0, help="Multiple of real time; 0 = as fast as possible")
-    wait_for_subscribers: bool = option(
-        True, help="Begin when somebody listens to all topics (at most --live_wait_s)"
-    )
-    stamps_now: bool = option(
-        False, help="Move the stamps so that the recording begins now (with --play_rate=1)"
-    )
+    rate: float = 1.0
+    """Multiple of real time; 0 = as fast as possible"""
+    wait_for_subscribers: bool = True
+    """Begin when somebody listens to all topics (at most --live_wait_s)"""
+    stamps_now: bool = False
+    """Move the stamps so that the recording begins now (with --play_rate=1)"""
 
     def check(self) -> None:
         """Check the values.

@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.interop.device import DeviceOptions
 from maplab_py.interop.stamps import time_unit_option
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 
-@dataclasses.dataclass(frozen=True)
-class ReadingOptions:
+class ReadingOptions(Options):
     """Reading of stamps and images."""
 
-    flag_prefix: ClassVar[str] = ""
-
-    image_bits: int = option(
-        0,
-        help="Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording",
-    )
-    recording_part: int = option(
-        0,
-        help="Part to read of a recording whose clock starts again, from 1 (see recording_info); 0 = the "
-        "only one",
-    )
-    max_late_share: float = option(
-        0.01,
-        help="Share of messages with repeated, late or wild stamps up to which they are left out; more is an "
-        "error",
-    )
-    use_arrival_time: bool = option(
-        False, help="Take the times at which messages of a bag arrived in place of their stamps"
-    )
-    skip_missing_images: bool = option(
-        False, help="Leave out images of a folder's tables whose files are missing"
-    )
+    image_bits: int = 0
+    """Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording"""
+    recording_part: int = 0
+    """Part to read of a recording whose clock starts again, from 1 (see recording_info); 0 = the only one"""
+    max_late_share: float = 0.01
+    """Share of messages with repeated, late or wild stamps up to which they are left out; more is an error"""
+    use_arrival_time: bool = False
+    """Take the times at which messages of a bag arrived in place of their stamps"""
+    skip_missing_images: bool = False
+    """Leave out images of a folder's tables whose files are missing"""
     time_unit: str = time_unit_option()
 
     def check(self) -> None:
@@ -54,41 +39,25 @@ class ReadingOptions:
             raise FlagError(f"--max_late_share={self.max_late_share:g}: wants a number from 0 to 1")
 
 
-@dataclasses.dataclass(frozen=True)
-class SourceOptions:
+class SourceOptions(Options):
     """Opening of a recording."""
 
-    flag_prefix: ClassVar[str] = ""
-
-    sensor_calibration_file: Path | None = option(
-        None,
-        help="Calibration: sensors.yaml, kalibr's camchain, or a file of another program that "
-        "import_calibration reads; empty = as the recording has it",
-    )
-    imu_calibration_file: Path | None = option(
-        None,
-        help="File of the IMU, where the calibration has cameras alone, as kalibr's camchain",
-    )
+    sensor_calibration_file: Path | None = None
+    """Calibration: sensors.yaml, kalibr's camchain, or a file of another program that import_calibration
+    reads; empty = as the recording has it"""
+    imu_calibration_file: Path | None = None
+    """File of the IMU, where the calibration has cameras alone, as kalibr's camchain"""
     device: DeviceOptions = DeviceOptions()
     reading: ReadingOptions = ReadingOptions()
-    rovio_active_camera_indices: str = option(
-        "", help="Cameras to read, separated by commas; empty = all of the calibration"
-    )
-    imu_to_camera_time_offset_ns: int | None = option(
-        None,
-        help="Time of the IMU's clock minus that of the cameras' clock; empty = as the calibration "
-        "says",
-        unit="ns",
-    )
-    imu_topic: str = option(
-        "",
-        help="IMU topic of a bag, or two, GYRO,ACCEL, that are joined; empty = as the calibration says",
-    )
-    camera_topics: str = option(
-        "",
-        help="Image topics of a bag, separated by commas, in the order of the cameras of the "
-        "calibration; empty = as it says",
-    )
+    rovio_active_camera_indices: str = ""
+    """Cameras to read, separated by commas; empty = all of the calibration"""
+    imu_to_camera_time_offset_ns: int | None = None
+    """Time of the IMU's clock minus that of the cameras' clock; empty = as the calibration says"""
+    imu_topic: str = ""
+    """IMU topic of a bag, or two, GYRO,ACCEL, that are joined; empty = as the calibration says"""
+    camera_topics: str = ""
+    """Image topics of a bag, separated by commas, in the order of the cameras of the calibration; empty = as
+    it says"""
 
     def check(self) -> None:
         """Check the values.
@@ -134,27 +103,17 @@ class SourceOptions:
         return tuple(_words(self.camera_topics))
 
 
-@dataclasses.dataclass(frozen=True)
-class StreamOptions:
+class StreamOptions(Options, prefix="vio_"):
     """Part of a recording to read, and the grouping of its images."""
 
-    flag_prefix: ClassVar[str] = "vio_"
-
-    start_s: float = option(
-        0.0, help="Skip this much of the recording", unit="s", flag="vio_rosbag_start_s"
-    )
-    end_s: float = option(
-        0.0,
-        help="Stop this long after the beginning of the recording; 0 = read to its end",
-        unit="s",
-        flag="vio_rosbag_end_s",
-    )
-    nframe_sync_tolerance_ns: int = option(
-        500_000, help="Largest difference between the times of images of one frame set", unit="ns"
-    )
-    imu_gap_s: float = option(
-        0.05, help="Report intervals between IMU samples that are longer than this", unit="s"
-    )
+    start_s: float = option(0.0, flag="vio_rosbag_start_s")
+    """Skip this much of the recording"""
+    end_s: float = option(0.0, flag="vio_rosbag_end_s")
+    """Stop this long after the beginning of the recording; 0 = read to its end"""
+    nframe_sync_tolerance_ns: int = 500_000
+    """Largest difference between the times of images of one frame set"""
+    imu_gap_s: float = 0.05
+    """Report intervals between IMU samples that are longer than this"""
 
     def check(self) -> None:
         """Check the values.

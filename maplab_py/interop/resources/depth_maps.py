@@ -6,7 +6,6 @@ optical axis in millimetres at the pixels of the camera's own, distorted image; 
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from maplab_py.interop.resources.matching import (
     stamped_files,
 )
 from maplab_py.interop.resources.reports import ImportedResources
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
 from maplab_py.storage.resources.new import NewResources
@@ -39,14 +38,13 @@ MM_PER_M = 1000.0
 _MAX_FILE_BYTES = 200_000_000
 
 
-@dataclasses.dataclass(frozen=True)
-class DepthImportOptions:
+class DepthImportOptions(Options):
     """Conversion of files to depth maps."""
 
-    depth_scale: float = option(MM_PER_M, help="Value of a pixel at a depth of one metre")
-    image_tolerance_ms: float = option(
-        1.0, help="Largest difference between the times of depth map and frame", unit="ms"
-    )
+    depth_scale: float = MM_PER_M
+    """Value of a pixel at a depth of one metre"""
+    image_tolerance_ms: float = 1.0
+    """Largest difference between the times of depth map and frame"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

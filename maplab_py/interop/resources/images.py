@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from maplab_py.interop.resources.matching import (
     mission_rig,
 )
 from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
@@ -35,19 +34,16 @@ RAW_GREY, RAW_COLOUR = 0, 4
 """Numbers of the resource types of images as recorded."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ImageImportOptions:
+class ImageImportOptions(Options):
     """Choice of the images of a recording that become resources."""
 
-    image_tolerance_ms: float = option(
-        1.0, help="Largest difference between the times of image and frame", unit="ms"
-    )
-    every_nth: int = option(1, help="Attach images to every n-th vertex only")
-    link: bool = option(
-        False,
-        help="Refer to the recording's files by symbolic links instead of copying them: the map then "
-        "needs the recording to stay where it is",
-    )
+    image_tolerance_ms: float = 1.0
+    """Largest difference between the times of image and frame"""
+    every_nth: int = 1
+    """Attach images to every n-th vertex only"""
+    link: bool = False
+    """Refer to the recording's files by symbolic links instead of copying them: the map then needs the
+    recording to stay where it is"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

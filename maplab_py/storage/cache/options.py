@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options
 
 
-@dataclasses.dataclass(frozen=True)
-class CacheOptions:
+class CacheOptions(Options):
     """Whether the columns of loaded maps are kept for the next load, and how much of them."""
 
-    map_cache: bool = option(
-        False,
-        help="Keep the columns of the map in the user's cache folder, and map them into memory from there "
-        "at the next load as long as the files of the map are the same.",
-    )
-    map_cache_max_gb: float = option(
-        20.0,
-        help="Size of the cache of maps; those that were not loaded for the longest time are deleted.",
-        unit="GB",
-    )
+    map_cache: bool = False
+    """Keep the columns of the map in the user's cache folder, and map them into memory from there at the next
+    load as long as the files of the map are the same."""
+    map_cache_max_gb: float = 20.0
+    """Size of the cache of maps; those that were not loaded for the longest time are deleted."""
 
     def __post_init__(self) -> None:
         """Check the range.

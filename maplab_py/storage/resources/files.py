@@ -11,7 +11,7 @@ import numpy as np
 
 from maplab_py.cancellation import check_cancelled, lasting_effect
 from maplab_py.errors import UserError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.storage.resources.store import (
     MAP_FOLDER,
     copied_to_external,
@@ -155,22 +155,17 @@ def remove_files(files: Iterable[Path]) -> tuple[int, list[str]]:
     return removed, problems
 
 
-@dataclasses.dataclass(frozen=True)
-class ResourceMigration:
+class ResourceMigration(Options):
     """Place of resource files when a map is saved; at most one option is given."""
 
-    copy_resources_to_map_folder: bool = option(
-        False, help="Copy all resources into the map's folder."
-    )
-    move_resources_to_map_folder: bool = option(
-        False, help="Move all resources into the map's folder."
-    )
-    copy_resources_to_external_folder: str = option(
-        "", help="Copy all resources to this folder and refer to it."
-    )
-    move_resources_to_external_folder: str = option(
-        "", help="Move all resources to this folder and refer to it."
-    )
+    copy_resources_to_map_folder: bool = False
+    """Copy all resources into the map's folder."""
+    move_resources_to_map_folder: bool = False
+    """Move all resources into the map's folder."""
+    copy_resources_to_external_folder: str = ""
+    """Copy all resources to this folder and refer to it."""
+    move_resources_to_external_folder: str = ""
+    """Move all resources to this folder and refer to it."""
 
     def check(self) -> None:
         """Refuse contradicting options."""

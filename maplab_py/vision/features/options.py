@@ -2,74 +2,48 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import ClassVar
-
 from maplab_py.errors import FlagError
-from maplab_py.options import option
+from maplab_py.options import Options, option
 
 DETECTORS = ("fast", "agast")
 DESCRIPTORS = ("brisk",)
 
 
-@dataclasses.dataclass(frozen=True)
-class FeatureOptions:
+class FeatureOptions(Options, prefix="feature_tracking_"):
     """Preparation of images, and detection and description of keypoints."""
 
-    flag_prefix: ClassVar[str] = "feature_tracking_"
-
-    detector_type: str = option(
-        "fast",
-        help="Corner test: fast and agast decide alike, fast is faster in this OpenCV",
-        choices=DETECTORS,
-    )
-    detector_threshold: int = option(
-        20,
-        help="Smallest contrast of a corner; where a cell has too few corners, a third of it suffices",
-    )
-    detector_max_feature_count: int = option(250, help="Largest number of keypoints of an image")
-    detector_nms_radius: float = option(
-        14.0,
-        help="Smallest distance between a new keypoint and stronger or tracked ones",
-        unit="px",
-    )
-    gridded_detector_num_grid_cols: int = option(4, help="Columns of the detection grid")
-    gridded_detector_num_grid_rows: int = option(2, help="Rows of the detection grid")
-    gridded_detector_cell_num_features_scaler: float = option(
-        2.0, help="Largest number of keypoints of a cell, as a multiple of its equal share of all"
-    )
+    detector_type: str = option("fast", choices=DETECTORS)
+    """Corner test: fast and agast decide alike, fast is faster in this OpenCV"""
+    detector_threshold: int = 20
+    """Smallest contrast of a corner; where a cell has too few corners, a third of it suffices"""
+    detector_max_feature_count: int = 250
+    """Largest number of keypoints of an image"""
+    detector_nms_radius: float = option(14.0, unit="px")
+    """Smallest distance between a new keypoint and stronger or tracked ones"""
+    gridded_detector_num_grid_cols: int = 4
+    """Columns of the detection grid"""
+    gridded_detector_num_grid_rows: int = 2
+    """Rows of the detection grid"""
+    gridded_detector_cell_num_features_scaler: float = 2.0
+    """Largest number of keypoints of a cell, as a multiple of its equal share of all"""
     min_tracking_distance_to_image_border_px: int = option(
-        20,
-        help="Smallest distance of a keypoint to the image border; descriptors need 20",
-        unit="px",
-        flag="min_tracking_distance_to_image_border_px",
+        20, flag="min_tracking_distance_to_image_border_px"
     )
-    descriptor_type: str = option("brisk", help="Descriptor: brisk (of 64 bytes)")
-    descriptor_size_px: float = option(
-        12.0, help="Diameter of what a descriptor sees, OpenCV's keypoint size", unit="px"
-    )
-    apply_clahe: bool = option(
-        False,
-        help="Equalise the contrast of images locally (CLAHE)",
-        flag="rovioli_image_apply_clahe_histogram_equalization",
-    )
-    clahe_clip_limit: int = option(
-        2, help="CLAHE: limit of contrast", flag="rovioli_image_clahe_clip_limit"
-    )
-    clahe_grid_size: int = option(
-        8, help="CLAHE: rows and columns of tiles", flag="rovioli_image_clahe_grid_size"
-    )
-    image_resize_factor: float = option(
-        1.0,
-        help="Track in images resized by this factor; keypoints are of the recorded size",
-        flag="rovioli_image_resize_factor",
-    )
-    image_mask_path: str = option(
-        "",
-        help="Image in which black areas are not to be used, or several, by camera, separated by "
-        "commas",
-        flag="rovio_image_mask_path",
-    )
+    """Smallest distance of a keypoint to the image border; descriptors need 20"""
+    descriptor_type: str = "brisk"
+    """Descriptor: brisk (of 64 bytes)"""
+    descriptor_size_px: float = 12.0
+    """Diameter of what a descriptor sees, OpenCV's keypoint size"""
+    apply_clahe: bool = option(False, flag="rovioli_image_apply_clahe_histogram_equalization")
+    """Equalise the contrast of images locally (CLAHE)"""
+    clahe_clip_limit: int = option(2, flag="rovioli_image_clahe_clip_limit")
+    """CLAHE: limit of contrast"""
+    clahe_grid_size: int = option(8, flag="rovioli_image_clahe_grid_size")
+    """CLAHE: rows and columns of tiles"""
+    image_resize_factor: float = option(1.0, flag="rovioli_image_resize_factor")
+    """Track in images resized by this factor; keypoints are of the recorded size"""
+    image_mask_path: str = option("", flag="rovio_image_mask_path")
+    """Image in which black areas are not to be used, or several, by camera, separated by commas"""
 
     def check(self) -> None:
         """Check the values.

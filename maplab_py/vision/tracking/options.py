@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import ClassVar
 
 from maplab_py.errors import FlagError
 from maplab_py.options import option
@@ -13,39 +11,30 @@ from maplab_py.vision.features.options import FeatureOptions, check_range
 _HALF_A_DEGREE = 1.0 - math.cos(math.radians(0.5))
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackingOptions(FeatureOptions):
+class TrackingOptions(FeatureOptions, prefix="feature_tracking_"):
     """Detection of keypoints, tracking from image to image, and matching between cameras."""
 
-    flag_prefix: ClassVar[str] = "feature_tracking_"
-
-    keypoint_sigma_px: float = option(
-        0.5, help="Standard deviation of a tracked keypoint", unit="px"
-    )
-    patch_size_px: int = option(15, help="Side of the patches that are compared", unit="px")
-    pyramid_levels: int = option(3, help="Levels of half resolution above the image")
-    forward_backward_px: float = option(
-        0.5, help="Largest error of a keypoint that is tracked forwards and back again", unit="px"
-    )
+    keypoint_sigma_px: float = 0.5
+    """Standard deviation of a tracked keypoint"""
+    patch_size_px: int = 15
+    """Side of the patches that are compared"""
+    pyramid_levels: int = 3
+    """Levels of half resolution above the image"""
+    forward_backward_px: float = 0.5
+    """Largest error of a keypoint that is tracked forwards and back again"""
     two_pt_ransac_threshold: float = option(
-        _HALF_A_DEGREE,
-        help="Two-point RANSAC: largest error of an inlier, as 1 - cos(angle)",
-        flag="feature_tracker_two_pt_ransac_threshold",
+        _HALF_A_DEGREE, flag="feature_tracker_two_pt_ransac_threshold"
     )
+    """Two-point RANSAC: largest error of an inlier, as 1 - cos(angle)"""
     two_pt_ransac_max_iterations: int = option(
-        200,
-        help="Two-point RANSAC: largest number of iterations",
-        flag="feature_tracker_two_pt_ransac_max_iterations",
+        200, flag="feature_tracker_two_pt_ransac_max_iterations"
     )
-    epipolar_gate_px: float = option(
-        2.0,
-        help="Largest distance of a keypoint to its epipolar line after the refinement of turn and "
-        "direction, and between the cameras of a rig",
-        unit="px",
-    )
-    stereo_distance_m: float = option(
-        5.0, help="Distance at which other cameras look for a point of unknown distance", unit="m"
-    )
+    """Two-point RANSAC: largest number of iterations"""
+    epipolar_gate_px: float = 2.0
+    """Largest distance of a keypoint to its epipolar line after the refinement of turn and direction, and
+    between the cameras of a rig"""
+    stereo_distance_m: float = 5.0
+    """Distance at which other cameras look for a point of unknown distance"""
 
     def check(self) -> None:
         """Check the values.

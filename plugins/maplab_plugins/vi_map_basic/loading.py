@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.input_files import SizeOptions
-from maplab_py.options import option
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command, key_of_folder
 from maplab_py.report import counted
 from maplab_py.storage.cache.options import CacheOptions
@@ -102,15 +101,12 @@ class MergedMapsTable:
     notes: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class ReadingOptions(CacheOptions, SizeOptions):
     """Reading of map files."""
 
-    repair: bool = option(
-        False,
-        help="Keep the observations that both of their copies agree on and drop what is no number instead of "
-        "refusing the map.",
-    )
+    repair: bool = False
+    """Keep the observations that both of their copies agree on and drop what is no number instead of refusing
+    the map."""
 
 
 _READING = ReadingOptions()

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from maplab_py.errors import MaplabError
-from maplab_py.options import option
+from maplab_py.options import Options
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice
 from maplab_py.storage.resources.files import ResourceMigration, delete_files
@@ -82,30 +82,20 @@ class SavePlan(Report):
     maps: tuple[PlannedSave, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class SaveOptions:
+class SaveOptions(Options):
     """Files that a save may replace, and the layout of descriptors."""
 
-    overwrite: bool = option(
-        False,
-        help="Replace another map that is there; not needed for the map's own folder, which it was "
-        "loaded from or last saved to.",
-    )
-    force: bool = option(
-        False,
-        help="Replace the map that is there even if another program has changed it since this one "
-        "was loaded or saved.",
-    )
-    repair: bool = option(
-        False,
-        help="Drop what is no number, in memory too, instead of refusing to save a map that could not be "
-        "loaded.",
-    )
-    descriptor_layout: LayoutChoice = option(
-        "as_loaded",
-        help="Layout of the descriptors: as_loaded (every frame as it was loaded, new frames as 2.2), "
-        "2.2 (maplab since 2021), legacy (maplab before 2021; binary descriptors only)",
-    )
+    overwrite: bool = False
+    """Replace another map that is there; not needed for the map's own folder, which it was loaded from or
+    last saved to."""
+    force: bool = False
+    """Replace the map that is there even if another program has changed it since this one was loaded or
+    saved."""
+    repair: bool = False
+    """Drop what is no number, in memory too, instead of refusing to save a map that could not be loaded."""
+    descriptor_layout: LayoutChoice = "as_loaded"
+    """Layout of the descriptors: as_loaded (every frame as it was loaded, new frames as 2.2), 2.2 (maplab
+    since 2021), legacy (maplab before 2021; binary descriptors only)"""
 
 
 _NO_MIGRATION = ResourceMigration()

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from maplab_py.cancellation import check_cancelled, lasting_effect
-from maplab_py.options import option
+from maplab_py.options import Options, option
 from maplab_py.plugin import Cancelled, CommandContext, Report, UserError
 
 if TYPE_CHECKING:
@@ -26,26 +26,19 @@ if TYPE_CHECKING:
 NAME = "viewer"
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewerOptions:
+class ViewerOptions(Options, prefix="viewer_"):
     """Program that shows the map; address and appearance of the page in the browser."""
 
-    flag_prefix: ClassVar[str] = "viewer_"
-
-    program: str = option(
-        "browser",
-        help="Program that shows the map: a page in the browser, or Rerun (extra rerun)",
-        choices=("browser", "rerun"),
-        flag="viewer",
-    )
-    file: Path | None = option(
-        None, help="With --viewer=rerun: write this file .rrd in place of opening a window"
-    )
-    port: int = option(8080, help="Port on this machine; a busy one gives the next, 0 = any.")
-    dark: bool = option(False, help="Dark theme; the panel can change it.")
-    open_page: bool = option(
-        True, help="Open the page when a person is at the prompt and has a desktop."
-    )
+    program: str = option("browser", choices=("browser", "rerun"), flag="viewer")
+    """Program that shows the map: a page in the browser, or Rerun (extra rerun)"""
+    file: Path | None = None
+    """With --viewer=rerun: write this file .rrd in place of opening a window"""
+    port: int = 8080
+    """Port on this machine; a busy one gives the next, 0 = any."""
+    dark: bool = False
+    """Dark theme; the panel can change it."""
+    open_page: bool = True
+    """Open the page when a person is at the prompt and has a desktop."""
 
 
 @dataclasses.dataclass(frozen=True)
