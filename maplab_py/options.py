@@ -82,8 +82,9 @@ class Options:
             bounds = field.metadata.get("bounds")
             if bounds and not _is_within(value := getattr(self, field.name), bounds):
                 name = field.metadata["flag"] or self.flag_prefix + field.name
-                words = " and ".join(f"{words} {bound:g}" for words, bound in bounds.items())
-                raise FlagError(f"--{name}={value:g}: must be {words}")
+                words = [f"{words} {bound:g}" for words, bound in bounds.items()]
+                words += ["finite"] if math.isinf(value) else []
+                raise FlagError(f"--{name}={value:g}: must be {' and '.join(words)}")
 
 
 def _is_within(value: float, bounds: Mapping[str, float]) -> bool:

@@ -45,11 +45,9 @@ class MapBuilder:
                 system's.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: The temporary folder cannot be made.
         """
         self._device, self._options = device, options or MapBuilderOptions()
-        self._options.check()
         seed = f"{device.rig_id} {device.imu_id}".encode()
         self._images = None
         if self._options.save_image_as_resources:

@@ -87,11 +87,9 @@ class Mapping:
             keeps_states: Keep the state of every frame for `trajectory`; runs of hours need not.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: The recording has no IMU, or a file cannot be used.
         """
         self.options = options or RunOptions()
-        self.options.check()
         self._recording, self._observer, self._status = recording, observer, status
         self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization

@@ -24,13 +24,8 @@ class MotionDetector:
     """Classifies the motion between frames."""
 
     def __init__(self, options: RestOptions | None = None) -> None:
-        """Start without samples.
-
-        Raises:
-            FlagError: An option is wrong.
-        """
+        """Start without samples."""
         self._options = options or RestOptions()
-        self._options.check()
         self._keypoints = RecentKeypoints(self._options.imu_time_s)
         self.reset()
 

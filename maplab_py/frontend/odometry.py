@@ -88,7 +88,6 @@ class Odometry:
                 it cannot be localised.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: The device has no IMU, or a mask cannot be used.
         """
         if device.imu is None:
@@ -97,7 +96,6 @@ class Odometry:
                 "--imu_calibration_file=FILE, or a --sensor_calibration_file with an IMU"
             )
         self.options = options or OdometryOptions()
-        self.options.check()
         self.counts = OdometryCounts()
         self._device, self._imu = device, device.imu
         self._make_starter = make_starter or self._initializer

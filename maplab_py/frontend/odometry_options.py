@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-import numpy as np
-
 from maplab_py.errors import FlagError
 from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
@@ -16,59 +12,37 @@ from maplab_py.vision.tracking.options import TrackingOptions
 class RestOptions(Options, prefix="vio_rest_"):
     """Conditions of standstill: all must hold."""
 
-    max_disparity_px: float = 0.5
+    max_disparity_px: float = option(0.5, ge=0)
     """Standing still: largest median disparity in 0.1 s, turn removed; half of it over half a second, noise
     of the tracks removed"""
-    max_acceleration_deviation: float = option(0.25, unit="m/s^2")
+    max_acceleration_deviation: float = option(0.25, ge=0, unit="m/s^2")
     """Standing still: largest deviation of the accelerometer from its mean over 0.5 s"""
-    max_turn_rate: float = option(0.01, unit="rad/s")
+    max_turn_rate: float = option(0.01, ge=0, unit="rad/s")
     """Standing still: largest mean angular velocity between two images"""
-    max_speed: float = option(0.1, unit="m/s")
+    max_speed: float = option(0.1, ge=0, unit="m/s")
     """Standing still: largest estimated speed"""
-    imu_time_s: float = 0.5
+    imu_time_s: float = option(0.5, gt=0)
     """Standing still: time over which the accelerometer is compared"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A limit is negative or the time is not positive.
-        """
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not 0.0 <= value < np.inf or (field.name == "imu_time_s" and value == 0.0):
-                raise FlagError(f"--{self.flag_prefix}{field.name}={value:g}: must be positive")
 
 
 class HealthOptions(Options, prefix="vio_health_"):
     """Criteria of divergence, after which the estimator starts again."""
 
-    min_tracks: int = 8
+    min_tracks: int = option(8, ge=0)
     """Diverged: fewer keypoints than this are tracked, for longer than
     --vio_health_max_time_without_tracks_s"""
-    max_time_without_tracks_s: float = 2.0
+    max_time_without_tracks_s: float = option(2.0, ge=0)
     """Diverged: longest time with too few tracked keypoints"""
-    max_speed: float = option(25.0, unit="m/s")
+    max_speed: float = option(25.0, ge=0, unit="m/s")
     """Diverged: largest estimated speed"""
-    max_velocity_sigma: float = option(1.0, unit="m/s")
+    max_velocity_sigma: float = option(1.0, ge=0, unit="m/s")
     """Diverged: largest standard deviation of the velocity"""
-    max_tilt_sigma_deg: float = 10.0
+    max_tilt_sigma_deg: float = option(10.0, ge=0)
     """Diverged: largest standard deviation of the direction of gravity"""
-    max_accel_bias: float = option(3.0, unit="m/s^2")
+    max_accel_bias: float = option(3.0, ge=0, unit="m/s^2")
     """Diverged: largest bias of the accelerometer"""
-    max_gyro_bias: float = option(0.6, unit="rad/s")
+    max_gyro_bias: float = option(0.6, ge=0, unit="rad/s")
     """Diverged: largest bias of the gyroscope"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A limit is negative.
-        """
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not 0.0 <= value < np.inf:
-                raise FlagError(f"--{self.flag_prefix}{field.name}={value:g}: wants 0 or more")
 
 
 class OdometryOptions(Options, prefix="vio_"):
@@ -79,7 +53,7 @@ class OdometryOptions(Options, prefix="vio_"):
     window: WindowOptions = WindowOptions()
     rest: RestOptions = RestOptions()
     health: HealthOptions = HealthOptions()
-    max_imu_gap_s: float = 0.2
+    max_imu_gap_s: float = option(0.2, gt=0, lt=1e9)
     """Start again after an interval between IMU samples that is longer than this"""
 
     estimate: str = "time_offset"
@@ -112,41 +86,21 @@ class OdometryOptions(Options, prefix="vio_"):
         """
         return () if self.estimated == ("time_offset",) else self.estimated
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: A value is out of its range.
         """
-        self.tracking.check()
+        super().__post_init__()
         for name in self.estimated:
             if name not in CALIBRATED:
                 raise FlagError(
                     f"--{self.flag_prefix}estimate: there is no {name}: give some of "
                     f"{', '.join(CALIBRATED)}, separated by commas, or none"
                 )
-        self.initialization.check()
-        self._check_window()
-        self.rest.check()
-        self.health.check()
-        if not 0.0 < self.max_imu_gap_s < 1e9:
-            raise FlagError(f"--vio_max_imu_gap_s={self.max_imu_gap_s:g}: must be positive")
-
-    def _check_window(self) -> None:
         window = self.window
         if window.num_keyframes < 2 and window.num_keyframes != 0:
             raise FlagError(
                 f"--{window.flag_prefix}num_keyframes={window.num_keyframes}: wants 2 or more, or 0"
             )
-        for name, least in (
-            ("num_recent_frames", 1),
-            ("max_landmarks", 10),
-            ("num_iterations", 1),
-        ):
-            value = getattr(window, name)
-            if value < least:
-                raise FlagError(f"--{window.flag_prefix}{name}={value}: wants {least} or more")
-        for name in ("min_depth_m", "max_depth_m", "huber_sigmas", "gate_chi2"):
-            value = getattr(window, name)
-            if not value > 0.0:
-                raise FlagError(f"--{window.flag_prefix}{name}={value:g}: must be positive")

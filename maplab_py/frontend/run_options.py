@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from maplab_py.errors import FlagError
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
@@ -32,23 +30,11 @@ class MapBuilderOptions(Options):
     """Choice of the frames that become vertices, and their content."""
 
     nframe_sync_max_output_frequency_hz: float = option(
-        10.0, flag="vio_nframe_sync_max_output_frequency_hz"
+        10.0, gt=0, flag="vio_nframe_sync_max_output_frequency_hz"
     )
     """Largest rate of the vertices of the map"""
     save_image_as_resources: bool = option(False, flag="map_builder_save_image_as_resources")
     """Keep the images of the vertices as resources of the map"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: The rate is not positive.
-        """
-        rate = self.nframe_sync_max_output_frequency_hz
-        if not 0.0 < rate < np.inf:
-            raise FlagError(
-                f"--vio_nframe_sync_max_output_frequency_hz={rate:g}: must be greater than 0"
-            )
 
 
 class OutputOptions(Options):
@@ -62,7 +48,7 @@ class OutputOptions(Options):
     """Build a map; without, only the poses are estimated"""
     optimize_map_to_localization_map: bool = False
     """Turn the map into a localisation map: keyframes, loop closure, optimisation"""
-    localization_map_keep_landmark_fraction: float = 0.0
+    localization_map_keep_landmark_fraction: float = option(0.0, ge=0, le=1)
     """Share of the good landmarks that the localisation map keeps; 0 = all"""
     export_estimated_poses_to_csv: Path | None = None
     """Write the states of all frames, as estimated at their time, in EuRoC's form"""
@@ -71,15 +57,14 @@ class OutputOptions(Options):
     """Write the poses of all frames in the map and in the mission, T_G_M, velocities and biases, as estimated
     at their time; needs --vio_localization_map_folder"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: Options contradict each other, or the share is not in [0, 1].
         """
+        super().__post_init__()
         share = self.localization_map_keep_landmark_fraction
-        if not 0.0 <= share <= 1.0:
-            raise FlagError(f"--localization_map_keep_landmark_fraction={share:g}: wants 0 to 1")
         if share and not self.optimize_map_to_localization_map:
             raise FlagError(
                 "--localization_map_keep_landmark_fraction needs --optimize_map_to_localization_map"
@@ -102,27 +87,20 @@ class RunOptions(Options):
     builder: MapBuilderOptions = MapBuilderOptions()
     output: OutputOptions = OutputOptions()
     localization: OnlineLocalizationOptions = OnlineLocalizationOptions()
-    realtime_playback_rate: float = option(0.0, flag="vio_rosbag_realtime_playback_rate")
+    realtime_playback_rate: float = option(
+        0.0, ge=0, lt=1e6, flag="vio_rosbag_realtime_playback_rate"
+    )
     """Read the recording at this multiple of real time; 0 = as fast as possible"""
     enable_health_checking: bool = option(False, flag="rovioli_enable_health_checking")
     """Print speed, uncertainty and biases every second"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: A value is out of its range.
         """
-        self.stream.check()
-        self.odometry.check()
-        self.builder.check()
-        self.output.check()
-        self.localization.check()
+        super().__post_init__()
         is_localized = self.localization.map_folder is not None
         if self.output.export_localized_poses_to_csv is not None and not is_localized:
             raise FlagError("--export_localized_poses_to_csv needs --vio_localization_map_folder")
-        if not 0.0 <= self.realtime_playback_rate < 1e6:
-            raise FlagError(
-                f"--vio_rosbag_realtime_playback_rate={self.realtime_playback_rate:g}: wants 0 "
-                "or more"
-            )

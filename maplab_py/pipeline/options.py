@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from maplab_py.errors import FlagError
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 
 
 class PipelineOptions(Options):
@@ -14,7 +14,7 @@ class PipelineOptions(Options):
     scheduler: str = "none"
     """Where tasks run: none (one after another), local:N (N processes of this machine) or tcp://HOST:PORT (a
     Dask scheduler with its workers)."""
-    retries: int = 1
+    retries: int = option(1, ge=0)
     """How often a task is tried again that failed other than by wrong usage."""
     resume: bool = False
     """Keep the tasks that an earlier run finished; run only the others."""
@@ -24,9 +24,9 @@ class PipelineOptions(Options):
     """Replace the results of an earlier run."""
     results_folder: Path | None = None
     """Folder of results, logs and reports; empty = the file's name with _results."""
-    task_memory_gb: float = 0.0
+    task_memory_gb: float = option(0.0, ge=0)
     """A task that takes more is stopped and run once more alone; 0 = its share of the memory."""
-    task_threads: int = 0
+    task_threads: int = option(0, ge=0)
     """Threads of a task; 0 = its share of the processors."""
 
     def __post_init__(self) -> None:
@@ -35,10 +35,8 @@ class PipelineOptions(Options):
         Raises:
             FlagError: A value is out of range, or two contradict each other.
         """
+        super().__post_init__()
         self.local_workers()
-        for name in ("retries", "task_memory_gb", "task_threads"):
-            if getattr(self, name) < 0:
-                raise FlagError(f"--{name}={getattr(self, name):g} is negative")
         if self.resume and self.restart:
             raise FlagError("--resume and --restart contradict each other: give one of them")
         if self.redo_changed and not self.resume:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from maplab_py.errors import FlagError
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
@@ -17,7 +16,7 @@ class SubmapOptions(Options):
     """Leave out absolute poses that contradict their neighbours (see optvi)."""
     stationary_submaps_fix_with_lc_edge: bool = False
     """Tie the first and the last vertex of a submap that stands still by a loop closure edge."""
-    submap_loading_thread_pool_size: int = 4
+    submap_loading_thread_pool_size: int = option(4, ge=1)
     """Submaps that are prepared at the same time, each in a process."""
 
 
@@ -39,7 +38,7 @@ class MergingOptions(Options):
     """A joint optimisation starts with the trust region of the one before."""
     reset_trust_region_radius_if_new_robot: bool = True
     """Not where a new robot has come since."""
-    reset_trust_region_radius_every_nth_submap: int = 0
+    reset_trust_region_radius_every_nth_submap: int = option(0, ge=0)
     """Nor where so many submaps were merged since the last reset; 0 = never."""
 
 
@@ -50,7 +49,7 @@ class PublishingOptions(Options):
     """Folder of the merged map, replaced after every change; required."""
     resource_folder: str = ""
     """Folder for the resources of the map; empty = the map's own."""
-    backup_interval_s: int = 300
+    backup_interval_s: int = option(300, ge=0)
     """Keep a copy of the map beside it every so often; 0 = never."""
     dense_map_resource_type: int = 21
     """Type of the resources that get_dense_map_in_range looks into (number)."""
@@ -59,43 +58,21 @@ class PublishingOptions(Options):
 class MapServerOptions(PublishingOptions, MergingOptions, SubmapOptions, prefix="maplab_server_"):
     """All flags of the server that maplab has, too."""
 
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            FlagError: A value is out of range.
-        """
-        for name in ("backup_interval_s", "reset_trust_region_radius_every_nth_submap"):
-            if getattr(self, name) < 0:
-                raise FlagError(f"--maplab_server_{name} must not be negative; 0 = never")
-        if self.submap_loading_thread_pool_size < 1:
-            raise FlagError("--maplab_server_submap_loading_thread_pool_size must be at least 1")
-
 
 class IncrementalOptions(Options):
     """Optimisation after each submap, and of the whole map."""
 
-    full_optimization_every_nth: int = 10
+    full_optimization_every_nth: int = option(10, ge=0)
     """Close all loops and optimise the whole map jointly after so many submaps, and when the server stops; 0
     = when it stops only."""
-    local_free_vertices: int = 150
+    local_free_vertices: int = option(150, ge=0)
     """Vertices besides those of a new submap that are optimised with it."""
-    local_fixed_vertices: int = 150
+    local_fixed_vertices: int = option(150, ge=0)
     """Vertices that are held fixed and observe landmarks of the optimised ones."""
-    similar_stretches: int = 5
+    similar_stretches: int = option(5, ge=0)
     """Submaps that look most like a new one and are searched for loop closures."""
-    near_vertices: int = 100
+    near_vertices: int = option(100, ge=0)
     """Vertices nearest to a new submap that are searched for loop closures as well."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            FlagError: A value is negative.
-        """
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 0:
-                raise FlagError(f"--{field.name} must not be negative")
 
 
 class ServiceOptions(Options, prefix="serve_"):
@@ -106,26 +83,16 @@ class ServiceOptions(Options, prefix="serve_"):
     server.json of the spool."""
     port: int = 0
     """Its port; 0 = any."""
-    stop_when_idle_s: float = 0.0
+    stop_when_idle_s: float = option(0.0, ge=0)
     """Stop after so long without anything to do; 0 = never."""
     keep_submaps: bool = True
     """Keep submaps in the spool's folder merged, so that the map can be built again."""
     save_on_shutdown: bool = True
     """At its end the server optimises jointly and publishes; otherwise it ends at once, and what it has not
     published is merged again after the next start."""
-    visualization_interval_s: float = 10.0
+    visualization_interval_s: float = option(10.0, ge=0)
     """With --serve_visualize_map, show the published map at most every so often, and at the end; 0 = after
     every publication."""
-
-    def __post_init__(self) -> None:
-        """Check the times.
-
-        Raises:
-            FlagError: One is negative.
-        """
-        for name in ("stop_when_idle_s", "visualization_interval_s"):
-            if not getattr(self, name) >= 0.0:
-                raise FlagError(f"--serve_{name} must not be negative")
 
 
 class SubmapOutput(Options):
@@ -133,39 +100,19 @@ class SubmapOutput(Options):
 
     submap_spool: Path | None = None
     """Spool of a map server that gets the map in parts; empty = none"""
-    submap_interval_s: float = 20.0
+    submap_interval_s: float = option(20.0, gt=0)
     """Length of a part"""
     robot_name: str = "robot"
     """Name of this robot in the spool"""
-
-    def __post_init__(self) -> None:
-        """Check the interval.
-
-        Raises:
-            FlagError: It is not positive.
-        """
-        if not self.submap_interval_s > 0.0:
-            raise FlagError(f"--submap_interval_s={self.submap_interval_s:g}: must be positive")
 
 
 class PlayOptions(Options, prefix="robots_"):
     """Division of sessions into submaps, and their playback rate."""
 
-    submap_s: float = 10.0
+    submap_s: float = option(10.0, gt=0)
     """Length of a submap."""
-    rate: float = 1.0
+    rate: float = option(1.0, ge=0)
     """Speed relative to real time; 0 = push everything as fast as it can be written."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            FlagError: A value is out of range.
-        """
-        if not self.submap_s > 0.0:
-            raise FlagError(f"--robots_submap_s={self.submap_s:g}: must be greater than 0")
-        if not 0.0 <= self.rate < float("inf"):
-            raise FlagError(f"--robots_rate={self.rate:g}: must be 0 or greater")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,7 +58,7 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Missions of one name have one colour, as those of a robot in a server's map."""
     color_salt: int = 1
     """Another number gives the missions other colours."""
-    landmark_gray_level: int = 150
+    landmark_gray_level: int = option(150, ge=0, le=255)
     """Grey of landmarks that no rule colours."""
     check_landmark_constrained: bool = True
     """Hide landmarks of bad quality at first; the panel can show them."""
@@ -67,13 +67,13 @@ class VisualizationOptions(Options, prefix="vis_"):
     empty = all."""
     landmarks_min_observers: int = 0
     """Leave out landmarks that fewer vertices observe."""
-    landmarks_max_observers: int = 5
+    landmarks_max_observers: int = option(5, ge=1)
     """This many observers, and more, have the last colour."""
     landmarks_min_number_of_observer_missions: int = 0
     """Leave out landmarks that fewer missions observe."""
-    max_points: int = 300_000
+    max_points: int = option(300_000, ge=1)
     """Draw at most this many landmarks, and as many points of dense clouds."""
-    max_refused_closures: int = 200
+    max_refused_closures: int = option(200, ge=0)
     """Draw at most this many refused closures, those nearest to acceptance first."""
     refused_closures_reason: str = ""
     """Draw refused closures whose reason contains this text only, such as inliers; empty = all."""
@@ -81,9 +81,9 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Show the covariance of the position of each loop closure edge as an ellipsoid."""
     abs_6dof_constraint_covariances: bool = False
     """Show the covariance of the position of each absolute pose as an ellipsoid."""
-    covariance_scale: float = 3.0
+    covariance_scale: float = option(3.0, gt=0)
     """Half axes of the ellipsoids of covariances, in standard deviations."""
-    scale: float = 1.0
+    scale: float = option(1.0, gt=0)
     """Size of points, frusta and axes."""
     frustum_every_nth: int = 0
     """Draw every n-th camera; 0 = as suits the mission."""
@@ -102,31 +102,18 @@ class VisualizationOptions(Options, prefix="vis_"):
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        for name in ("max_points", "landmarks_max_observers"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--vis_{name}={getattr(self, name)}: must be 1 or greater")
-        if self.max_refused_closures < 0:
-            raise ValueError(
-                f"--vis_max_refused_closures={self.max_refused_closures}: must be 0 or greater"
-            )
+        super().__post_init__()
         reason = self.refused_closures_reason
         if reason and not any(reason.lower() in verdict.value for verdict in Verdict):
             known = ", ".join(verdict.value for verdict in Verdict)
-            raise ValueError(
+            raise FlagError(
                 f"--vis_refused_closures_reason={reason}: no reason contains this text (there are: {known})"
-            )
-        for name in ("scale", "covariance_scale"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"--vis_{name}={getattr(self, name):g}: must be greater than 0")
-        if not 0 <= self.landmark_gray_level <= 255:
-            raise ValueError(
-                f"--vis_landmark_gray_level={self.landmark_gray_level}: must be 0 to 255"
             )
         if self.show_only_landmark_type:
             try:
                 type_of_name(self.show_only_landmark_type)
             except FlagError as error:
-                raise ValueError(f"--vis_show_only_landmark_type: {error}") from None
+                raise FlagError(f"--vis_show_only_landmark_type: {error}") from None
 
     @property
     def landmark_colouring(self) -> str:
@@ -168,25 +155,16 @@ class PlaybackOptions(Options, prefix="vis_seq_"):
     """Play missions by the distance travelled instead of by time."""
     synchronize_missions_on_distance_percent: bool = True
     """Let all missions begin and end together."""
-    vertex_frequency: float = option(10.0, unit="Hz")
+    vertex_frequency: float = option(10.0, gt=0, le=60, unit="Hz")
     """Steps shown per second."""
-    steps: int = 200
+    steps: int = option(200, ge=2, le=2000)
     """Steps from the beginning to the end."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not 2 <= self.steps <= 2000:
-            raise ValueError(f"--vis_seq_steps={self.steps}: must be 2 to 2000")
-        if not 0.0 < self.vertex_frequency <= 60.0:
-            raise ValueError(
-                f"--vis_seq_vertex_frequency={self.vertex_frequency:g}: must be above 0, at most 60"
-            )
 
 
 class PointCloudOptions(Options, prefix="vis_pointcloud_"):
     """Selection of dense clouds."""
 
-    visualize_every_nth: int = 1
+    visualize_every_nth: int = option(1, ge=1)
     """Show every n-th cloud or depth map."""
     color_random: bool = False
     """Give every cloud a different colour."""
@@ -194,10 +172,3 @@ class PointCloudOptions(Options, prefix="vis_pointcloud_"):
     """The depth maps are of undistorted images."""
     export_accumulated_pc_to_ply_path: str = ""
     """Write all points that are shown to this PLY file, in G."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        if self.visualize_every_nth < 1:
-            raise ValueError(
-                f"--vis_pointcloud_visualize_every_nth={self.visualize_every_nth}: must be at least 1"
-            )

@@ -248,7 +248,6 @@ def import_trajectory(
     from maplab_py.algorithms.external_poses.trajectories import shifted
     from maplab_py.interop.trajectories import read_kitti, read_trajectory
 
-    options.check()
     if options.times_file is None:
         trajectory = read_trajectory(trajectory_file, options.time_unit, needs_orientation=False)
     else:
@@ -348,7 +347,6 @@ def import_gps(
     from maplab_py.interop.gps_bags import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
-    options.check()
     mission = context.mission_row(map_mission)
     track = read_fixes(gps_file, options.date, options.topic, options.time_unit)
     result = attach_fixes(context.vi_map, mission, track, options)
@@ -393,7 +391,6 @@ def import_wheel_odometry(
     from maplab_py.interop.wheel_odometry import read_wheel_odometry
     from maplab_py.vimap.queries import mission_labels
 
-    options.check()
     mission = context.mission_row(map_mission)
     track = read_wheel_odometry(wheel_file, options.time_unit)
     if track.note:

@@ -93,7 +93,6 @@ def rovioli(
     from maplab_py.frontend.mapping import Mapping
     from maplab_py.server.submap_sources import SubmapWriter
 
-    run.check()
     _check_output(run.output)
     folder = run.output.save_map_folder
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)

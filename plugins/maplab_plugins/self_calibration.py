@@ -87,7 +87,7 @@ def self_calibrate(
         from maplab_py.research.joint_ekf import filter_jointly
 
         filtered = filter_jointly(
-            context.vi_map, options.checked(), missions=missions, progress=context.progress
+            context.vi_map, options, missions=missions, progress=context.progress
         )
         context.commit(context.vi_map.replace(sensors=filtered.sensors))
         return filtered.report()
@@ -98,7 +98,7 @@ def self_calibrate(
 
     sensors, collected, report = calibrate_with_checks(
         context.vi_map,
-        options.checked(),
+        options,
         max_camera_shift_m=max_camera_shift_m,
         parts=parts,
         database=_existing(database, size),
@@ -138,7 +138,7 @@ def collect_segments(
 
     collected, report = collect(
         context.vi_map,
-        options.checked(),
+        options,
         _existing(database, size),
         missions=chosen.rows(context.vi_map),
         progress=context.progress,
@@ -212,7 +212,7 @@ def prune_segments(
         raise UserError(f"--probability={probability:g}: must be between 0 and 1")
     result, report = prune(
         load_database(database, size.max_bytes),
-        options.checked(),
+        options,
         missions=[part.strip() for part in missions.split(",") if part.strip()],
         outdated=outdated,
         calibration=read_calibration(calibration, size.max_bytes)
@@ -289,7 +289,7 @@ def evaluate_segment_information(
             check_writable(file, overwrite=overwrite)
     report, segments = segment_information(
         context.vi_map,
-        options.checked(),
+        options,
         missions=chosen.rows(context.vi_map),
         progress=context.progress,
     )

@@ -202,7 +202,7 @@ def test_what_makes_no_map() -> None:
     builder.add_vertex(states_of(vi_map, 0), (None,))
     with pytest.raises(EstimationError, match="fewer than two vertices"):
         builder.make_map()
-    with pytest.raises(FlagError, match="max_output_frequency_hz=0: must be greater than 0"):
+    with pytest.raises(FlagError, match="max_output_frequency_hz=0: must be above 0"):
         MapBuilder(
             MapRecording(vi_map, 0).device,
             MapBuilderOptions(nframe_sync_max_output_frequency_hz=0.0),

@@ -375,20 +375,23 @@ def test_real_time_playback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("group", "values", "message"),
     [
-        (options_of(localization_map_keep_landmark_fraction=1.5), "wants 0 to 1"),
-        (options_of(localization_map_keep_landmark_fraction=0.5), "needs --optimize_map"),
-        (options_of(run_map_builder=False, save_map_folder=Path("x")), "needs a map"),
-        (options_of(run_map_builder=False, optimize_map_to_localization_map=True), "needs a map"),
-        (dataclasses.replace(RunOptions(), realtime_playback_rate=-1.0), "wants 0 or more"),
-        (RunOptions(stream=StreamOptions(start_s=-1.0)), "vio_rosbag_start_s"),
+        (OutputOptions, {"localization_map_keep_landmark_fraction": 1.5}, "must be .* at most 1"),
+        (OutputOptions, {"localization_map_keep_landmark_fraction": 0.5}, "needs --optimize_map"),
+        (OutputOptions, {"run_map_builder": False, "save_map_folder": Path("x")}, "needs a map"),
+        (
+            OutputOptions,
+            {"run_map_builder": False, "optimize_map_to_localization_map": True},
+            "needs a map",
+        ),
+        (RunOptions, {"realtime_playback_rate": -1.0}, "must be at least 0"),
+        (StreamOptions, {"start_s": -1.0}, "vio_rosbag_start_s"),
     ],
 )
-def test_wrong_options(options: RunOptions, message: str) -> None:
-    recording, _ = recording_of()
+def test_wrong_options(group: type, values: dict[str, object], message: str) -> None:
     with pytest.raises(FlagError, match=message):
-        Mapping(recording, options)
+        group(**values)
 
 
 @pytest.mark.parametrize(

@@ -383,7 +383,6 @@ def test_only_what_is_named_is_estimated() -> None:
     device, events, start = events_of(cameras=1)
     for names, kinds in (("none", ()), ("time_offset", ()), ("line_delay, extrinsics", None)):
         options = OdometryOptions(estimate=names)
-        options.check()
         expected = ("line_delay", "extrinsics") if kinds is None else kinds
         assert options.window_states == expected
     odometry = Odometry(device, make_starter=start)
@@ -391,4 +390,4 @@ def test_only_what_is_named_is_estimated() -> None:
     odometry.find_calibration()
     assert odometry.calibration_estimate is None
     with pytest.raises(FlagError, match="--vio_estimate: there is no focus: give some of"):
-        OdometryOptions(estimate="extrinsics,focus").check()
+        OdometryOptions(estimate="extrinsics,focus")

@@ -116,7 +116,7 @@ def test_wrong_input_is_told_in_one_line(folders: Path, tmp_path: Path) -> None:
                     "vil_map_tilt_sigma_deg": 0.0,
                 },
                 FlagError,
-                "vil_map_tilt_sigma_deg=0: must be positive",
+                "vil_map_tilt_sigma_deg=0: must be above 0",
             ),
         ):
             with pytest.raises(error, match=message) as told:

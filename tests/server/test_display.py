@@ -52,5 +52,5 @@ def test_a_deleted_map_is_not_shown() -> None:
 
 @pytest.mark.parametrize("name", ["stop_when_idle_s", "visualization_interval_s"])
 def test_negative_times_are_refused(name: str) -> None:
-    with pytest.raises(FlagError, match=f"--serve_{name} must not be negative"):
+    with pytest.raises(FlagError, match=f"--serve_{name}=.*: must be at least 0"):
         ServiceOptions(**{name: -1.0})

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.errors import UserError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import Distortion, Projection
@@ -399,7 +399,7 @@ def test_an_empty_map_is_refused() -> None:
 
 def test_options_refuse_nonsense() -> None:
     for wrong in ({"max_points": 0}, {"scale": 0.0}, {"landmark_gray_level": 300}):
-        with pytest.raises(ValueError, match="--vis_"):
+        with pytest.raises(FlagError, match="--vis_"):
             VisualizationOptions(**wrong)
 
 

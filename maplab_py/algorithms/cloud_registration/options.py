@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.report import Report
 
@@ -21,21 +22,21 @@ class CloudClosureOptions(Options, prefix="lidar_lc_"):
     """Clouds that are farther apart in the map are not compared"""
     min_time_gap_s: float = 10.0
     """Clouds of one mission that are closer in time are not compared"""
-    sequence_gap_s: float = 1.0
+    sequence_gap_s: float = option(1.0, ge=0)
     """Compare each cloud also with those of its mission about this long, and twice as long, before it: they
     limit the drift between places that are visited once; 0 = none"""
-    max_candidates: int = 3
+    max_candidates: int = option(3, ge=1)
     """Clouds of each mission that a cloud is compared with"""
-    every_nth: int = 1
+    every_nth: int = option(1, ge=1)
     """Use every n-th cloud of a sensor only"""
-    voxel_size_m: float = 0.1
+    voxel_size_m: float = option(0.1, gt=0)
     """Clouds are thinned to a point per voxel of this side"""
-    max_correspondence_m: float = 0.3
+    max_correspondence_m: float = option(0.3, gt=0)
     """Largest distance of corresponding points at the end of the registration; it starts with eight times
     this"""
-    min_overlap: float = 0.5
+    min_overlap: float = option(0.5, ge=0, le=1)
     """Share of the points of either cloud that must lie on surfaces of the other"""
-    max_conflict: float = 0.05
+    max_conflict: float = option(0.05, ge=0, le=1)
     """Largest share of points of either cloud in space that the other has seen to be free"""
     max_residual_m: float = 0.04
     """Largest root mean square distance of corresponding points from the surface"""
@@ -49,33 +50,20 @@ class CloudClosureOptions(Options, prefix="lidar_lc_"):
     correction (plus 0.5 m) is implausible"""
     min_support: int = 2
     """Number of nearby clouds whose closures must agree in yaw and position"""
-    covariance_scaler: float = 4.0
+    covariance_scaler: float = option(4.0, gt=0)
     """Factor on the inverse Hessian of the registration: errors of neighbouring points are alike"""
-    switch_variable_variance: float = 1e-2
+    switch_variable_variance: float = option(1e-2, gt=0)
     """Variance of the prior of an edge's switch variable at 1"""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.voxel_size_m <= 0.0 or self.max_correspondence_m <= 0.0:
-            raise ValueError(
-                "--lidar_lc_voxel_size_m and --lidar_lc_max_correspondence_m must be positive"
-            )
-        if self.max_candidates < 1 or self.every_nth < 1:
-            raise ValueError(
-                "--lidar_lc_max_candidates and --lidar_lc_every_nth must be 1 or greater"
-            )
-        if self.sequence_gap_s < 0.0:
-            raise ValueError("--lidar_lc_sequence_gap_s must be 0 or greater")
-        if not 0.0 <= self.min_overlap <= 1.0 or not 0.0 <= self.max_conflict <= 1.0:
-            raise ValueError(
-                "--lidar_lc_min_overlap and --lidar_lc_max_conflict must be between 0 and 1"
-            )
-        if self.covariance_scaler <= 0.0 or self.switch_variable_variance <= 0.0:
-            raise ValueError(
-                "--lidar_lc_covariance_scaler and --lidar_lc_switch_variable_variance must be positive"
-            )
+        """Check the values.
+
+        Raises:
+            FlagError: A value is out of range, or two options exclude each other.
+        """
+        super().__post_init__()
         if self.search_globally and self.from_closures:
-            raise ValueError("--lidar_lc_global and --lidar_lc_from_closures exclude each other")
+            raise FlagError("--lidar_lc_global and --lidar_lc_from_closures exclude each other")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 
 MESH_MIN_WEIGHT = 2.5
@@ -13,40 +14,29 @@ MESH_MIN_WEIGHT = 2.5
 class FusionOptions(Options, prefix="dense_tsdf_"):
     """Grid of truncated signed distances, and the weights of measurements."""
 
-    voxel_size_m: float = 0.10
+    voxel_size_m: float = option(0.10, gt=0)
     """Side of a voxel"""
-    truncation_distance_m: float = 0.0
+    truncation_distance_m: float = option(0.0, ge=0)
     """Distances are limited to this; 0 = three voxels"""
-    min_ray_length_m: float = 0.2
+    min_ray_length_m: float = option(0.2, gt=0)
     """Smallest depth that is used"""
     max_ray_length_m: float = 6.0
     """Largest depth that is used"""
-    weight_depth_power: int = 4
+    weight_depth_power: int = option(4, ge=0, le=8)
     """The weight of a measurement falls with this power of its depth: 4 for stereo, whose variance grows with
     it, 2 or 0 for depth sensors"""
-    max_weight: float = 10000.0
+    max_weight: float = option(10000.0, gt=0)
     """Largest weight of a voxel"""
-    integrate_every_nth: int = 1
+    integrate_every_nth: int = option(1, ge=1)
     """Integrate every n-th depth map only"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.voxel_size_m <= 0.0 or self.truncation_distance_m < 0.0:
-            raise ValueError(
-                "--dense_tsdf_voxel_size_m must be positive, --dense_tsdf_truncation_distance_m 0 or "
-                "greater"
+        super().__post_init__()
+        if not self.min_ray_length_m < self.max_ray_length_m < float("inf"):
+            raise FlagError(
+                "--dense_tsdf_min_ray_length_m must be below --dense_tsdf_max_ray_length_m"
             )
-        if not 0.0 < self.min_ray_length_m < self.max_ray_length_m:
-            raise ValueError(
-                "0 < --dense_tsdf_min_ray_length_m < --dense_tsdf_max_ray_length_m must hold"
-            )
-        if not 0 <= self.weight_depth_power <= 8 or self.integrate_every_nth < 1:
-            raise ValueError(
-                "--dense_tsdf_weight_depth_power must be 0 to 8, --dense_tsdf_integrate_every_nth 1 or "
-                "greater"
-            )
-        if self.max_weight <= 0.0:
-            raise ValueError("--dense_tsdf_max_weight must be positive")
 
     @property
     def truncation_m(self) -> float:
@@ -57,12 +47,12 @@ class FusionOptions(Options, prefix="dense_tsdf_"):
 class DistanceOptions(Options, prefix="dense_esdf_"):
     """Reach of distances, and free space near the robot."""
 
-    max_distance_m: float = 2.0
+    max_distance_m: float = option(2.0, gt=0)
     """Distances are limited to this"""
     use_clear_sphere: bool = False
     """Around every camera, count voxels that no depth map has observed as free inside the inner radius, and
     as occupied between it and the outer radius"""
-    clear_sphere_inner_radius: float = option(0.3, unit="m")
+    clear_sphere_inner_radius: float = option(0.3, ge=0, unit="m")
     """Inner radius"""
     clear_sphere_outer_radius: float = option(1.0, unit="m")
     """Outer radius"""
@@ -72,12 +62,11 @@ class DistanceOptions(Options, prefix="dense_esdf_"):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not 0.0 < self.max_distance_m < float("inf"):
-            raise ValueError("--dense_esdf_max_distance_m must be positive")
-        if not 0.0 <= self.clear_sphere_inner_radius <= self.clear_sphere_outer_radius:
-            raise ValueError(
-                "0 <= --dense_esdf_clear_sphere_inner_radius <= --dense_esdf_clear_sphere_outer_radius "
-                "must hold"
+        super().__post_init__()
+        if not self.clear_sphere_inner_radius <= self.clear_sphere_outer_radius:
+            raise FlagError(
+                "--dense_esdf_clear_sphere_inner_radius must not exceed "
+                "--dense_esdf_clear_sphere_outer_radius"
             )
 
 
@@ -143,11 +132,11 @@ class StereoOptions(Options, prefix="dense_stereo_"):
 
     use_sgbm: bool = True
     """Semi-global block matching; else plain block matching"""
-    downscaling_factor: float = 1.0
+    downscaling_factor: float = option(1.0, gt=0, le=1)
     """Images are matched at this fraction of their size"""
     adapt_params_to_image_size: bool = True
     """Take an eighth of the image's width as the number of disparities"""
-    min_baseline: float = option(0.02, unit="m")
+    min_baseline: float = option(0.02, gt=0, unit="m")
     """Pairs of cameras nearer to each other are left out"""
     max_angle_between_opt_axes: float = option(0.785, unit="rad")
     """Pairs whose optical axes differ by more are left out"""
@@ -155,67 +144,53 @@ class StereoOptions(Options, prefix="dense_stereo_"):
     """Remove what the right image does not confirm"""
     median_window: int = option(5, unit="px")
     """Side of the median filter of disparities, 0 (none), 3 or 5"""
-    bilateral_window: int = option(15, unit="px")
+    bilateral_window: int = option(15, ge=0, le=31, unit="px")
     """Side of the bilateral filter of disparities, which keeps edges; 0 = none"""
-    edge_margin: int = option(3, unit="px")
+    edge_margin: int = option(3, ge=0, unit="px")
     """Pixels so near to a step of the depth are removed: they belong to either side"""
     multi_view: bool = True
     """Remove what neighbouring vertices do not confirm"""
-    multi_view_min_agreeing: int = 2
+    multi_view_min_agreeing: int = option(2, ge=1)
     """Neighbouring vertices that must confirm a pixel"""
-    multi_view_max_difference: float = option(1.0, unit="px")
+    multi_view_max_difference: float = option(1.0, gt=0, unit="px")
     """Difference of disparities that counts as confirmation"""
-    multi_view_interval_s: float = 0.2
+    multi_view_interval_s: float = option(0.2, ge=0)
     """Time between the neighbours that are asked, three before and three after"""
 
-    debug_reconstruction_start_fraction_of_trajectory: float = 0.0
+    debug_reconstruction_start_fraction_of_trajectory: float = option(0.0, ge=0)
     """Part of each mission's vertices before the first that is used"""
-    debug_reconstruction_end_fraction_of_trajectory: float = 1.0
+    debug_reconstruction_end_fraction_of_trajectory: float = option(1.0, le=1)
     """Part of each mission's vertices up to the last that is used"""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        super().__post_init__()
         start = self.debug_reconstruction_start_fraction_of_trajectory
-        if not 0.0 <= start < self.debug_reconstruction_end_fraction_of_trajectory <= 1.0:
-            raise ValueError(
-                "0 <= --dense_stereo_debug_reconstruction_start_fraction_of_trajectory < "
-                "--dense_stereo_debug_reconstruction_end_fraction_of_trajectory <= 1 must hold"
+        if not start < self.debug_reconstruction_end_fraction_of_trajectory:
+            raise FlagError(
+                "--dense_stereo_debug_reconstruction_start_fraction_of_trajectory must be below "
+                "--dense_stereo_debug_reconstruction_end_fraction_of_trajectory"
             )
-        if not 0.0 < self.downscaling_factor <= 1.0:
-            raise ValueError("--dense_stereo_downscaling_factor must be in (0, 1]")
-        if self.median_window not in (0, 3, 5) or self.edge_margin < 0:
-            raise ValueError(
-                "--dense_stereo_median_window must be 0, 3 or 5, --dense_stereo_edge_margin 0 or greater"
-            )
-        if not 0 <= self.bilateral_window <= 31:
-            raise ValueError("--dense_stereo_bilateral_window must be 0 to 31")
-        if self.min_baseline <= 0.0:
-            raise ValueError("--dense_stereo_min_baseline must be positive")
-        if self.multi_view_min_agreeing < 1:
-            raise ValueError("--dense_stereo_multi_view_min_agreeing must be 1 or greater")
-        if self.multi_view_interval_s < 0.0 or self.multi_view_max_difference <= 0.0:
-            raise ValueError(
-                "--dense_stereo_multi_view_interval_s must be 0 or greater, "
-                "--dense_stereo_multi_view_max_difference positive"
-            )
+        if self.median_window not in (0, 3, 5):
+            raise FlagError("--dense_stereo_median_window must be 0, 3 or 5")
 
 
 def check_matcher(options: SgbmOptions | BmOptions) -> None:
     """Check the ranges that OpenCV would refuse with its own message.
 
     Raises:
-        ValueError: A value is out of range.
+        FlagError: A value is out of range.
     """
     name = options.flag_prefix
     if options.num_disparities < 16 or options.num_disparities % 16:
-        raise ValueError(f"--{name}num_disparities must be a positive multiple of 16")
+        raise FlagError(f"--{name}num_disparities must be a positive multiple of 16")
     smallest = 1 if isinstance(options, SgbmOptions) else 5
     if options.sad_window_size < smallest or options.sad_window_size % 2 == 0:
-        raise ValueError(f"--{name}sad_window_size must be odd and at least {smallest}")
+        raise FlagError(f"--{name}sad_window_size must be odd and at least {smallest}")
     if isinstance(options, SgbmOptions):
         if not 0 <= options.mode < _SGBM_MODES or not 0 < options.p1 < options.p2:
-            raise ValueError(f"--{name}mode must be 0 to 3, and 0 < --{name}p1 < --{name}p2")
+            raise FlagError(f"--{name}mode must be 0 to 3, and 0 < --{name}p1 < --{name}p2")
     elif options.pre_filter_size % 2 == 0 or not 5 <= options.pre_filter_size <= 255:
-        raise ValueError(f"--{name}pre_filter_size must be odd, 5 to 255")
+        raise FlagError(f"--{name}pre_filter_size must be odd, 5 to 255")
     elif not 1 <= options.pre_filter_cap <= 63:
-        raise ValueError(f"--{name}pre_filter_cap must be 1 to 63")
+        raise FlagError(f"--{name}pre_filter_cap must be 1 to 63")

@@ -23,15 +23,15 @@ class TrajectoryOptions(Options):
 
     kind: str = option("absolute", choices=("absolute", "odometry", "mission"), flag="as")
     """Absolute pose measurements or odometry edges of a mission of the map, or a mission of its own"""
-    position_sigma_m: float = 0.05
+    position_sigma_m: float = option(0.05, gt=0, lt=1e9)
     """Standard deviation per axis of absolute positions; of odometry: after one second, growing with the root
     of time"""
-    orientation_sigma_deg: float = 1.0
+    orientation_sigma_deg: float = option(1.0, gt=0, lt=1e9)
     """Standard deviation per axis of orientations, likewise"""
-    time_offset_s: float = 0.0
+    time_offset_s: float = option(0.0, gt=-1e9, lt=1e9)
     """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = 0.5
+    max_gap_s: float = option(0.5, gt=0, lt=1e9)
     """Poses of the file are not interpolated over longer gaps"""
     sensor_id: str = ""
     """Sensor or camera of the map whose poses the file has; empty = the IMU"""
@@ -42,32 +42,20 @@ class TrajectoryOptions(Options):
     replace: bool = False
     """Replace the measurements of the same kind that the mission has"""
 
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A deviation or gap is not positive, or the offset is not finite.
-        """
-        for name in ("position_sigma_m", "orientation_sigma_deg", "max_gap_s"):
-            if not 0.0 < getattr(self, name) < 1e9:
-                raise FlagError(f"--{name}={getattr(self, name):g}: must be positive")
-        if not abs(self.time_offset_s) < 1e9:
-            raise FlagError(f"--time_offset_s={self.time_offset_s:g}: wants seconds below 1e9")
-
 
 class GpsOptions(Options, prefix="gps_"):
     """Use of the positions of a satellite receiver."""
 
-    sigma_m: float = 1.0
+    sigma_m: float = option(1.0, gt=0, lt=1e9)
     """Standard deviation of east and of north"""
-    sigma_vertical_m: float = 0.0
+    sigma_vertical_m: float = option(0.0, ge=0, lt=1e9)
     """Standard deviation of the altitude; 0 = twice that of east"""
     lever_arm_m: str = "0,0,0"
     """Position x,y,z of the antenna on the IMU"""
-    time_offset_s: float = 0.0
+    time_offset_s: float = option(0.0, gt=-1e10, lt=1e10)
     """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = 2.0
+    max_gap_s: float = option(2.0, gt=0, lt=1e9)
     """Fixes between vertices that are further apart are left out"""
     origin: str = ""
     """Origin of east, north and up: latitude,longitude [deg],ellipsoidal altitude [m]; empty = that of the
@@ -81,19 +69,13 @@ class GpsOptions(Options, prefix="gps_"):
     replace: bool = False
     """Replace the absolute poses that the mission has"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
-            FlagError: A deviation or gap is not positive, or a list of numbers is none.
+            FlagError: A value is out of range, or a list of numbers is none.
         """
-        for name in ("sigma_m", "max_gap_s"):
-            if not 0.0 < getattr(self, name) < 1e9:
-                raise FlagError(f"--gps_{name}={getattr(self, name):g}: must be positive")
-        if not 0.0 <= self.sigma_vertical_m < 1e9:
-            raise FlagError(f"--gps_sigma_vertical_m={self.sigma_vertical_m:g}: must be 0 or more")
-        if not abs(self.time_offset_s) < 1e10:
-            raise FlagError(f"--gps_time_offset_s={self.time_offset_s:g}: wants seconds below 1e10")
+        super().__post_init__()
         _ = self.lever_arm, self.given_origin
 
     @property
@@ -119,13 +101,13 @@ class GpsOptions(Options, prefix="gps_"):
 class WheelOptions(Options, prefix="wheel_"):
     """Uncertainty of wheel odometry, and the pose of its sensor."""
 
-    position_sigma_m: float = 0.02
+    position_sigma_m: float = option(0.02, gt=0, lt=1e9)
     """Standard deviation along and across after one metre, growing with the root of the distance"""
-    yaw_sigma_deg: float = 0.5
+    yaw_sigma_deg: float = option(0.5, gt=0, lt=1e9)
     """Standard deviation of the heading, likewise"""
-    vertical_sigma_m: float = 0.05
+    vertical_sigma_m: float = option(0.05, gt=0, lt=1e9)
     """Standard deviation of height, likewise, where the file has none"""
-    tilt_sigma_deg: float = 2.0
+    tilt_sigma_deg: float = option(2.0, gt=0, lt=1e9)
     """Standard deviation of roll and pitch, likewise, where the file has none"""
     sensor_id: str = ""
     """Sensor WHEEL_ODOMETRY of sensors.yaml, of which extrinsics and covariance are taken; empty = a new
@@ -134,34 +116,21 @@ class WheelOptions(Options, prefix="wheel_"):
     """Position x,y,z of a new sensor, the middle of the axle, on the IMU"""
     orientation_xyzw: str = "0,0,0,1"
     """Orientation of a new sensor on the IMU as a quaternion x,y,z,w; its x points forwards, its z upwards"""
-    time_offset_s: float = 0.0
+    time_offset_s: float = option(0.0, gt=-1e10, lt=1e10)
     """Added to the time stamps of the file"""
     time_unit: str = time_unit_option()
-    max_gap_s: float = 0.5
+    max_gap_s: float = option(0.5, gt=0, lt=1e9)
     """Rows of the file are not interpolated over longer gaps"""
     replace: bool = False
     """Replace the wheel odometry edges that the mission has"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
-            FlagError: A deviation or gap is not positive, or the mounting is none.
+            FlagError: A value is out of range, or the mounting is none.
         """
-        names = (
-            "position_sigma_m",
-            "yaw_sigma_deg",
-            "vertical_sigma_m",
-            "tilt_sigma_deg",
-            "max_gap_s",
-        )
-        for name in names:
-            if not 0.0 < getattr(self, name) < 1e9:
-                raise FlagError(f"--wheel_{name}={getattr(self, name):g}: must be positive")
-        if not abs(self.time_offset_s) < 1e10:
-            raise FlagError(
-                f"--wheel_time_offset_s={self.time_offset_s:g}: wants seconds below 1e10"
-            )
+        super().__post_init__()
         _ = self.T_I_S
 
     @property

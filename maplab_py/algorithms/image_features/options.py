@@ -13,7 +13,6 @@ from maplab_py.vision.features.extractors import KINDS
 
 PLUGIN = "plugin:"
 """Beginning of the names of extractors that plugins have."""
-_MAX_FEATURES = 100_000
 
 
 class ExtractionOptions(Options):
@@ -24,9 +23,9 @@ class ExtractionOptions(Options):
     (Binary, 61), or plugin:NAME, a feature extractor of a plugin"""
     feature_model: str = ""
     """File of a plugin's extractor, such as a network in the ONNX format"""
-    max_features: int = 1000
+    max_features: int = option(1000, ge=1, le=100_000)
     """Largest number of keypoints of an image"""
-    feature_sigma_px: float = 0.8
+    feature_sigma_px: float = option(0.8, gt=0, le=100)
     """Standard deviation of the new keypoints"""
     replace: bool = False
     """Replace the keypoints of frames that have such features, or keypoints without descriptors, with their
@@ -34,15 +33,10 @@ class ExtractionOptions(Options):
 
     def __post_init__(self) -> None:
         """Check the values."""
+        super().__post_init__()
         if self.feature_type not in KINDS and not self.feature_type.startswith(PLUGIN):
             raise FlagError(
                 f"--feature_type={self.feature_type}: wants {', '.join(KINDS)} or {PLUGIN}NAME"
-            )
-        if not 1 <= self.max_features <= _MAX_FEATURES:
-            raise FlagError(f"--max_features={self.max_features}: wants a number from 1 to 100000")
-        if not 0.0 < self.feature_sigma_px <= 100.0:
-            raise FlagError(
-                f"--feature_sigma_px={self.feature_sigma_px:g}: wants a positive number up to 100"
             )
         if self.feature_model and not self.feature_type.startswith(PLUGIN):
             raise FlagError(
@@ -56,33 +50,18 @@ class FeatureTrackOptions(Options, prefix="track_"):
     feature_type: str = option("sift", flag="feature_type")
     """Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, plugin:NAME) or by their
     type (Binary, SuperPoint, R2D2, SIFT or a number)"""
-    neighbors: int = 2
+    neighbors: int = option(2, ge=1, le=100)
     """Following frames of the camera that a frame is matched with"""
-    epipolar_gate_px: float = 4.0
+    epipolar_gate_px: float = option(4.0, gt=0)
     """Largest distance of a keypoint from the epipolar line that the map's poses predict"""
-    min_depth_m: float = 0.3
+    min_depth_m: float = option(0.3, gt=0)
     """Smallest distance of a point, which limits its parallax"""
-    max_ratio: float = 0.9
+    max_ratio: float = option(0.9, gt=0, le=1)
     """Largest ratio of the differences of the best and the second best match"""
-    max_bit_fraction: float = 0.25
+    max_bit_fraction: float = option(0.25, gt=0)
     """Largest fraction of bits in which matched Binary descriptors differ"""
-    max_descriptor_distance: float = 0.45
+    max_descriptor_distance: float = option(0.45, gt=0)
     """Largest distance of other matched descriptors, scaled to unit length"""
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not 1 <= self.neighbors <= 100:
-            raise FlagError(f"--track_neighbors={self.neighbors}: wants a number from 1 to 100")
-        for name in (
-            "epipolar_gate_px",
-            "min_depth_m",
-            "max_bit_fraction",
-            "max_descriptor_distance",
-        ):
-            if not getattr(self, name) > 0.0:
-                raise FlagError(f"--track_{name} must be positive")
-        if not 0.0 < self.max_ratio <= 1.0:
-            raise FlagError(f"--track_max_ratio={self.max_ratio:g}: wants a number from 0 to 1")
 
     def wanted(self) -> tuple[int, tuple[int, ...]]:
         """Return the feature type and the sizes [bytes] of the descriptors, empty = any.

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 
-from maplab_py.errors import FlagError
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
 class KeyframingOptions(Options, prefix="kf_"):
     """Criteria for keyframes."""
 
-    distance_threshold_m: float = 0.75
+    distance_threshold_m: float = option(0.75, ge=0)
     """Distance from the last keyframe that makes a new one."""
-    rotation_threshold_deg: float = 20.0
+    rotation_threshold_deg: float = option(20.0, ge=0)
     """Rotation from the last keyframe that makes a new one."""
-    every_nth_vertex: int = 10
+    every_nth_vertex: int = option(10, ge=1)
     """Make at least every n-th vertex a keyframe."""
-    min_shared_landmarks_obs: int = 20
+    min_shared_landmarks_obs: int = option(20, ge=0)
     """Make a keyframe where fewer landmarks are shared with the last one."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.every_nth_vertex < 1:
-            raise FlagError("--kf_every_nth_vertex must be at least 1")
-        for name in ("distance_threshold_m", "rotation_threshold_deg", "min_shared_landmarks_obs"):
-            if getattr(self, name) < 0:
-                raise FlagError(f"--kf_{name} must not be negative")
 
 
 @dataclasses.dataclass(frozen=True)

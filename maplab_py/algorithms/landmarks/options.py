@@ -12,9 +12,9 @@ from maplab_py.report import Report
 class LandmarkQualityOptions(Options, prefix="elq_"):
     """Criteria for well-constrained landmarks."""
 
-    min_observers: int = 2
+    min_observers: int = option(2, ge=0)
     """Smallest number of vertices that observe a landmark."""
-    min_observation_angle_deg: float = 2.0
+    min_observation_angle_deg: float = option(2.0, ge=0, le=180)
     """Smallest angle between the two most different rays."""
     max_relative_sigma: float = 0.05
     """Largest standard deviation of a landmark along its worst axis, relative to its distance from the
@@ -25,7 +25,7 @@ class LandmarkQualityOptions(Options, prefix="elq_"):
     """Largest distance of a landmark from its closest observer."""
     max_reprojection_error_px: float = -1.0
     """Largest reprojection error of any observation; negative = not checked."""
-    lidar_min_observers: int = 1
+    lidar_min_observers: int = option(1, ge=0)
     """Smallest number of vertices that observe a lidar landmark."""
     lidar_min_distance_from_closest_observer: float = option(1.0, unit="m")
     """Smallest distance of a lidar landmark from its closest observer."""
@@ -36,10 +36,7 @@ class LandmarkQualityOptions(Options, prefix="elq_"):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.min_observers < 0 or self.lidar_min_observers < 0:
-            raise FlagError("--elq_min_observers must not be negative")
-        if not 0.0 <= self.min_observation_angle_deg <= 180.0:
-            raise FlagError("--elq_min_observation_angle_deg must be in [0, 180]")
+        super().__post_init__()
         for prefix in ("", "lidar_"):
             low = getattr(self, f"{prefix}min_distance_from_closest_observer")
             high = getattr(self, f"{prefix}max_distance_from_closest_observer")
@@ -52,15 +49,10 @@ class LandmarkQualityOptions(Options, prefix="elq_"):
 class InvalidObservationOptions(Options, prefix="rio_"):
     """Criteria for invalid observations."""
 
-    max_reprojection_error_px: float = 50.0
+    max_reprojection_error_px: float = option(50.0, gt=0)
     """Largest reprojection error of a valid observation."""
     make_new_landmarks: bool = True
     """Make new landmarks from detached observations of one feature track."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.max_reprojection_error_px <= 0.0:
-            raise FlagError("--rio_max_reprojection_error_px must be positive")
 
 
 _MANY_BAD = 0.8

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.report import Report
 
@@ -12,53 +11,37 @@ from maplab_py.report import Report
 class LocalizationOptions(Options, prefix="localization_"):
     """Matching of images with a map and acceptance of poses."""
 
-    num_neighbors: int = 3
+    num_neighbors: int = option(3, ge=1)
     """Landmarks to retrieve per keypoint."""
-    num_words_for_nn_search: int = 24
+    num_words_for_nn_search: int = option(24, ge=1)
     """Cells of the multi-index that are searched per keypoint."""
     max_bit_fraction: float = 0.26
     """Largest fraction of descriptor bits in which a match may differ; full maps only."""
-    max_descriptor_distance: float = 0.45
+    max_descriptor_distance: float = option(0.45, gt=0)
     """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length; full
     maps only."""
-    max_projected_distance: float = 40.0
+    max_projected_distance: float = option(40.0, gt=0)
     """Largest squared distance of projected descriptors of a match; summary maps."""
-    places: int = 6
+    places: int = option(6, ge=1)
     """Places of the map that are tried for each query."""
     min_shared_landmarks: int = 5
     """Number of shared landmarks above which observers of the map belong to one place."""
     min_matches: int = 5
     """Smallest number of matches with a place for verification."""
-    ransac_pixel_sigma: float = option(2.0, unit="px")
+    ransac_pixel_sigma: float = option(2.0, gt=0, unit="px")
     """Largest reprojection error of an inlier."""
-    num_ransac_iters: int = 500
+    num_ransac_iters: int = option(500, ge=1)
     """Largest number of samples of two matches per place."""
-    min_inlier_count: int = 8
+    min_inlier_count: int = option(8, ge=3)
     """Landmarks that must agree with the pose."""
     min_inlier_ratio: float = 0.03
     """Fraction of the keypoints matched in the place that must agree."""
     max_gravity_misalignment_deg: float = 5.0
     """Largest angle between gravity in the query's frame and in the estimated pose."""
-    max_position_sigma_m: float = 0.5
+    max_position_sigma_m: float = option(0.5, gt=0)
     """Largest standard deviation of the position of an accepted pose."""
     seed: int = 0
     """Seed of all random choices."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("num_neighbors", "num_words_for_nn_search", "places", "num_ransac_iters"):
-            if getattr(self, name) < 1:
-                raise FlagError(f"--localization_{name} must be at least 1")
-        if self.min_inlier_count < 3:
-            raise FlagError("--localization_min_inlier_count must be at least 3")
-        for name in (
-            "ransac_pixel_sigma",
-            "max_position_sigma_m",
-            "max_projected_distance",
-            "max_descriptor_distance",
-        ):
-            if getattr(self, name) <= 0.0:
-                raise FlagError(f"--localization_{name} must be positive")
 
 
 @dataclasses.dataclass(frozen=True)

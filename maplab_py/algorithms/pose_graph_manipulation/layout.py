@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.errors import FlagError
 from maplab_py.geometry import se3, so3
 from maplab_py.options import Options, option
 from maplab_py.report import Report
@@ -19,15 +18,10 @@ class LayoutOptions(Options, prefix="spatially_distribute_missions_"):
 
     meters: float = option(20.0, unit="m")
     """Distance of neighbours, or radius of the circle."""
-    dimension: int = 0
+    dimension: int = option(0, ge=0, le=2)
     """Axis to shift along: 0 = x, 1 = y, 2 = z."""
     around_circle: bool = False
     """Spread the missions around a circle instead."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.dimension not in (0, 1, 2):
-            raise FlagError("--spatially_distribute_missions_dimension must be 0, 1 or 2")
 
 
 def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, int]:
@@ -56,22 +50,16 @@ def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, i
 class DisturbanceOptions(Options, prefix="disturb_"):
     """Magnitude of the disturbance; maplab's names and defaults."""
 
-    max_translational_disturbance_norm_m: float = 0.05
+    max_translational_disturbance_norm_m: float = option(0.05, ge=0)
     """Largest shift of a vertex."""
-    max_yaw_angle_rad: float = 0.05
+    max_yaw_angle_rad: float = option(0.05, ge=0)
     """Largest turn of a vertex."""
-    translation_random_walk_sigma_m: float = 0.005
+    translation_random_walk_sigma_m: float = option(0.005, ge=0)
     """Standard deviation by which the shift changes per vertex and axis."""
-    yaw_angle_stddev_rad: float = 0.0005
+    yaw_angle_stddev_rad: float = option(0.0005, ge=0)
     """Standard deviation by which the turn changes per vertex."""
-    random_generator_seed: int = 0
+    random_generator_seed: int = option(0, ge=0)
     """Seed of the disturbance."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 0:
-                raise FlagError(f"--disturb_{field.name} must not be negative")
 
 
 @dataclasses.dataclass(frozen=True)

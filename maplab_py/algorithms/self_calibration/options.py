@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Self
-
 from maplab_py.errors import UserError
 from maplab_py.options import Options, option
 
@@ -30,14 +27,6 @@ _STATES_OF = {
 METRICS = ("a_optimality", "d_optimality", "e_optimality", "entropy")
 SELECTIONS = ("informative", "least_informative", "random", "information_gain", "all")
 
-_MINIMUM = {
-    "segments_per_group": 1,
-    "segment_keyframes": 3,
-    "num_iterations": 1,
-    "min_shared_landmarks": 0,
-    "min_parallax_deg": 0.0,
-}
-
 
 class SelfCalibrationOptions(Options, prefix="sc_"):
     """Estimated parameters, data and priors.
@@ -58,19 +47,19 @@ class SelfCalibrationOptions(Options, prefix="sc_"):
     """How a group's covariance becomes one number."""
     selection: str = option("informative", choices=SELECTIONS)
     """Which segments to take."""
-    segments_per_group: int = 8
+    segments_per_group: int = option(8, ge=1)
     """How many segments each group keeps."""
-    segment_keyframes: int = 40
+    segment_keyframes: int = option(40, ge=3)
     """Keyframes of a segment."""
     seed: int = 1
     """Seed of the random selection."""
     min_information_gain: float = option(0.2, unit="nat")
     """Selection by information gain keeps a segment above this."""
-    min_shared_landmarks: int = 15
+    min_shared_landmarks: int = option(15, ge=0)
     """Segments that share more landmarks than this form one partition."""
-    min_parallax_deg: float = 1.0
+    min_parallax_deg: float = option(1.0, ge=0)
     """Landmarks seen under a smaller parallax are not used."""
-    num_iterations: int = 40
+    num_iterations: int = option(40, ge=1)
     """Largest number of iterations."""
     function_tolerance: float = 1e-6
     """Stop when an iteration lowers the cost by less than this share of it."""
@@ -88,54 +77,43 @@ class SelfCalibrationOptions(Options, prefix="sc_"):
     keep_unobservable_at_prior: bool = False
     """Accept data that leave directions undetermined and keep those at their prior; otherwise such data are
     refused."""
-    prior_focal_relative: float = 0.05
+    prior_focal_relative: float = option(0.05, gt=0)
     """Prior deviation of focal lengths, relative."""
-    prior_centre_px: float = 15.0
+    prior_centre_px: float = option(15.0, gt=0)
     """Prior deviation of the centre."""
-    prior_distortion: float = 0.05
+    prior_distortion: float = option(0.05, gt=0)
     """Prior deviation of distortion parameters."""
-    prior_rotation_deg: float = 5.0
+    prior_rotation_deg: float = option(5.0, gt=0)
     """Prior deviation of the camera's orientation."""
-    prior_position_m: float = 0.05
+    prior_position_m: float = option(0.05, gt=0)
     """Prior deviation of the camera's position."""
-    prior_imu_scale: float = 0.05
+    prior_imu_scale: float = option(0.05, gt=0)
     """Prior deviation of IMU scales."""
-    prior_imu_misalignment: float = 0.05
+    prior_imu_misalignment: float = option(0.05, gt=0)
     """Prior deviation of IMU misalignments."""
-    prior_imu_rotation_deg: float = 5.0
+    prior_imu_rotation_deg: float = option(5.0, gt=0)
     """Prior deviation of the accelerometer's orientation."""
-    prior_time_offset_s: float = 0.03
+    prior_time_offset_s: float = option(0.03, gt=0)
     """Prior deviation of the delay of the images."""
 
-    prior_line_delay_us: float = 100.0
+    prior_line_delay_us: float = option(100.0, gt=0)
     """Prior deviation of the time between two rows."""
 
-    prior_gyro_bias_radps: float = 0.2
+    prior_gyro_bias_radps: float = option(0.2, gt=0)
     """Prior deviation of the gyroscope's bias at the beginning of a run of segments."""
-    prior_accel_bias_mps2: float = 2.0
+    prior_accel_bias_mps2: float = option(2.0, gt=0)
     """Prior deviation of the accelerometer's bias at the beginning of a run of segments."""
-    prior_velocity_mps: float = 20.0
+    prior_velocity_mps: float = option(20.0, gt=0)
     """Prior deviation of the velocity at the beginning of a run of segments."""
 
-    def checked(self) -> Self:
-        """Return the options if they can be used.
+    def __post_init__(self) -> None:
+        """Check ranges and names.
 
         Raises:
             UserError: A number is out of its range, or a name is unknown; the message names the flag.
         """
+        super().__post_init__()
         self.grouping()
-        for name, least in _MINIMUM.items():
-            value = getattr(self, name)
-            if not value >= least:
-                raise UserError(f"--{self.flag_prefix}{name}={value:g}: wants at least {least:g}")
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name.startswith("prior_") and not value > 0.0:
-                raise UserError(
-                    f"--{self.flag_prefix}{field.name}={value:g}: wants a positive deviation; to "
-                    "hold something, leave it out of --sc_states"
-                )
-        return self
 
     def estimated(self) -> frozenset[str]:
         """Return the states to estimate.

@@ -16,37 +16,29 @@ class SparsificationOptions(Options, prefix="sparsification_"):
 
     method: str = option("ilp", choices=METHODS)
     """ilp (integer programme), greedy (cover), or, for comparison, most_observed or random."""
-    min_keypoints_per_keyframe: int = 30
+    min_keypoints_per_keyframe: int = option(30, ge=0)
     """Number of landmarks that every keyframe should still observe"""
     weighted: bool = False
     """Weight a landmark by the probability of matching it again, which increases with the number of observing
     vertices; otherwise all weights are equal (Schneider 2019, section 4)"""
-    slack_levels: int = 2
+    slack_levels: int = option(2, ge=1, le=8)
     """Number of levels of the cost of missing landmarks, which doubles from level to level; 1 = constant
     cost, as in Schneider 2019"""
-    descriptor_dev_scoring_threshold: float = 10.0
+    descriptor_dev_scoring_threshold: float = option(10.0, gt=0)
     """Mean distance of a landmark's descriptors from their majority, in bits of 384, above which its score
     falls."""
-    exact_up_to: int = 2000
+    exact_up_to: int = option(2000, ge=0)
     """Largest number of landmarks for which the integer programme is solved exactly"""
-    landmarks_per_part: int = 60000
+    landmarks_per_part: int = option(60000, ge=100)
     """Largest number of landmarks of a part; larger maps are split along the co-visibility graph"""
-    seed: int = 0
+    seed: int = option(0, ge=0)
     """Seed of the random choice."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise FlagError(f"--sparsification_method={self.method}: one of {', '.join(METHODS)}")
-        if not 1 <= self.slack_levels <= 8:
-            raise FlagError("--sparsification_slack_levels must be between 1 and 8")
-        if self.descriptor_dev_scoring_threshold <= 0.0:
-            raise FlagError("--sparsification_descriptor_dev_scoring_threshold must be positive")
-        for name in ("min_keypoints_per_keyframe", "exact_up_to", "seed"):
-            if getattr(self, name) < 0:
-                raise FlagError(f"--sparsification_{name} must not be negative")
-        if self.landmarks_per_part < 100:
-            raise FlagError("--sparsification_landmarks_per_part must be at least 100")
 
 
 @dataclasses.dataclass(frozen=True)

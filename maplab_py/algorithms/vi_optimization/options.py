@@ -34,10 +34,10 @@ class DataOptions(Options):
     """Leave out the observations of images that see fewer landmarks."""
     use_only_good_landmarks: bool = False
     """Leave out landmarks of bad quality; otherwise only their gross outliers are left out."""
-    max_observations_per_landmark: int = 0
+    max_observations_per_landmark: int = option(0, ge=0)
     """Largest number of observations of a landmark: those with the most information about it and about
     vertices with few observations are used; 0 = all."""
-    max_covisible_frames: int = 0
+    max_covisible_frames: int = option(0, ge=0)
     """Largest number of vertices that a vertex shares landmarks with: observations that join it with others
     are left out; every mission and loop keeps its best pairs; 0 = all."""
     gravity_magnitude_mps2: float = 0.0
@@ -49,14 +49,12 @@ class DataOptions(Options):
 
     def __post_init__(self) -> None:
         """Check the limits of thinning and the feature type."""
+        super().__post_init__()
         if self.feature_type:
             try:
                 type_of_name(self.feature_type)
             except FlagError as error:
                 raise FlagError(f"--ba_feature_type: {error}") from None
-        for name in ("max_observations_per_landmark", "max_covisible_frames"):
-            if getattr(self, name) < 0:
-                raise FlagError(f"--ba_{name} must not be negative; 0 = all")
         if self.max_observations_per_landmark == 1:
             raise FlagError(
                 "--ba_max_observations_per_landmark must be at least 2: one observation does not "

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 from maplab_py.console.session.maps import MapEntry, Step
 from maplab_py.console.session.settings import Settings
-from maplab_py.errors import FlagError
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.vimap import VIMap
 
 _FLAG = "undo_max_gb"
@@ -18,18 +17,9 @@ _GB = 1e9
 class UndoOptions(Options):
     """Bound of the values that undo and redo keep."""
 
-    undo_max_gb: float = 4.0
+    undo_max_gb: float = option(4.0, ge=0)
     """Memory for the former values of each map, columns that the present value shares left out; the oldest
     values beyond it are dropped and cannot be restored by undo."""
-
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            FlagError: The bound is negative or not a number.
-        """
-        if not 0.0 <= self.undo_max_gb < float("inf"):
-            raise FlagError(f"--{_FLAG}={self.undo_max_gb:g}: must be a number of gigabytes")
 
     @classmethod
     def of(cls, settings: Settings) -> UndoOptions:

@@ -16,12 +16,12 @@ class WindowOptions(Options, prefix="vio_"):
     num_keyframes: int = 0
     """Keyframes in the window; 0 = 7 of several cameras, and 12 of a single camera, which sees distances by
     its motion only."""
-    num_recent_frames: int = 3
+    num_recent_frames: int = option(3, ge=1)
     """Frames in the window that follow the last keyframe."""
     landmark_policy: str = option("all", choices=("all", "thesis"))
     """Which tracks are estimated: all with parallax, or as in the thesis terminated and long ones only, the
     best of them by score."""
-    max_landmarks: int = 300
+    max_landmarks: int = option(300, ge=10)
     """Landmarks that the newest frame sees; the longest tracks are taken. Landmarks whose tracks have ended
     stay beside them until the frame leaves in which they are anchored."""
     min_parallax_deg: float = 0.7
@@ -29,21 +29,21 @@ class WindowOptions(Options, prefix="vio_"):
     expected_depth_share: float = 4.0
     """Standard deviation of the inverse depth of a landmark without that parallax, as a multiple of the
     median inverse depth."""
-    min_depth_m: float = 0.1
+    min_depth_m: float = option(0.1, gt=0)
     """Smallest depth of a new landmark."""
-    max_depth_m: float = 100.0
+    max_depth_m: float = option(100.0, gt=0)
     """Largest depth of a new landmark."""
     keyframe_parallax_deg: float = 2.0
     """Median parallax to the last keyframe that makes a keyframe."""
     keyframe_tracked_share: float = 0.7
     """Share of the last keyframe's tracks; with fewer a frame becomes a keyframe."""
-    huber_sigmas: float = 1.345
+    huber_sigmas: float = option(1.345, gt=0)
     """Scale of the Huber loss of reprojection errors."""
-    gate_chi2: float = 9.21
+    gate_chi2: float = option(9.21, gt=0)
     """Largest squared error of an observation in standard deviations (99 %: 9.21)."""
     prediction_sigma_px: float = 2.0
     """Uncertainty of a predicted place, for gates of new observations."""
-    num_iterations: int = 5
+    num_iterations: int = option(5, ge=1)
     """Largest number of iterations of an update."""
     function_tolerance: float = 1e-3
     """Relative decrease of the cost that ends an update."""

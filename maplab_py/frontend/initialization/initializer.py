@@ -58,13 +58,11 @@ class Initializer:
         """Prepare for the sensors of a device.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: The device has no IMU.
         """
         if device.imu is None:
             raise UserError("the start needs an IMU, and the calibration has none")
         self._options = options or InitializationOptions()
-        self._options.check()
         self._imu = device.imu
         self._focal_px = min(focal_length_px(camera) for camera in device.cameras)
         self._history = History(self._options.longest_s + 1e-3)

@@ -99,12 +99,7 @@ class OnlineLocalization:
         options: OnlineLocalizationOptions,
         window: WindowOptions | None = None,
     ) -> None:
-        """Index the map.
-
-        Raises:
-            FlagError: An option is out of its range.
-        """
-        options.check()
+        """Index the map."""
         self.counts = LocalizationCounts()
         self.events: list[MapEvent] = []  # of the last frame
         self.notes = calibration_notes(searched, device)

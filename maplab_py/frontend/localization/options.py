@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.errors import FlagError
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.options import Options, option
 
@@ -24,70 +23,45 @@ class OnlineLocalizationOptions(Options, prefix="localization_"):
     mode: str = option("vil", choices=MODES)
     """vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, poses fixed; pose =
     T_G_M from poses of single images; odo = T_G_M from the first matches only"""
-    max_frequency_hz: float = option(2.0, flag="vio_max_localization_frequency_hz")
+    max_frequency_hz: float = option(2.0, gt=0, flag="vio_max_localization_frequency_hz")
     """Largest rate at which images are matched with the map"""
     map_tracking: bool = True
     """Once localised, match landmarks near their predicted places before all others"""
-    max_num_constraints: int = option(25, flag="rovioli_max_num_localization_constraints")
+    max_num_constraints: int = option(25, ge=0, flag="rovioli_max_num_localization_constraints")
     """Tracks per camera that observe the map at a time; 0 = any number"""
-    min_num_constraints: int = option(5, flag="rovioli_min_number_of_structure_constraints")
+    min_num_constraints: int = option(5, ge=1, flag="rovioli_min_number_of_structure_constraints")
     """Matches that an answer must have to be used"""
-    max_tilt_deg: float = option(5.0, flag="rovioli_localization_max_gravity_misalignment_deg")
+    max_tilt_deg: float = option(
+        5.0, gt=0, flag="rovioli_localization_max_gravity_misalignment_deg"
+    )
     """Largest angle between gravity in the map and in the odometry"""
     init_position_covariance_msq: float = option(
-        20.0, unit="m^2", flag="rovioli_baseframe_init_position_covariance_msq"
+        20.0, gt=0, unit="m^2", flag="rovioli_baseframe_init_position_covariance_msq"
     )
     """Variance of the position of T_G_M before anything is matched"""
     init_rotation_covariance_radsq: float = option(
         float(np.radians(90.0)),
+        gt=0,
         unit="rad^2",
         flag="rovioli_baseframe_init_rotation_covariance_radsq",
     )
     """Variance of the orientation of T_G_M before anything is matched"""
-    min_num_estimates: int = option(2, flag="rovioli_min_num_baseframe_estimates_before_init")
+    min_num_estimates: int = option(2, ge=1, flag="rovioli_min_num_baseframe_estimates_before_init")
     """Answers in a row that must agree before T_G_M is set, or set again; four times as many where they
     differ by more than the odometry drifts and have fewer than 80 matches together"""
     max_mean_error_px: float = option(
-        20.0, flag="rovioli_max_mean_localization_reprojection_error_px"
+        20.0, gt=0, flag="rovioli_max_mean_localization_reprojection_error_px"
     )
     """Mean reprojection error at the estimated pose above which an answer disagrees"""
-    keypoint_sigma_px: float = option(1.0, flag="vil_keypoint_sigma_px")
+    keypoint_sigma_px: float = option(1.0, gt=0, flag="vil_keypoint_sigma_px")
     """Standard deviation of a keypoint that observes the map"""
-    tilt_sigma_deg: float = option(0.5, flag="vil_map_tilt_sigma_deg")
+    tilt_sigma_deg: float = option(0.5, gt=0, flag="vil_map_tilt_sigma_deg")
     """Standard deviation of the tilt of the map against the odometry"""
     landmark_uncertainty: str = option(
         "none", choices=LANDMARK_UNCERTAINTIES, flag="vil_landmark_uncertainty"
     )
     """none = landmarks of the map are exact; map = they are estimated, with the map's covariances (mode
     vil)"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range.
-        """
-        for flag, value in (
-            ("vio_max_localization_frequency_hz", self.max_frequency_hz),
-            ("rovioli_localization_max_gravity_misalignment_deg", self.max_tilt_deg),
-            ("rovioli_baseframe_init_position_covariance_msq", self.init_position_covariance_msq),
-            (
-                "rovioli_baseframe_init_rotation_covariance_radsq",
-                self.init_rotation_covariance_radsq,
-            ),
-            ("rovioli_max_mean_localization_reprojection_error_px", self.max_mean_error_px),
-            ("vil_keypoint_sigma_px", self.keypoint_sigma_px),
-            ("vil_map_tilt_sigma_deg", self.tilt_sigma_deg),
-        ):
-            if not 0.0 < value < np.inf:
-                raise FlagError(f"--{flag}={value:g}: must be positive")
-        for flag, count, least in (
-            ("rovioli_max_num_localization_constraints", self.max_num_constraints, 0),
-            ("rovioli_min_number_of_structure_constraints", self.min_num_constraints, 1),
-            ("rovioli_min_num_baseframe_estimates_before_init", self.min_num_estimates, 1),
-        ):
-            if count < least:
-                raise FlagError(f"--{flag}={count}: wants {least} or more")
 
     @property
     def rule(self) -> MapRule:

@@ -23,17 +23,10 @@ class PoseToBagOptions(Options, prefix="rosbag_plugin_pose_to_bag_"):
     """Add the poses to /tf"""
     add_transform_stamped: bool = True
     """Add the poses as the topics T_G_I, T_M_I and T_G_M"""
-    interpolate_to_frequency_hz: float = 100.0
+    interpolate_to_frequency_hz: float = option(100.0, gt=0, le=1e9)
     """Rate of the poses between vertices, if higher than theirs"""
     drop_tf: bool = False
     """Leave /tf of the input out"""
-
-    def __post_init__(self) -> None:
-        """Check the rate."""
-        if not 0.0 < self.interpolate_to_frequency_hz <= _HIGHEST_RATE_HZ:
-            raise ValueError(
-                "--rosbag_plugin_pose_to_bag_interpolate_to_frequency_hz must be positive and at most 1e9"
-            )
 
 
 class BagExportOptions(Options, prefix="bag_"):
@@ -75,19 +68,11 @@ class BagImportOptions(Options):
     """Is added to the stamps of the topic, beside the time offset of the camera"""
     camera_calibration_topic: str = ""
     """Topic of CameraInfo that the camera of the map is compared with; empty = no comparison"""
-    calibration_tolerance_px: float = 1.0
+    calibration_tolerance_px: float = option(1.0, ge=0)
     """Largest difference between the two calibrations"""
-    camera: int = -1
+    camera: int = option(-1, ge=-1)
     """Index of the camera in its rig; -1 = the one of that topic, or the only one"""
     sensor_id: str = ""
     """Sensor of point clouds; empty = the mission's lidar"""
-    image_tolerance_ms: float = 1.0
+    image_tolerance_ms: float = option(1.0, ge=0)
     """Largest difference between the times of message and frame"""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.image_tolerance_ms < 0.0 or self.calibration_tolerance_px < 0.0 or self.camera < -1:
-            raise ValueError(
-                "--image_tolerance_ms and --calibration_tolerance_px must be 0 or greater, --camera -1 or "
-                "greater"
-            )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 
 from maplab_py.interop.stamps import time_unit_option
@@ -56,7 +55,7 @@ class ColmapImportOptions(Options):
     timestamps_file: str = ""
     """File of lines `image name, time stamp` for --timestamps_from=file"""
     time_unit: str = time_unit_option()
-    order_interval_s: float = 1.0
+    order_interval_s: float = option(1.0, gt=0)
     """Time between frames for --timestamps_from=order"""
     scale: float = option(0.0, unit="m")
     """Metres per unit of the model; 0 = unknown"""
@@ -72,24 +71,12 @@ class ColmapImportOptions(Options):
     """Folder of the images, which become resources; empty = none"""
     link_images: bool = False
     """Refer to the images by symbolic links instead of copying them"""
-    colmap_keypoint_sigma_px: float = 0.8
+    colmap_keypoint_sigma_px: float = option(0.8, gt=0)
     """Standard deviation of the keypoints"""
-    colmap_odometry_sigma_m: float = 0.02
+    colmap_odometry_sigma_m: float = option(0.02, gt=0)
     """Standard deviation of the position of odometry edges"""
-    colmap_odometry_sigma_deg: float = 0.2
+    colmap_odometry_sigma_deg: float = option(0.2, gt=0)
     """Standard deviation of the rotation of odometry edges"""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in (
-            "order_interval_s",
-            "colmap_keypoint_sigma_px",
-            "colmap_odometry_sigma_m",
-            "colmap_odometry_sigma_deg",
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be greater than 0")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,6 @@ def open_transport(
     Raises:
         UserError: The transport is unknown, a library is missing, or nobody answers.
     """
-    network.check()
     if kind not in TRANSPORTS:
         raise UserError(f"transport {kind}: wants one of {', '.join(TRANSPORTS)}")
     transport: Transport

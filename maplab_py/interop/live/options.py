@@ -25,17 +25,8 @@ class NetworkOptions(Options):
     """WebSocket of foxglove_bridge, or of what speaks its protocol"""
     live_interface: str = ""
     """Network interface or IP address to listen on; empty = this computer only (loopback)"""
-    live_wait_s: float = 10.0
+    live_wait_s: float = option(10.0, gt=0, lt=1e9)
     """Wait so long for the first publishers"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range.
-        """
-        if not 0.0 < self.live_wait_s < 1e9:
-            raise FlagError(f"--live_wait_s={self.live_wait_s:g}: must be greater than 0")
 
     @property
     def domain(self) -> int:
@@ -60,9 +51,9 @@ class NetworkOptions(Options):
 class LiveOptions(Options, prefix="live_"):
     """Reading of a live source, and publishing."""
 
-    silence_s: float = 10.0
+    silence_s: float = option(10.0, ge=0, lt=1e9)
     """End when nothing has arrived for so long; 0 = only Ctrl-C ends"""
-    max_delay_s: float = 1.0
+    max_delay_s: float = option(1.0, gt=0, lt=1e9)
     """Leave out the oldest images when they have waited longer than this; IMU samples are never left out"""
     publish: bool = True
     """Publish /maplab/odometry, /maplab/pose_in_map and /tf where the images come from"""
@@ -74,14 +65,3 @@ class LiveOptions(Options, prefix="live_"):
     """Name of the frame M of the mission in what is published"""
     base_frame: str = "imu"
     """Name of the body frame I in what is published"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range.
-        """
-        if not 0.0 <= self.silence_s < 1e9:
-            raise FlagError(f"--live_silence_s={self.silence_s:g}: wants 0 or more")
-        if not 0.0 < self.max_delay_s < 1e9:
-            raise FlagError(f"--live_max_delay_s={self.max_delay_s:g}: must be greater than 0")

@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
@@ -14,7 +14,7 @@ from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
 from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bags import IMU_TYPE
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Recording
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
@@ -27,21 +27,12 @@ _DRAIN_S = 1.0
 class PlayingOptions(Options, prefix="play_"):
     """Playback of a recording."""
 
-    rate: float = 1.0
+    rate: float = option(1.0, ge=0, lt=1e6)
     """Multiple of real time; 0 = as fast as possible"""
     wait_for_subscribers: bool = True
     """Begin when somebody listens to all topics (at most --live_wait_s)"""
     stamps_now: bool = False
     """Move the stamps so that the recording begins now (with --play_rate=1)"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: The rate is negative.
-        """
-        if not 0.0 <= self.rate < 1e6:
-            raise FlagError(f"--play_rate={self.rate:g}: wants 0 or more")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,11 +78,9 @@ def play_recording(
         is_to_end: Tells whether to end now.
 
     Raises:
-        FlagError: An option is wrong.
         UserError: A library is missing, nobody answers, or two sensors have the same topic.
         MapError: The recording is damaged.
     """
-    options.check()
     with open_transport(kind, network, is_server=True) as transport:
         player = _Player(recording, transport, options)
         if options.wait_for_subscribers:

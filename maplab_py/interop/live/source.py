@@ -101,12 +101,9 @@ class LiveRecording:
             tell: Is told what the user should know while it goes on.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: A topic is not published, not named, or of another type.
             Cancelled: The user does not want to wait.
         """
-        options.check()
-        source.check()
         self.device, self.name = device, transport.name
         self.kind = "live topics"
         self._transport, self._options, self._tell = transport, options, tell

@@ -26,7 +26,6 @@ def open_recording(path: Path, options: SourceOptions | None = None) -> Recordin
         MapError: A file of it is missing or damaged.
     """
     options = options or SourceOptions()
-    options.reading.check()
     root = image_root(path)
     if root is not None:
         if options.imu_topic or options.camera_topics:

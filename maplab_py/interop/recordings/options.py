@@ -15,9 +15,9 @@ class ReadingOptions(Options):
 
     image_bits: int = 0
     """Bits of the values of images that are stored in 16: 8 to 16, as 12; 0 = found in the recording"""
-    recording_part: int = 0
+    recording_part: int = option(0, ge=0)
     """Part to read of a recording whose clock starts again, from 1 (see recording_info); 0 = the only one"""
-    max_late_share: float = 0.01
+    max_late_share: float = option(0.01, ge=0, le=1)
     """Share of messages with repeated, late or wild stamps up to which they are left out; more is an error"""
     use_arrival_time: bool = False
     """Take the times at which messages of a bag arrived in place of their stamps"""
@@ -25,18 +25,15 @@ class ReadingOptions(Options):
     """Leave out images of a folder's tables whose files are missing"""
     time_unit: str = time_unit_option()
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: A value is out of range.
         """
+        super().__post_init__()
         if self.image_bits and not 8 <= self.image_bits <= 16:
             raise FlagError(f"--image_bits={self.image_bits}: wants 8 to 16, or 0")
-        if self.recording_part < 0:
-            raise FlagError(f"--recording_part={self.recording_part}: wants a number from 1, or 0")
-        if not 0.0 <= self.max_late_share <= 1.0:
-            raise FlagError(f"--max_late_share={self.max_late_share:g}: wants a number from 0 to 1")
 
 
 class SourceOptions(Options):
@@ -58,14 +55,6 @@ class SourceOptions(Options):
     camera_topics: str = ""
     """Image topics of a bag, separated by commas, in the order of the cameras of the calibration; empty = as
     it says"""
-
-    def check(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range.
-        """
-        self.reading.check()
 
     @property
     def active_cameras(self) -> tuple[int, ...]:
@@ -106,29 +95,22 @@ class SourceOptions(Options):
 class StreamOptions(Options, prefix="vio_"):
     """Part of a recording to read, and the grouping of its images."""
 
-    start_s: float = option(0.0, flag="vio_rosbag_start_s")
+    start_s: float = option(0.0, ge=0, lt=1e9, flag="vio_rosbag_start_s")
     """Skip this much of the recording"""
-    end_s: float = option(0.0, flag="vio_rosbag_end_s")
+    end_s: float = option(0.0, ge=0, lt=1e9, flag="vio_rosbag_end_s")
     """Stop this long after the beginning of the recording; 0 = read to its end"""
-    nframe_sync_tolerance_ns: int = 500_000
+    nframe_sync_tolerance_ns: int = option(500_000, ge=0, lt=1e9)
     """Largest difference between the times of images of one frame set"""
-    imu_gap_s: float = 0.05
+    imu_gap_s: float = option(0.05, ge=0, lt=1e9)
     """Report intervals between IMU samples that are longer than this"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: A value is negative, or the end is not after the start.
         """
-        for flag, value in (
-            ("vio_rosbag_start_s", self.start_s),
-            ("vio_rosbag_end_s", self.end_s),
-            ("vio_nframe_sync_tolerance_ns", self.nframe_sync_tolerance_ns),
-            ("vio_imu_gap_s", self.imu_gap_s),
-        ):
-            if not 0 <= value < 1e9:
-                raise FlagError(f"--{flag}={value:g}: wants a number from 0 to 1e9")
+        super().__post_init__()
         if self.end_s and self.end_s <= self.start_s:
             raise FlagError(
                 f"--vio_rosbag_end_s={self.end_s:g} is not after "

@@ -91,14 +91,9 @@ class EventStream:
     """
 
     def __init__(self, recording: Recording, options: StreamOptions | None = None) -> None:
-        """Prepare a stream.
-
-        Raises:
-            FlagError: An option is wrong.
-        """
+        """Prepare a stream."""
         self._recording = recording
         self._options = options or StreamOptions()
-        self._options.check()
         cameras = len(recording.device.cameras)
         self.statistics = StreamStatistics(
             images=[Times() for _ in range(cameras)], unmatched_images=[0] * cameras

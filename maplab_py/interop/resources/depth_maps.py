@@ -24,7 +24,7 @@ from maplab_py.interop.resources.matching import (
     stamped_files,
 )
 from maplab_py.interop.resources.reports import ImportedResources
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
 from maplab_py.storage.resources.new import NewResources
@@ -41,15 +41,10 @@ _MAX_FILE_BYTES = 200_000_000
 class DepthImportOptions(Options):
     """Conversion of files to depth maps."""
 
-    depth_scale: float = MM_PER_M
+    depth_scale: float = option(MM_PER_M, gt=0)
     """Value of a pixel at a depth of one metre"""
-    image_tolerance_ms: float = 1.0
+    image_tolerance_ms: float = option(1.0, ge=0)
     """Largest difference between the times of depth map and frame"""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.depth_scale <= 0.0 or self.image_tolerance_ms < 0.0:
-            raise ValueError("--depth_scale must be positive, --image_tolerance_ms 0 or greater")
 
 
 def import_depth_maps(

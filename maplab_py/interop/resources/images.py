@@ -20,7 +20,7 @@ from maplab_py.interop.resources.matching import (
     mission_rig,
 )
 from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
@@ -37,18 +37,13 @@ RAW_GREY, RAW_COLOUR = 0, 4
 class ImageImportOptions(Options):
     """Choice of the images of a recording that become resources."""
 
-    image_tolerance_ms: float = 1.0
+    image_tolerance_ms: float = option(1.0, ge=0)
     """Largest difference between the times of image and frame"""
-    every_nth: int = 1
+    every_nth: int = option(1, ge=1)
     """Attach images to every n-th vertex only"""
     link: bool = False
     """Refer to the recording's files by symbolic links instead of copying them: the map then needs the
     recording to stay where it is"""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.image_tolerance_ms < 0.0 or self.every_nth < 1:
-            raise ValueError("--image_tolerance_ms must be 0 or greater, --every_nth 1 or greater")
 
 
 def import_images(

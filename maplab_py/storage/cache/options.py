@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from maplab_py.errors import FlagError
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 
 
 class CacheOptions(Options):
@@ -12,17 +11,5 @@ class CacheOptions(Options):
     map_cache: bool = False
     """Keep the columns of the map in the user's cache folder, and map them into memory from there at the next
     load as long as the files of the map are the same."""
-    map_cache_max_gb: float = 20.0
+    map_cache_max_gb: float = option(20.0, gt=0)
     """Size of the cache of maps; those that were not loaded for the longest time are deleted."""
-
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            FlagError: The size is not a positive number.
-        """
-        if not 0.0 < self.map_cache_max_gb < float("inf"):
-            raise FlagError(
-                f"--map_cache_max_gb={self.map_cache_max_gb:g}: must be a positive number; "
-                "--nomap_cache loads without the cache"
-            )

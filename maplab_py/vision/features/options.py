@@ -14,67 +14,44 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
 
     detector_type: str = option("fast", choices=DETECTORS)
     """Corner test: fast and agast decide alike, fast is faster in this OpenCV"""
-    detector_threshold: int = 20
+    detector_threshold: int = option(20, ge=1, le=255)
     """Smallest contrast of a corner; where a cell has too few corners, a third of it suffices"""
-    detector_max_feature_count: int = 250
+    detector_max_feature_count: int = option(250, ge=1, le=10_000)
     """Largest number of keypoints of an image"""
-    detector_nms_radius: float = option(14.0, unit="px")
+    detector_nms_radius: float = option(14.0, ge=0, le=1000, unit="px")
     """Smallest distance between a new keypoint and stronger or tracked ones"""
-    gridded_detector_num_grid_cols: int = 4
+    gridded_detector_num_grid_cols: int = option(4, ge=1, le=100)
     """Columns of the detection grid"""
-    gridded_detector_num_grid_rows: int = 2
+    gridded_detector_num_grid_rows: int = option(2, ge=1, le=100)
     """Rows of the detection grid"""
-    gridded_detector_cell_num_features_scaler: float = 2.0
+    gridded_detector_cell_num_features_scaler: float = option(2.0, ge=1, le=10_000)
     """Largest number of keypoints of a cell, as a multiple of its equal share of all"""
     min_tracking_distance_to_image_border_px: int = option(
-        20, flag="min_tracking_distance_to_image_border_px"
+        20, ge=4, le=1000, flag="min_tracking_distance_to_image_border_px"
     )
     """Smallest distance of a keypoint to the image border; descriptors need 20"""
     descriptor_type: str = "brisk"
     """Descriptor: brisk (of 64 bytes)"""
-    descriptor_size_px: float = 12.0
+    descriptor_size_px: float = option(12.0, ge=1, le=1000)
     """Diameter of what a descriptor sees, OpenCV's keypoint size"""
     apply_clahe: bool = option(False, flag="rovioli_image_apply_clahe_histogram_equalization")
     """Equalise the contrast of images locally (CLAHE)"""
-    clahe_clip_limit: int = option(2, flag="rovioli_image_clahe_clip_limit")
+    clahe_clip_limit: int = option(2, ge=1, le=100, flag="rovioli_image_clahe_clip_limit")
     """CLAHE: limit of contrast"""
-    clahe_grid_size: int = option(8, flag="rovioli_image_clahe_grid_size")
+    clahe_grid_size: int = option(8, ge=1, le=100, flag="rovioli_image_clahe_grid_size")
     """CLAHE: rows and columns of tiles"""
-    image_resize_factor: float = option(1.0, flag="rovioli_image_resize_factor")
+    image_resize_factor: float = option(1.0, ge=0.05, le=4, flag="rovioli_image_resize_factor")
     """Track in images resized by this factor; keypoints are of the recorded size"""
     image_mask_path: str = option("", flag="rovio_image_mask_path")
     """Image in which black areas are not to be used, or several, by camera, separated by commas"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
             FlagError: A value is out of its range, or the descriptor is not available.
         """
-        self._check_descriptor()
-        prefix = self.flag_prefix
-        for flag, value, low, high in (
-            ("detector_threshold", self.detector_threshold, 1, 255),
-            ("detector_max_feature_count", self.detector_max_feature_count, 1, 10_000),
-            ("detector_nms_radius", self.detector_nms_radius, 0, 1000),
-            ("gridded_detector_num_grid_cols", self.gridded_detector_num_grid_cols, 1, 100),
-            ("gridded_detector_num_grid_rows", self.gridded_detector_num_grid_rows, 1, 100),
-            (
-                "gridded_detector_cell_num_features_scaler",
-                self.gridded_detector_cell_num_features_scaler,
-                1,
-                10_000,
-            ),
-            ("descriptor_size_px", self.descriptor_size_px, 1, 1000),
-        ):
-            check_range(prefix + flag, value, low, high)
-        border = self.min_tracking_distance_to_image_border_px
-        check_range("min_tracking_distance_to_image_border_px", border, 4, 1000)
-        check_range("rovioli_image_clahe_clip_limit", self.clahe_clip_limit, 1, 100)
-        check_range("rovioli_image_clahe_grid_size", self.clahe_grid_size, 1, 100)
-        check_range("rovioli_image_resize_factor", self.image_resize_factor, 0.05, 4)
-
-    def _check_descriptor(self) -> None:
+        super().__post_init__()
         if self.detector_type not in DETECTORS:
             raise FlagError(
                 f"--{self.flag_prefix}detector_type={self.detector_type}: wants one of "
@@ -89,13 +66,3 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
             raise FlagError(
                 f"--{self.flag_prefix}descriptor_type={self.descriptor_type}: wants brisk"
             )
-
-
-def check_range(flag: str, value: float, low: float, high: float) -> None:
-    """Check that the value of a flag lies between two numbers.
-
-    Raises:
-        FlagError: It does not.
-    """
-    if not low <= value <= high:
-        raise FlagError(f"--{flag}={value:g}: wants a number from {low:g} to {high:g}")

@@ -66,11 +66,9 @@ class FrameTracker:
             options: Parameters.
 
         Raises:
-            FlagError: An option is wrong.
             UserError: A mask cannot be used.
         """
         self._options = options or TrackingOptions()
-        self._options.check()
         poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)
         self._views = tuple(
             CameraView.of(camera, row, poses[row], self._options)

@@ -15,7 +15,7 @@ from maplab_py.algorithms.loop_closure.listing import find_closures, list_closur
 from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
-from maplab_py.errors import UserError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
@@ -105,7 +105,7 @@ def test_maps_without_clouds_or_pairs() -> None:
         close_cloud_loops(vi_map, Path(), dataclasses.replace(OPTIONS, from_closures=True))
     late = dataclasses.replace(OPTIONS, min_time_gap_s=100.0, sequence_gap_s=0.0)
     assert "--lidar_lc_min_time_gap_s" in close_cloud_loops(vi_map, Path(), late)[1].failure
-    with pytest.raises(ValueError, match="exclude each other"):
+    with pytest.raises(FlagError, match="exclude each other"):
         CloudClosureOptions(search_globally=True, from_closures=True)
 
 

@@ -19,7 +19,7 @@ from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
 from maplab_py.algorithms.dense.options import DistanceOptions
 from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.array_types import F64
-from maplab_py.errors import EstimationError, MapError
+from maplab_py.errors import EstimationError, FlagError, MapError
 from maplab_py.memory import NotEnoughMemory, memory_limited
 from tests.algorithms.dense.test_triangle_tree import to_every_triangle
 
@@ -217,7 +217,7 @@ def test_a_grid_without_a_surface_and_too_little_memory() -> None:
 
 
 def test_wrong_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="max_distance_m must be positive"):
+    with pytest.raises(FlagError, match="max_distance_m=0: must be above 0"):
         DistanceOptions(max_distance_m=0.0)
-    with pytest.raises(ValueError, match="inner_radius"):
+    with pytest.raises(FlagError, match="inner_radius"):
         DistanceOptions(clear_sphere_inner_radius=2.0)

@@ -87,4 +87,4 @@ def test_the_spread_is_the_standard_error_of_the_mean_of_parts(
 )
 def test_flags_without_meaning_are_named(field: str, value: Any) -> None:
     with pytest.raises(UserError, match=f"--sc_{field}"):
-        dataclasses.replace(OPTIONS, **{field: value}).checked()
+        dataclasses.replace(OPTIONS, **{field: value})

@@ -191,7 +191,7 @@ def test_options_out_of_their_range_are_refused(device: RecordedSensors) -> None
     with pytest.raises(UserError, match="--ros_domain_id=300: a domain is a number from 0 to 232"):
         _ = NetworkOptions(ros_domain_id=300).domain
     with pytest.raises(UserError, match="--live_wait_s=0"):
-        NetworkOptions(live_wait_s=0.0).check()
+        NetworkOptions(live_wait_s=0.0)
 
 
 def test_the_domain_is_that_of_the_environment(

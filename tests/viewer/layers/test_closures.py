@@ -14,6 +14,7 @@ from maplab_py.algorithms.loop_closure.listing import list_closures, near_miss_o
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import close_loops
+from maplab_py.errors import FlagError
 from maplab_py.storage.extension_fields import with_extension
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
@@ -159,5 +160,5 @@ def test_the_best_refused_closures_are_drawn(closed: VIMap) -> None:
     "flags", [{"max_refused_closures": -1}, {"refused_closures_reason": "weather"}]
 )
 def test_bad_restrictions_are_refused(flags: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=f"--vis_{next(iter(flags))}"):
+    with pytest.raises(FlagError, match=f"--vis_{next(iter(flags))}"):
         VisualizationOptions(**flags)  # type: ignore[arg-type]

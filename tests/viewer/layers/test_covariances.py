@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from maplab_py.errors import FlagError
 from maplab_py.geometry import se3, so3
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.layers import covariances
@@ -110,7 +111,7 @@ def test_layers_are_there_only_when_asked_for() -> None:
     layer = build_scene(Subject(vi_map, options=options)).layer(LOOP_CLOSURES)
     assert (layer.entity, layer.is_visible) == (Entity.LOOP_CLOSURE, True)
     assert layer.total == len(vi_map.loop_closure_edges)
-    with pytest.raises(ValueError, match="--vis_covariance_scale=0: must be greater than 0"):
+    with pytest.raises(FlagError, match="--vis_covariance_scale=0: must be above 0"):
         VisualizationOptions(covariance_scale=0.0)
 
 

@@ -96,7 +96,7 @@ def test_images_that_are_refused(image: np.ndarray) -> None:
 
 def test_freak_is_refused_in_a_line() -> None:
     with pytest.raises(FlagError, match="feature_tracking_descriptor_type=freak: FREAK is not in"):
-        FeatureOptions(descriptor_type="freak").check()
+        FeatureOptions(descriptor_type="freak")
 
 
 @pytest.mark.parametrize(
@@ -114,5 +114,5 @@ def test_freak_is_refused_in_a_line() -> None:
 )
 def test_wrong_options_name_their_flag(name: str, value: object, flag: str) -> None:
     with pytest.raises(FlagError) as caught:
-        dataclasses.replace(FeatureOptions(), **{name: value}).check()
+        dataclasses.replace(FeatureOptions(), **{name: value})
     assert flag in str(caught.value)
