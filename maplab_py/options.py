@@ -79,23 +79,24 @@ class Options:
             FlagError: A value is out of its range.
         """
         for field in dataclasses.fields(self):
-            bounds = field.metadata.get("bounds")
-            if bounds and not _is_within(value := getattr(self, field.name), bounds):
+            value = getattr(self, field.name)
+            if said := violation(value, field.metadata.get("bounds", {})):
                 name = field.metadata["flag"] or self.flag_prefix + field.name
-                words = [f"{words} {bound:g}" for words, bound in bounds.items()]
-                words += ["finite"] if math.isinf(value) else []
-                raise FlagError(f"--{name}={value:g}: must be {' and '.join(words)}")
+                raise FlagError(f"--{name}={value:g}: {said}")
 
 
-def _is_within(value: float, bounds: Mapping[str, float]) -> bool:
-    """Tell whether a value is finite and keeps all bounds."""
-    return (
+def violation(value: Any, bounds: Mapping[str, float]) -> str:
+    """Return what a value must be ("must be above 0"); empty if it is finite and keeps its bounds."""
+    if not bounds or (
         math.isfinite(value)
         and value > bounds.get("above", -math.inf)
         and value >= bounds.get("at least", -math.inf)
         and value <= bounds.get("at most", math.inf)
         and value < bounds.get("below", math.inf)
-    )
+    ):
+        return ""
+    words = [f"{words} {bound:g}" for words, bound in bounds.items()]
+    return f"must be {' and '.join(words + ['finite'] * math.isinf(value))}"
 
 
 def unit_of(field: dataclasses.Field[Any]) -> str:

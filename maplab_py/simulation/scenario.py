@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from maplab_py.options import option
+
 PATH_KINDS = ("room_scan", "figure_8", "loop", "corridor", "vehicle", "streets")
 """Motions along a path of the world; other motions start at the current pose."""
 MOTION_KINDS = (*PATH_KINDS, "straight", "rotation", "stationary", "hover", "shake")
@@ -14,10 +16,10 @@ LAYOUTS = ("rooms", "corridor", "city")
 class Seeds:
     """Independent seeds: a change of one does not affect the results of the others."""
 
-    world: int = 1
-    motion: int = 1
-    measurement: int = 1
-    appearance: int = 1
+    world: int = option(1, ge=0)
+    motion: int = option(1, ge=0)
+    measurement: int = option(1, ge=0)
+    appearance: int = option(1, ge=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,40 +32,40 @@ class WorldOptions:
     """
 
     layout: str = "rooms"  # or corridor, city
-    rooms: int = 1
+    rooms: int = option(1, gt=0)
     corridor_rooms: tuple[int, ...] = ()  # are corridors with an appearance of their own
-    floors: int = 1  # of a corridor
+    floors: int = option(1, gt=0)  # of a corridor
     blocks: tuple[int, int] = (3, 2)  # columns and rows of a city
     room_size_m: tuple[float, float, float] = (10.0, 8.0, 3.5)  # corridor: of a floor; city: block
-    corridor_width_m: float = 2.5  # city: of the streets
-    landmarks_per_room: int = 2500  # corridor: per floor; city: per block
-    furniture_per_room: int = 4
-    patchiness: float = 0.6  # 0 = even density, 1 = all landmarks in clusters
-    bare_share: float = 0.0  # of the surfaces: carry a tenth of the landmarks that others do
+    corridor_width_m: float = option(2.5, gt=0)  # city: of the streets
+    landmarks_per_room: int = option(2500, gt=0)  # corridor: per floor; city: per block
+    furniture_per_room: int = option(4, ge=0)
+    patchiness: float = option(0.6, ge=0, le=1)  # 0 = even density, 1 = all landmarks in clusters
+    bare_share: float = option(0.0, ge=0, le=1)  # of the surfaces: carry a tenth of the landmarks
     identical_rooms: bool = False  # all rooms but corridor_rooms have the same appearance
     identical_floors: bool = False  # all floors of a corridor have the same appearance
-    distinct_share: float = 0.03  # share of landmarks that distinguish a room from the others
-    moving_objects: int = 0
-    landmarks_per_object: int = 60
-    object_speed_mps: float = 0.5
+    distinct_share: float = option(0.03, ge=0, le=1)  # of landmarks: distinguish a room from others
+    moving_objects: int = option(0, ge=0)
+    landmarks_per_object: int = option(60, gt=0)
+    object_speed_mps: float = option(0.5, gt=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class ImuOptions:
     """IMU model of Schneider 2019, section 7."""
 
-    rate_hz: float = 200.0
-    gyro_noise_density: float = 1.7e-4  # [rad/s/sqrt(Hz)]
-    accel_noise_density: float = 2.0e-3  # [m/s^2/sqrt(Hz)]
-    gyro_bias_walk: float = 2.0e-5  # [rad/s^2/sqrt(Hz)]
-    accel_bias_walk: float = 1.0e-3  # [m/s^3/sqrt(Hz)]
-    gyro_bias_sigma: float = 0.01  # initial [rad/s]
-    accel_bias_sigma: float = 0.1  # initial [m/s^2]
-    gravity_mps2: float = 9.81
-    saturation_accel_mps2: float = 150.0
-    saturation_gyro_radps: float = 7.5
-    dropped_share: float = 0.0  # of the samples
-    time_jitter_s: float = 0.0  # standard deviation of the time stamps
+    rate_hz: float = option(200.0, gt=0)
+    gyro_noise_density: float = option(1.7e-4, ge=0)  # [rad/s/sqrt(Hz)]
+    accel_noise_density: float = option(2.0e-3, ge=0)  # [m/s^2/sqrt(Hz)]
+    gyro_bias_walk: float = option(2.0e-5, ge=0)  # [rad/s^2/sqrt(Hz)]
+    accel_bias_walk: float = option(1.0e-3, ge=0)  # [m/s^3/sqrt(Hz)]
+    gyro_bias_sigma: float = option(0.01, ge=0)  # initial [rad/s]
+    accel_bias_sigma: float = option(0.1, ge=0)  # initial [m/s^2]
+    gravity_mps2: float = option(9.81, gt=0)
+    saturation_accel_mps2: float = option(150.0, gt=0)
+    saturation_gyro_radps: float = option(7.5, gt=0)
+    dropped_share: float = option(0.0, ge=0, le=1)  # of the samples
+    time_jitter_s: float = option(0.0, ge=0)  # standard deviation of the time stamps
     gyro_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     accel_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gyro_misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)  # T_g [01, 02, 12]
@@ -73,8 +75,8 @@ class ImuOptions:
     g_sensitivity: float = 0.0  # of the gyroscope, along each axis [rad/s per m/s^2]
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the accelerometer, in I
     warming_scale: float = 0.0  # by which both scales grow while the device warms up
-    warming_time_s: float = 120.0
-    time_offset_s: float = 0.0  # IMU time stamps are late by this against the cameras'
+    warming_time_s: float = option(120.0, gt=0)
+    time_offset_s: float = option(0.0, ge=-0.05, le=0.05)  # by which IMU stamps are late
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +88,8 @@ class CameraOptions:
     distortion: str = "radial-tangential"
     intrinsics: tuple[float, ...] = (380.0, 380.0, 376.0, 240.0)
     distortion_parameters: tuple[float, ...] = (-0.28, 0.07, 2e-4, 2e-5)
-    width_px: int = 752
-    height_px: int = 480
+    width_px: int = option(752, ge=16)
+    height_px: int = option(480, ge=16)
     position_m: tuple[float, float, float] = (0.05, 0.02, 0.01)  # of C in I
     turn_rad: tuple[float, float, float] = (0.01, -0.02, 0.015)  # rotation vector, in I
     line_delay_s: float = 0.0  # between two rows of a rolling shutter; 0 = global shutter
@@ -97,49 +99,49 @@ class CameraOptions:
 class MeasurementOptions:
     """Visibility, detection and tracking of landmarks."""
 
-    frame_rate_hz: float = 10.0
-    keypoint_sigma_px: float = 0.8  # in the lowest octave
-    octaves: int = 1  # of the image pyramid; sigma grows by 1.4 with each
-    max_keypoints: int = 500  # with landmark, per frame
-    min_distance_m: float = 0.4
-    max_distance_m: float = 12.0
-    max_view_angle_deg: float = 65.0
-    detection_probability: float = 0.9
-    track_break_probability: float = 0.02  # per frame
-    identity_swap_share: float = 0.03  # of tracks
-    track_drift_share: float = 0.0  # of tracks: slide off their point
-    track_drift_px: float = 0.5  # per frame, a random walk
-    clutter_share: float = 0.2  # of keypoints, without landmark
-    min_track_length: int = 3
+    frame_rate_hz: float = option(10.0, gt=0)
+    keypoint_sigma_px: float = option(0.8, ge=0)  # in the lowest octave
+    octaves: int = option(1, gt=0)  # of the image pyramid; sigma grows by 1.4 with each
+    max_keypoints: int = option(500, gt=0)  # with landmark, per frame
+    min_distance_m: float = option(0.4, ge=0)
+    max_distance_m: float = option(12.0, gt=0)
+    max_view_angle_deg: float = option(65.0, gt=0, le=90)
+    detection_probability: float = option(0.9, ge=0, le=1)
+    track_break_probability: float = option(0.02, ge=0, le=1)  # per frame
+    identity_swap_share: float = option(0.03, ge=0, le=1)  # of tracks
+    track_drift_share: float = option(0.0, ge=0, le=1)  # of tracks: slide off their point
+    track_drift_px: float = option(0.5, ge=0)  # per frame, a random walk
+    clutter_share: float = option(0.2, ge=0, le=0.9)  # of keypoints, without landmark
+    min_track_length: int = option(3, ge=2)
 
 
 @dataclasses.dataclass(frozen=True)
 class AppearanceOptions:
     """Binary descriptors: signs of correlated activations that move with the viewpoint."""
 
-    descriptor_bytes: int = 48
-    latent_dimensions: int = 24
-    bit_bias: float = 0.45  # how unequal the bits' thresholds are
-    bit_noise: float = 0.3  # of an activation, per observation; the median
-    bit_noise_spread: float = 0.9  # of its logarithm over observations
-    viewpoint_change: float = 0.45  # per unit of view direction
-    scale_change: float = 0.25  # per doubling of the distance
-    session_change: float = 0.25  # persistent, per session
-    vanish_share: float = 0.3  # landmarks that are not there in a session
+    descriptor_bytes: int = option(48, gt=0)
+    latent_dimensions: int = option(24, gt=0)
+    bit_bias: float = option(0.45, ge=0)  # how unequal the bits' thresholds are
+    bit_noise: float = option(0.3, ge=0)  # of an activation, per observation; the median
+    bit_noise_spread: float = option(0.9, ge=0)  # of its logarithm over observations
+    viewpoint_change: float = option(0.45, ge=0)  # per unit of view direction
+    scale_change: float = option(0.25, ge=0)  # per doubling of the distance
+    session_change: float = option(0.25, ge=0)  # persistent, per session
+    vanish_share: float = option(0.3, ge=0, le=1)  # landmarks that are not there in a session
 
 
 @dataclasses.dataclass(frozen=True)
 class DriftOptions:
     """Drift of the visual-inertial odometry."""
 
-    position_walk: float = 0.01  # [m/sqrt(s)]
-    yaw_walk_deg: float = 0.25  # [deg/sqrt(s)]
-    tilt_sigma_deg: float = 0.2
-    scale_sigma: float = 0.01
-    velocity_sigma: float = 0.03  # [m/s]
-    gyro_bias_sigma: float = 5e-4  # [rad/s]
-    accel_bias_sigma: float = 0.01  # [m/s^2]
-    baseframe_offset_m: float = 5.0  # the stored T_G_M is arbitrary
+    position_walk: float = option(0.01, ge=0)  # [m/sqrt(s)]
+    yaw_walk_deg: float = option(0.25, ge=0)  # [deg/sqrt(s)]
+    tilt_sigma_deg: float = option(0.2, ge=0)
+    scale_sigma: float = option(0.01, ge=0)
+    velocity_sigma: float = option(0.03, ge=0)  # [m/s]
+    gyro_bias_sigma: float = option(5e-4, ge=0)  # [rad/s]
+    accel_bias_sigma: float = option(0.01, ge=0)  # [m/s^2]
+    baseframe_offset_m: float = option(5.0, ge=0)  # the stored T_G_M is arbitrary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,56 +151,56 @@ class CalibrationOptions:
     `imu` and `cameras` of the scenario are the calibration in the maps. Deviations are drawn per device.
     """
 
-    focal_sigma_px: float = 0.0
-    centre_sigma_px: float = 0.0
-    distortion_sigma: float = 0.0  # of every distortion parameter
-    camera_rotation_sigma_deg: float = 0.0
-    camera_position_sigma_m: float = 0.0
-    gyro_scale_sigma: float = 0.0
-    accel_scale_sigma: float = 0.0
-    gyro_misalignment_sigma: float = 0.0
-    accel_misalignment_sigma: float = 0.0
-    accel_rotation_sigma_deg: float = 0.0
-    session_share: float = 0.0  # share of all of these that is drawn for every session
-    imu_noise_factor: float = 1.0  # noise densities in the map / true ones
-    keypoint_noise_factor: float = 1.0  # keypoint sigma in the map / true one
+    focal_sigma_px: float = option(0.0, ge=0)
+    centre_sigma_px: float = option(0.0, ge=0)
+    distortion_sigma: float = option(0.0, ge=0)  # of every distortion parameter
+    camera_rotation_sigma_deg: float = option(0.0, ge=0)
+    camera_position_sigma_m: float = option(0.0, ge=0)
+    gyro_scale_sigma: float = option(0.0, ge=0)
+    accel_scale_sigma: float = option(0.0, ge=0)
+    gyro_misalignment_sigma: float = option(0.0, ge=0)
+    accel_misalignment_sigma: float = option(0.0, ge=0)
+    accel_rotation_sigma_deg: float = option(0.0, ge=0)
+    session_share: float = option(0.0, ge=0)  # of all these: drawn for every session
+    imu_noise_factor: float = option(1.0, gt=0)  # noise densities in the map / true ones
+    keypoint_noise_factor: float = option(1.0, gt=0)  # keypoint sigma in the map / true one
 
 
 @dataclasses.dataclass(frozen=True)
 class OtherSensorOptions:
     """Other sensors than cameras and IMU; errors are white with the stated covariances."""
 
-    absolute_pose_every_s: float = 0.0  # 0 = none; of S in the frame of the world
-    absolute_pose_sigma_m: float = 0.05
-    absolute_pose_sigma_deg: float = 0.5
+    absolute_pose_every_s: float = option(0.0, ge=0)  # 0 = none; of S in the frame of the world
+    absolute_pose_sigma_m: float = option(0.05, gt=0)
+    absolute_pose_sigma_deg: float = option(0.5, gt=0)
     odometry: bool = False  # an edge of S between neighbouring vertices
     wheel_odometry: bool = False  # likewise of the wheels; raw data have their velocities
-    odometry_sigma_m: float = 0.005  # per edge, both kinds
-    odometry_sigma_deg: float = 0.05
-    wheel_scale: float = 1.0  # of the distance that the wheels report; not stated in the map
+    odometry_sigma_m: float = option(0.005, gt=0)  # per edge, both kinds
+    odometry_sigma_deg: float = option(0.05, gt=0)
+    wheel_scale: float = option(1.0, gt=0)  # of the reported distance; not in the map
     wheel_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the wheel sensor in I
     wheel_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rotation vector, in I
     sensor_position_m: tuple[float, float, float] = (0.1, 0.0, 0.2)  # of S in I
     sensor_turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
-    loop_edges: int = 0  # per session
-    loop_edge_false_share: float = 0.0
-    loop_edge_sigma_m: float = 0.03
-    loop_edge_sigma_deg: float = 0.5
-    loop_edge_min_gap_s: float = 15.0
-    loop_edge_max_distance_m: float = 2.0  # false edges join places twice as far apart or more
+    loop_edges: int = option(0, ge=0)  # per session
+    loop_edge_false_share: float = option(0.0, ge=0, le=1)
+    loop_edge_sigma_m: float = option(0.03, gt=0)
+    loop_edge_sigma_deg: float = option(0.5, gt=0)
+    loop_edge_min_gap_s: float = option(15.0, ge=0)
+    loop_edge_max_distance_m: float = option(2.0, gt=0)  # of false ones: twice this or more
 
 
 @dataclasses.dataclass(frozen=True)
 class LidarOptions:
     """A spinning lidar. Its clouds are of one moment each: motion during a turn is compensated."""
 
-    rate_hz: float = 0.0  # clouds per second; 0 = no lidar
-    rings: int = 16
-    columns: int = 900  # per turn
-    lowest_deg: float = -22.5  # elevation of the lowest ring
-    highest_deg: float = 22.5
-    range_sigma_m: float = 0.01
-    min_range_m: float = 0.3
+    rate_hz: float = option(0.0, ge=0)  # clouds per second; 0 = no lidar
+    rings: int = option(16, ge=2)
+    columns: int = option(900, ge=16)  # per turn
+    lowest_deg: float = option(-22.5, ge=-80)  # elevation of the lowest ring
+    highest_deg: float = option(22.5, le=80)
+    range_sigma_m: float = option(0.01, ge=0)
+    min_range_m: float = option(0.3, ge=0)
     max_range_m: float = 30.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.15)  # of the lidar in I
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.3)  # rotation vector, in I
@@ -210,13 +212,13 @@ class ImageOptions:
 
     render: bool = False
     depth: bool = True  # beside the truth
-    texel_m: float = 0.005  # of the finest texture
-    bare_share: float = 0.0  # of the surfaces: a hundredth of the shapes that others have
-    exposure_s: float = 0.004
-    blur_samples: int = 3  # moments within the exposure; 1 = no motion blur
-    gain_swing: float = 0.15  # by which brightness comes and goes
-    vignette: float = 0.3  # that the corners are darker
-    noise_sigma: float = 2.0  # grey values of 255
+    texel_m: float = option(0.005, gt=0)  # of the finest texture
+    bare_share: float = option(0.0, ge=0, le=1)  # of the surfaces: a hundredth of the shapes
+    exposure_s: float = option(0.004, ge=0)
+    blur_samples: int = option(3, gt=0)  # moments within the exposure; 1 = no motion blur
+    gain_swing: float = option(0.15, ge=0, le=1)  # by which brightness comes and goes
+    vignette: float = option(0.3, ge=0, le=1)  # that the corners are darker
+    noise_sigma: float = option(2.0, ge=0)  # grey values of 255
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,10 +237,7 @@ class MotionOptions:
     start_turn: float = 0.0  # counted from where the last piece of the same kind ended
     reverse: bool = False
     room: int = 0  # of room_scan and figure_8
-    first_block: tuple[int, int] = (
-        0,
-        0,
-    )  # of streets: column and row at the rectangle's low corner
+    first_block: tuple[int, int] = (0, 0)  # of streets: column and row at its low corner
     last_block: tuple[int, int] = (0, 0)  # and at its high corner
     height_m: float = 1.5
     height_swing_m: float = 0.2
@@ -246,7 +245,7 @@ class MotionOptions:
     look_around_rad: float = 0.3
     shake_m: float = 0.03
     shake_rad: float = 0.06
-    shake_hz: float = 1.0
+    shake_hz: float = option(1.0, gt=0)
     speed_mps: float = 0.4  # of straight
 
 
@@ -254,10 +253,10 @@ class MotionOptions:
 class SessionImages:
     """Properties of a session's rendered images."""
 
-    light: float = 1.0  # by which grey values are multiplied
-    gain_jump: float = 0.0  # the gain of the cameras jumps to values within 1 -+ gain_jump
-    gain_jump_every_s: float = 0.0  # mean time between the jumps; 0 = none
-    repainted_share: float = 0.0  # of the surfaces' area looks different
+    light: float = option(1.0, gt=0)  # by which grey values are multiplied
+    gain_jump: float = option(0.0, ge=0, lt=1)  # cameras jump to gains within 1 -+ gain_jump
+    gain_jump_every_s: float = option(0.0, ge=0)  # mean time between the jumps; 0 = none
+    repainted_share: float = option(0.0, ge=0, le=1)  # of the surfaces' area looks different
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,10 +265,10 @@ class SessionOptions(MotionOptions):
 
     phases: tuple[MotionOptions, ...] = ()  # where there are any, they are the motion
     trajectory: str = ""  # EuRoC or TUM file; where there is one, it is the motion
-    trajectory_start_s: float = 0.0  # of the part that is used, counted from the begin of the file
+    trajectory_start_s: float = option(0.0, ge=0)  # of the part used, from the start of the file
     keep_frame: bool = False  # trajectories that do are placed together, not each by itself
     recorded_imu: str = ""  # EuRoC file with the IMU samples of the trajectory; empty = simulated
-    device: int = 0  # devices of other numbers have other deviations and ids
+    device: int = option(0, ge=0)  # devices of other numbers have other deviations and ids
     images: SessionImages = SessionImages()
 
     @property

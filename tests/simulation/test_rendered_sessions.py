@@ -259,14 +259,14 @@ def test_the_dark_flight_is_dark() -> None:
 @pytest.mark.parametrize(
     ("session", "message"),
     [
-        ("images: {light: 0}", r"sessions\[0\].images.light: must be greater than 0"),
-        ("images: {repainted_share: 2}", "repainted_share: must be between 0 and 1"),
-        ("images: {gain_jump: 1}", "gain_jump: must be less than 1"),
-        ("images: {gain_jump_every_s: -1}", "gain_jump_every_s: must be 0 or greater"),
+        ("images: {light: 0}", r"sessions\[0\].images.light: must be above 0"),
+        ("images: {repainted_share: 2}", "repainted_share: must be at least 0 and at most 1"),
+        ("images: {gain_jump: 1}", "gain_jump: must be at least 0 and below 1"),
+        ("images: {gain_jump_every_s: -1}", "gain_jump_every_s: must be at least 0"),
         ("images: {dark: 1}", "images.dark: unknown key"),
         ("recorded_imu: imu.csv", "recorded_imu: is of a trajectory"),
         ("keep_frame: true", "keep_frame: is of a trajectory"),
-        ("trajectory_start_s: -1", "trajectory_start_s: must be 0 or greater"),
+        ("trajectory_start_s: -1", "trajectory_start_s: must be at least 0"),
     ],
 )
 def test_mistakes_in_sessions_are_named(session: str, message: str) -> None:
@@ -276,7 +276,7 @@ def test_mistakes_in_sessions_are_named(session: str, message: str) -> None:
 
 
 def test_bare_share_is_a_share() -> None:
-    with pytest.raises(UserError, match=r"images\.bare_share: must be between 0 and 1"):
+    with pytest.raises(UserError, match=r"images\.bare_share: must be at least 0 and at most 1"):
         parse_scenario("images: {bare_share: 2}", "mine.yaml")
 
 
