@@ -11,10 +11,6 @@ from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.plugin import CommandContext, command
 
-_ANCHORING = AnchoringOptions()
-_ABSOLUTE = AbsoluteAnchoringOptions()
-_LOOPS = LoopClosureOptions()
-
 
 @command(
     "anchor_all_missions",
@@ -25,9 +21,9 @@ _LOOPS = LoopClosureOptions()
 def anchor_all_missions(
     context: CommandContext,
     *,
-    options: AnchoringOptions = _ANCHORING,
-    absolute_options: AbsoluteAnchoringOptions = _ABSOLUTE,
-    loop_options: LoopClosureOptions = _LOOPS,
+    options: AnchoringOptions = AnchoringOptions(),
+    absolute_options: AbsoluteAnchoringOptions = AbsoluteAnchoringOptions(),
+    loop_options: LoopClosureOptions = LoopClosureOptions(),
 ) -> AnchoringReport:
     """Anchor every mission of unknown base frame to the known ones, directly or through other missions.
 
@@ -51,9 +47,9 @@ def anchor_all_missions(
 def anchor_mission(
     context: CommandContext,
     *,
-    options: AnchoringOptions = _ANCHORING,
-    absolute_options: AbsoluteAnchoringOptions = _ABSOLUTE,
-    loop_options: LoopClosureOptions = _LOOPS,
+    options: AnchoringOptions = AnchoringOptions(),
+    absolute_options: AbsoluteAnchoringOptions = AbsoluteAnchoringOptions(),
+    loop_options: LoopClosureOptions = LoopClosureOptions(),
     map_mission: str = "",
     to: str = "",
     T_G_M: str = "",

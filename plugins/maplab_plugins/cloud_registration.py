@@ -7,8 +7,6 @@ from pathlib import Path
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
-_OPTIONS = CloudClosureOptions()
-
 
 @command(
     "register_point_clouds",
@@ -20,7 +18,7 @@ def register_point_clouds(
     context: CommandContext,
     *,
     missions: MissionChoice = ALL_MISSIONS,
-    options: CloudClosureOptions = _OPTIONS,
+    options: CloudClosureOptions = CloudClosureOptions(),
 ) -> CloudClosureReport:
     """Register clouds of sensors with one another and add the relative poses as loop closure edges.
 

@@ -12,9 +12,6 @@ from maplab_py.interop.colmap.options import (
 )
 from maplab_py.plugin import CommandContext, UserError, command, key_of_folder
 
-_EXPORT = ColmapExportOptions()
-_IMPORT = ColmapImportOptions()
-
 
 @command(
     "export_colmap",
@@ -27,7 +24,7 @@ def export_colmap(
     colmap_folder: Path | None = None,
     *,
     missions: str = "",
-    options: ColmapExportOptions = _EXPORT,
+    options: ColmapExportOptions = ColmapExportOptions(),
     overwrite: bool = False,
 ) -> ColmapExportReport:
     """Write missions as a COLMAP model: cameras, rigs, frames, images, points.
@@ -63,7 +60,7 @@ def import_colmap(
     colmap_folder: Path | None = None,
     *,
     database: Path | None = None,
-    options: ColmapImportOptions = _IMPORT,
+    options: ColmapImportOptions = ColmapImportOptions(),
     map_key: str = "",
 ) -> ColmapImportReport:
     """Make a map of a COLMAP model: a mission of each rig, with odometry edges and landmarks, without IMU.

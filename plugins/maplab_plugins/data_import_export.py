@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from maplab_py.interop.recordings.summary import RecordingReport
     from maplab_py.vision.projection import DescriptorProjection
 
-_SOURCE = SourceOptions()
-_STREAM = StreamOptions()
 _ONLY_VERTICES = CsvExportOptions(
     imu_data=False,
     tracks_and_keypoints=False,
@@ -41,7 +39,7 @@ def csv_export(
     context: CommandContext,
     csv_export_path: Path | None = None,
     *,
-    options: CsvExportOptions = CsvExportOptions(),  # noqa: B008
+    options: CsvExportOptions = CsvExportOptions(),
     export_projected_descriptor: bool = False,
     lc_projection_matrix_filename: str = "",
     map_mission: str = "",
@@ -251,8 +249,8 @@ def recording_info(
     context: CommandContext,
     recording: Path,
     *,
-    source: SourceOptions = _SOURCE,
-    stream: StreamOptions = _STREAM,
+    source: SourceOptions = SourceOptions(),
+    stream: StreamOptions = StreamOptions(),
     check_images: bool = False,
 ) -> RecordingReport:
     """Show what is in a recording: rates, durations, gaps, and what would be left out.
@@ -287,8 +285,8 @@ def check_recording(
     context: CommandContext,
     recording: Path,
     *,
-    source: SourceOptions = _SOURCE,
-    stream: StreamOptions = _STREAM,
+    source: SourceOptions = SourceOptions(),
+    stream: StreamOptions = StreamOptions(),
     apply: Path | None = None,
     overwrite: bool = False,
 ) -> RecordingCheck:

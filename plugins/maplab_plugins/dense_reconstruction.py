@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from maplab_py.algorithms.dense.reconstruction import StereoReport
 
 _STEREO, _SGBM, _BM = StereoOptions(), SgbmOptions(), BmOptions()
-_FUSION = FusionOptions()
-_DISTANCE = DistanceOptions()
 
 
 @command(
@@ -78,7 +76,6 @@ def stereo_dense_reconstruction(
 
 @command(
     "convert_all_depth_maps_to_point_clouds",
-    example="convert_all_depth_maps_to_point_clouds",
     see_also=("stereo_dense_reconstruction", "visualize_xyzrgbn_pointclouds"),
 )
 def convert_all_depth_maps_to_point_clouds(context: CommandContext) -> ConvertedDepthMaps:
@@ -108,7 +105,7 @@ def create_tsdf_from_depth_resource(
     *,
     missions: MissionChoice = ALL_MISSIONS,
     dense_depth_resource_input_type: str = "",
-    options: FusionOptions = _FUSION,
+    options: FusionOptions = FusionOptions(),
     update: bool = False,
     dense_update_threshold_m: float = 0.01,
     dense_max_memory_gb: float = 0.0,
@@ -182,8 +179,8 @@ def create_esdf_from_depth_resource(
     *,
     missions: MissionChoice = ALL_MISSIONS,
     dense_depth_resource_input_type: str = "",
-    options: DistanceOptions = _DISTANCE,
-    fusion: FusionOptions = _FUSION,
+    options: DistanceOptions = DistanceOptions(),
+    fusion: FusionOptions = FusionOptions(),
     dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
     dense_max_memory_gb: float = 0.0,
     overwrite: bool = False,

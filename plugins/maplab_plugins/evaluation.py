@@ -29,7 +29,7 @@ def evaluate_trajectory(
     context: CommandContext,
     ground_truth: Path,
     *,
-    options: TrajectoryEvaluationOptions = TrajectoryEvaluationOptions(),  # noqa: B008
+    options: TrajectoryEvaluationOptions = TrajectoryEvaluationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
     baseline: str = "",
 ) -> TrajectoryEvaluationReport:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from maplab_py.sensors import Imu
 
 _TRAJECTORY, _GPS, _WHEELS = TrajectoryOptions(), GpsOptions(), WheelOptions()
-_DEVICE = DeviceOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +102,7 @@ def import_calibration(
     calibration_file: Path,
     *,
     imu_calibration_file: Path | None = None,
-    device: DeviceOptions = _DEVICE,
+    device: DeviceOptions = DeviceOptions(),
     sensors_file: Path | None = None,
     apply: bool = False,
     apply_imu_noise: bool = True,

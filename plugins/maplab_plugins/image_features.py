@@ -11,9 +11,6 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, comman
 if TYPE_CHECKING:
     from maplab_py.algorithms.image_features.options import ExtractionReport, FeatureTrackReport
 
-_EXTRACTION = ExtractionOptions()
-_TRACKS = FeatureTrackOptions()
-
 
 @command(
     "extract_features",
@@ -23,7 +20,7 @@ _TRACKS = FeatureTrackOptions()
 def extract_features(
     context: CommandContext,
     *,
-    options: ExtractionOptions = _EXTRACTION,
+    options: ExtractionOptions = ExtractionOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> ExtractionReport:
     """Compute keypoints and descriptors from the images that the map has as resources.
@@ -52,7 +49,7 @@ def extract_features(
 def track_features(
     context: CommandContext,
     *,
-    options: FeatureTrackOptions = _TRACKS,
+    options: FeatureTrackOptions = FeatureTrackOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> FeatureTrackReport:
     """Link keypoints without track between neighbouring frames, on epipolar lines of the map's poses.

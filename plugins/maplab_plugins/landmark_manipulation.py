@@ -16,15 +16,12 @@ if TYPE_CHECKING:
         TrackReport,
     )
 
-_QUALITY = LandmarkQualityOptions()
-_INVALID = InvalidObservationOptions()
-
 
 @command("retriangulate_landmarks", "rtl", example="rtl --elq_min_observers=2")
 def retriangulate_landmarks(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = _QUALITY,
+    options: LandmarkQualityOptions = LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> RetriangulationReport:
     """Triangulate all landmarks from their observations and evaluate their quality."""
@@ -42,7 +39,7 @@ def retriangulate_landmarks(
 def init_track_landmarks(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = _QUALITY,
+    options: LandmarkQualityOptions = LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> TrackReport:
     """Create landmarks for feature tracks that have none, then triangulate all."""
@@ -60,7 +57,7 @@ def init_track_landmarks(
 def evaluate_landmark_quality(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = _QUALITY,
+    options: LandmarkQualityOptions = LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> LandmarkQualityReport:
     """Classify every landmark as good or bad."""
@@ -104,7 +101,7 @@ def remove_bad_landmarks(
 def remove_invalid_observations(
     context: CommandContext,
     *,
-    options: InvalidObservationOptions = _INVALID,
+    options: InvalidObservationOptions = InvalidObservationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> InvalidObservationReport:
     """Detach observations that contradict their landmark and create new landmarks from their tracks."""

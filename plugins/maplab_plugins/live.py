@@ -24,11 +24,7 @@ if TYPE_CHECKING:
     from maplab_py.interop.live.source import LiveRecording
     from maplab_py.interop.recordings.options import StreamOptions
 
-_NETWORK = NetworkOptions()
 _LIVE = LiveOptions()
-_SOURCE = SourceOptions()
-_PLAYING = PlayingOptions()
-_RECORDING = RecordingOptions()
 
 
 @command(
@@ -41,7 +37,7 @@ def live_topics(
     context: CommandContext,
     transport: str = "ros2",
     *,
-    network: NetworkOptions = _NETWORK,
+    network: NetworkOptions = NetworkOptions(),
     listen_s: float = 3.0,
 ) -> LiveTopics:
     """List the topics of running robots: types, publishers, rates, sizes.
@@ -67,9 +63,9 @@ def play_recording(
     recording: Path,
     transport: str = "ros2",
     *,
-    source: SourceOptions = _SOURCE,
-    network: NetworkOptions = _NETWORK,
-    options: PlayingOptions = _PLAYING,
+    source: SourceOptions = SourceOptions(),
+    network: NetworkOptions = NetworkOptions(),
+    options: PlayingOptions = PlayingOptions(),
 ) -> PlayedRecording:
     """Publish images and IMU samples of a recording as topics of ROS 2, ROS 1 or Foxglove.
 
@@ -102,8 +98,8 @@ def record_bag(
     transport: str,
     bag: Path,
     *,
-    network: NetworkOptions = _NETWORK,
-    options: RecordingOptions = _RECORDING,
+    network: NetworkOptions = NetworkOptions(),
+    options: RecordingOptions = RecordingOptions(),
     live_silence_s: float = _LIVE.silence_s,
     overwrite: bool = False,
 ) -> RecordedBag:

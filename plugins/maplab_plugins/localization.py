@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
 
-_OPTIONS = LocalizationOptions()
-_FEATURES = FeatureTypeOptions()
-_SIZE = SizeOptions()
-
 
 def map_values(session: Session) -> list[tuple[str, str]]:
     """Return the maps in memory other than the selected one, and the map folders at hand."""
@@ -49,8 +45,8 @@ def localize(
     context: CommandContext,
     localization_map: str = "",
     *,
-    options: LocalizationOptions = _OPTIONS,
-    features: FeatureTypeOptions = _FEATURES,
+    options: LocalizationOptions = LocalizationOptions(),
+    features: FeatureTypeOptions = FeatureTypeOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
     sequence_length: int = 1,
     success_error_m: float = 0.5,
@@ -59,7 +55,7 @@ def localize(
     localization_csv: Path | None = None,
     localization_json: Path | None = None,
     overwrite: bool = False,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> LocalizationReport:
     """Localise the images of the selected map in another map, one by one; no map is changed.
 

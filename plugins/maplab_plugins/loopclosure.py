@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
 
 _LOOPS = LoopClosureOptions()
-_FEATURES = FeatureTypeOptions()
-_RELAXATION = RelaxationOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +177,7 @@ def train_projection_matrix(
     context: CommandContext,
     file: Path,
     *,
-    features: FeatureTypeOptions = _FEATURES,
+    features: FeatureTypeOptions = FeatureTypeOptions(),
     lc_target_dimensionality: int = _LOOPS.target_dimensionality,
     map_mission_list: str = "",
     overwrite: bool = False,
@@ -294,7 +292,7 @@ def remove_loopclosure(
     return report
 
 
-@command("delete_loopclosure_record", example="delete_loopclosure_record")
+@command("delete_loopclosure_record")
 def delete_loopclosure_record(context: CommandContext) -> Message:
     """Delete the record of loop closures; landmarks, edges and poses stay as they are."""
     from maplab_py.algorithms.loop_closure.closure_record import drop_record
@@ -312,7 +310,7 @@ def relax(
     context: CommandContext,
     *,
     loop_options: LoopClosureOptions = _LOOPS,
-    options: RelaxationOptions = _RELAXATION,
+    options: RelaxationOptions = RelaxationOptions(),
     lc_relax_merge_landmarks: bool = False,
     map_mission_list: str = "",
 ) -> RelaxReport:
@@ -333,7 +331,7 @@ def relax_missions_independently(
     context: CommandContext,
     *,
     loop_options: LoopClosureOptions = _LOOPS,
-    options: RelaxationOptions = _RELAXATION,
+    options: RelaxationOptions = RelaxationOptions(),
     lc_relax_merge_landmarks: bool = False,
     map_mission_list: str = "",
 ) -> RelaxMissionsReport:

@@ -12,14 +12,11 @@ if TYPE_CHECKING:
     from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 
 
-_OPTIONS = VIOptimizationOptions()
-
-
 @command("optimize_visual_inertial", "optvi", example="optvi --ba_num_iterations=20")
 def optimize_visual_inertial(
     context: CommandContext,
     *,
-    options: VIOptimizationOptions = _OPTIONS,
+    options: VIOptimizationOptions = VIOptimizationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> VIOptimizationReport:
     """Optimise poses, velocities, biases and landmarks from images and inertial measurements."""
@@ -30,7 +27,7 @@ def optimize_visual_inertial(
 def optimize_visual(
     context: CommandContext,
     *,
-    options: VIOptimizationOptions = _OPTIONS,
+    options: VIOptimizationOptions = VIOptimizationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> VIOptimizationReport:
     """Optimise poses and landmarks from images alone."""
@@ -63,7 +60,7 @@ class WarmupReport(Report):
     folder: str
 
 
-@command("warmup", example="warmup", needs_map=False, acts_outside=True, guards_effects=True)
+@command("warmup", needs_map=False, acts_outside=True, guards_effects=True)
 def warmup(context: CommandContext) -> WarmupReport:
     """Compile every numeric kernel that the installation does not bring, so that nothing waits later."""
     from maplab_py.warmup import compile_kernels

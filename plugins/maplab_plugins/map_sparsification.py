@@ -8,15 +8,12 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions, Keyframin
 from maplab_py.algorithms.sparsification.options import SparsificationOptions, SparsificationReport
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
-_KEYFRAMING = KeyframingOptions()
-_SPARSIFICATION = SparsificationOptions()
-
 
 @command("keyframe_heuristic", "kfh", example="kfh --kf_every_nth_vertex=5 --dry_run")
 def keyframe_heuristic(
     context: CommandContext,
     *,
-    options: KeyframingOptions = _KEYFRAMING,
+    options: KeyframingOptions = KeyframingOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> KeyframingReport:
     """Keep keyframes and remove the vertices between them; IMU and odometry edges are joined."""
@@ -38,7 +35,7 @@ def landmark_sparsify(
     context: CommandContext,
     num_landmarks_to_keep: int = -1,
     *,
-    options: SparsificationOptions = _SPARSIFICATION,
+    options: SparsificationOptions = SparsificationOptions(),
     coverage_csv: Path | None = None,
     overwrite: bool = False,
 ) -> SparsificationReport:

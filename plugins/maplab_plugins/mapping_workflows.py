@@ -15,11 +15,6 @@ from maplab_py.plugin import CommandContext, UserError, command
 if TYPE_CHECKING:
     from maplab_py.algorithms.summary.options import WorkflowReport
 
-_KEYFRAMING = KeyframingOptions()
-_LOOPS = LoopClosureOptions()
-_SPARSIFICATION = SparsificationOptions()
-_SUMMARY = SummaryMapOptions()
-
 
 @command(
     "create_localization_summary_map",
@@ -31,10 +26,10 @@ _SUMMARY = SummaryMapOptions()
 def create_localization_summary_map(
     context: CommandContext,
     *,
-    keyframing: KeyframingOptions = _KEYFRAMING,
-    loop_options: LoopClosureOptions = _LOOPS,
-    sparsification: SparsificationOptions = _SPARSIFICATION,
-    summary: SummaryMapOptions = _SUMMARY,
+    keyframing: KeyframingOptions = KeyframingOptions(),
+    loop_options: LoopClosureOptions = LoopClosureOptions(),
+    sparsification: SparsificationOptions = SparsificationOptions(),
+    summary: SummaryMapOptions = SummaryMapOptions(),
     num_landmarks_to_keep: int = 0,
     summary_map_save_path: Path | None = None,
     overwrite: bool = False,

@@ -17,8 +17,6 @@ from maplab_py.vimap.queries import mission_distances_m, mission_labels, mission
 if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
-_LAYOUT = LayoutOptions()
-
 
 @command("remove_mission", "rm", example="remove_mission --map_mission=59f0 --yes")
 def remove_mission(
@@ -221,9 +219,9 @@ def _set_all(context: CommandContext, *, is_known: bool) -> Message:
     return Message(f"base frames of {counted(len(vi_map.missions), 'mission')} set to {state}")
 
 
-@command("spatially_distribute_missions", example="spatially_distribute_missions")
+@command("spatially_distribute_missions")
 def spatially_distribute_missions(
-    context: CommandContext, *, options: LayoutOptions = _LAYOUT
+    context: CommandContext, *, options: LayoutOptions = LayoutOptions()
 ) -> Message:
     """Shift missions of unknown base frame apart, so that they do not overlap in the viewer."""
     from maplab_py.algorithms.pose_graph_manipulation.layout import distribute_missions

@@ -8,8 +8,6 @@ from pathlib import Path
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.plugin import CommandContext, Report, command
 
-_EVALUATION = TrajectoryEvaluationOptions()
-
 
 @dataclasses.dataclass(frozen=True)
 class Plot(Report):
@@ -70,7 +68,7 @@ def plot_errors(
     context: CommandContext,
     *,
     ground_truth: Path,
-    options: TrajectoryEvaluationOptions = _EVALUATION,
+    options: TrajectoryEvaluationOptions = TrajectoryEvaluationOptions(),
     plot_file: Path = Path("errors.png"),
     map_mission_list: str = "",
     overwrite: bool = False,

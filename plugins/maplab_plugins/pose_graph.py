@@ -9,8 +9,6 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions, Relaxatio
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
 
-_RELAXATION = RelaxationOptions()
-
 
 @command(
     "relax_external",
@@ -21,7 +19,7 @@ def relax_external(
     context: CommandContext,
     relax_external_loop_closures_file: Path | None = None,
     *,
-    options: RelaxationOptions = _RELAXATION,
+    options: RelaxationOptions = RelaxationOptions(),
     map_mission_list: str = "",
 ) -> RelaxationReport:
     """Relax the trajectories over loop closures from a file and the edges of the map.
@@ -96,7 +94,7 @@ def export_g2o(
     context: CommandContext,
     file: Path,
     *,
-    options: RelaxationOptions = _RELAXATION,
+    options: RelaxationOptions = RelaxationOptions(),
     overwrite: bool = False,
 ) -> Message:
     """Write the pose graph that relax works on: trajectories with their drift, and loop closures.

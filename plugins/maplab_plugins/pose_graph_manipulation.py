@@ -10,8 +10,6 @@ from maplab_py.algorithms.pose_graph_manipulation.layout import (
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, Message, MissionChoice, command
 from maplab_py.report import counted
 
-_DISTURBANCE = DisturbanceOptions()
-
 
 @command(
     "assign_edge_uncertainties",
@@ -93,11 +91,11 @@ def assign_switch_variable_uncertainties(
     )
 
 
-@command("artificially_disturb_vertices", example="artificially_disturb_vertices")
+@command("artificially_disturb_vertices")
 def artificially_disturb_vertices(
     context: CommandContext,
     *,
-    options: DisturbanceOptions = _DISTURBANCE,
+    options: DisturbanceOptions = DisturbanceOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> DisturbanceReport:
     """Disturb all vertices by a random walk, to test what corrects it."""

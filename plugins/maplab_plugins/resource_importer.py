@@ -12,9 +12,6 @@ from maplab_py.plugin import CommandContext, command
 if TYPE_CHECKING:
     from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
 
-_IMAGES = ImageImportOptions()
-_DEPTH = DepthImportOptions()
-
 
 @command(
     "import_images",
@@ -27,7 +24,7 @@ def import_images(
     dataset_folder: Path,
     *,
     map_mission: str = "",
-    options: ImageImportOptions = _IMAGES,
+    options: ImageImportOptions = ImageImportOptions(),
 ) -> ImportedResources:
     """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission.
 
@@ -101,7 +98,7 @@ def import_depth_maps(
     *,
     map_mission: str = "",
     camera: int = 0,
-    options: DepthImportOptions = _DEPTH,
+    options: DepthImportOptions = DepthImportOptions(),
 ) -> ImportedResources:
     """Attach depth images of another program to the frames of a camera, as raw depth maps.
 

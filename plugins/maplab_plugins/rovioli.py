@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     from maplab_py.server.submap_sources import SubmapWriter
     from maplab_py.viewer.display.viewer import Viewer
 
-_DATA = DataSourceOptions()
-_SOURCE = SourceOptions()
-_RUN = RunOptions()
-_SUBMAPS = SubmapOutput()
-_NETWORK = NetworkOptions()
-_LIVE = LiveOptions()
 _DEFAULT_KEY = "rovioli"
 
 
@@ -61,12 +55,12 @@ def rovioli(
     context: CommandContext,
     datasource_folder: Path | None = None,
     *,
-    data: DataSourceOptions = _DATA,
-    source: SourceOptions = _SOURCE,
-    run: RunOptions = _RUN,
-    submaps: SubmapOutput = _SUBMAPS,
-    network: NetworkOptions = _NETWORK,
-    live: LiveOptions = _LIVE,
+    data: DataSourceOptions = DataSourceOptions(),
+    source: SourceOptions = SourceOptions(),
+    run: RunOptions = RunOptions(),
+    submaps: SubmapOutput = SubmapOutput(),
+    network: NetworkOptions = NetworkOptions(),
+    live: LiveOptions = LiveOptions(),
     map_key: str = "",
     rovioli_visualize_map: bool = False,
     map_publish_interval_s: float = 2.0,

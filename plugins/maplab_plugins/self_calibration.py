@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     )
     from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 
-_OPTIONS = SelfCalibrationOptions()
-_SIZE = SizeOptions()
-
 
 @dataclasses.dataclass(frozen=True)
 class ExportedFiles(Report):
@@ -53,14 +50,14 @@ class ExportedFiles(Report):
 def self_calibrate(
     context: CommandContext,
     *,
-    options: SelfCalibrationOptions = _OPTIONS,
+    options: SelfCalibrationOptions = SelfCalibrationOptions(),
     database: Path | None = None,
     batch: bool = False,
     joint_ekf: bool = False,
     max_camera_shift_m: float = 0.025,
     parts: int = 0,
     chosen: MissionChoice = ALL_MISSIONS,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> SelfCalibrationReport:
     """Calibrate cameras and IMU on the most informative segments of the map and of a database.
 
@@ -124,9 +121,9 @@ def collect_segments(
     context: CommandContext,
     *,
     database: Path,
-    options: SelfCalibrationOptions = _OPTIONS,
+    options: SelfCalibrationOptions = SelfCalibrationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> CollectionReport:
     """Add the most informative segments of the map to a database file; it is created if missing.
 
@@ -157,7 +154,7 @@ def segment_database_stats(
     context: CommandContext,  # noqa: ARG001
     *,
     database: Path,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> DatabaseReport:
     """Show tables, scores, parameters and segments of a segment database.
 
@@ -182,13 +179,13 @@ def prune_segments(
     context: CommandContext,
     *,
     database: Path,
-    options: SelfCalibrationOptions = _OPTIONS,
+    options: SelfCalibrationOptions = SelfCalibrationOptions(),
     segments_per_group: int = 0,
     missions: str = "",
     outdated: bool = False,
     calibration: Path | None = None,
     probability: float = 0.999,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> PruneReport:
     """Remove segments: beyond a capacity, of some missions, or that contradict the calibration.
 
@@ -239,7 +236,7 @@ def export_segments(
     database: Path,
     map_folder: Path,
     overwrite: bool = False,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> Message:
     """Write the segments of a database as a map that can be loaded, looked at and optimised.
 
@@ -266,7 +263,7 @@ def export_segments(
 def evaluate_segment_information(
     context: CommandContext,
     *,
-    options: SelfCalibrationOptions = _OPTIONS,
+    options: SelfCalibrationOptions = SelfCalibrationOptions(),
     group: Literal["imu", "camera", "extrinsics"] = "imu",
     plot: Path | None = None,
     csv: Path | None = None,
@@ -315,7 +312,7 @@ def apply_calibration(
     *,
     calibration: Path,
     chosen: MissionChoice = ALL_MISSIONS,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> CalibrationComparison:
     """Apply the calibration of a sensors.yaml or of another map to the device; poses are unchanged.
 
@@ -381,7 +378,7 @@ def compare_calibrations(
     *,
     calibration: Path,
     chosen: MissionChoice = ALL_MISSIONS,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> CalibrationComparison:
     """Compare the calibration of the map's device with another, parameter by parameter.
 

@@ -32,11 +32,6 @@ if TYPE_CHECKING:
     from maplab_py.server.submap_sources import RecordedSession
     from maplab_py.vimap import VIMap
 
-_SERVER = MapServerOptions()
-_STATIONARY = StationaryOptions()
-_INCREMENTAL = IncrementalOptions()
-_SERVICE = ServiceOptions()
-_PLAY = PlayOptions()
 _SECONDS_BETWEEN_LOOKS = 0.2
 
 
@@ -52,10 +47,10 @@ def serve(
     context: CommandContext,
     *,
     spool: Path,
-    server: MapServerOptions = _SERVER,
-    stationary: StationaryOptions = _STATIONARY,
-    incremental: IncrementalOptions = _INCREMENTAL,
-    service: ServiceOptions = _SERVICE,
+    server: MapServerOptions = MapServerOptions(),
+    stationary: StationaryOptions = StationaryOptions(),
+    incremental: IncrementalOptions = IncrementalOptions(),
+    service: ServiceOptions = ServiceOptions(),
     serve_visualize_map: bool = False,
 ) -> ServeReport:
     """Merge the submaps that robots put into a spool into one map, and publish it.
@@ -323,7 +318,7 @@ def simulate_robots(
     scenario: str = "four_sessions",
     seed: int | None = None,
     maps_folder: Path | None = None,
-    play: PlayOptions = _PLAY,
+    play: PlayOptions = PlayOptions(),
 ) -> PlayedRobots:
     """Play robots: cut their sessions into submaps and put each into a spool when its time has come.
 
@@ -353,13 +348,9 @@ def simulate_robots(
     return PlayedRobots(len(sessions), len(submaps), truth, seconds)
 
 
-@command(
-    "tie_stationary_missions",
-    example="tie_stationary_missions",
-    see_also=("optimize_visual_inertial", "serve"),
-)
+@command("tie_stationary_missions", see_also=("optimize_visual_inertial", "serve"))
 def tie_stationary_missions(
-    context: CommandContext, *, options: StationaryOptions = _STATIONARY
+    context: CommandContext, *, options: StationaryOptions = StationaryOptions()
 ) -> Message:
     """Tie the first and last vertex of every mission that stands still by a loop closure edge.
 

@@ -10,10 +10,8 @@ from maplab_py.plugin import CommandContext, command
 if TYPE_CHECKING:
     from maplab_py.algorithms.statistics.statistics import MapDistributions, MapSize
 
-_KEYFRAMING = KeyframingOptions()
 
-
-@command("statistics", "stat", example="statistics", see_also=("map_stats", "map_size"))
+@command("statistics", "stat", see_also=("map_stats", "map_size"))
 def statistics(context: CommandContext) -> MapDistributions:
     """Show how tracks, landmarks, distances and samples of the selected map are distributed."""
     from maplab_py.algorithms.statistics.statistics import map_distributions
@@ -23,10 +21,11 @@ def statistics(context: CommandContext) -> MapDistributions:
 
 @command(
     "map_size",
-    example="map_size",
     see_also=("keyframe_heuristic", "landmark_sparsify", "generate_summary_map_and_save_to_disk"),
 )
-def map_size(context: CommandContext, *, keyframing: KeyframingOptions = _KEYFRAMING) -> MapSize:
+def map_size(
+    context: CommandContext, *, keyframing: KeyframingOptions = KeyframingOptions()
+) -> MapSize:
     """Show the size of each part of the map and what each maintenance command would save."""
     from maplab_py.algorithms.statistics.statistics import map_size as measure
 

@@ -13,10 +13,6 @@ from maplab_py.algorithms.summary.options import (
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
 
-_SUMMARY = SummaryMapOptions()
-_FEATURES = FeatureTypeOptions()
-_SIZE = SizeOptions()
-
 
 @command(
     "generate_summary_map_and_save_to_disk",
@@ -29,8 +25,8 @@ def generate_summary_map_and_save_to_disk(
     context: CommandContext,
     summary_map_save_path: Path | None = None,
     *,
-    options: SummaryMapOptions = _SUMMARY,
-    features: FeatureTypeOptions = _FEATURES,
+    options: SummaryMapOptions = SummaryMapOptions(),
+    features: FeatureTypeOptions = FeatureTypeOptions(),
     overwrite: bool = False,
 ) -> SummaryMapReport:
     """Write the good landmarks of the selected map and their descriptors to a summary map.
@@ -78,7 +74,7 @@ def print_summary_map(
     context: CommandContext,  # noqa: ARG001
     summary_map: Path,
     *,
-    size: SizeOptions = _SIZE,
+    size: SizeOptions = SizeOptions(),
 ) -> SummaryMapContent:
     """Check a summary map and show its content.
 

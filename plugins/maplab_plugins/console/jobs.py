@@ -46,7 +46,7 @@ class JoinReport(Report):
         return "; ".join(f"job {line.job} {line.state}: {line.problem}" for line in failed)
 
 
-@command("jobs", example="jobs", see_also=("join", "cancel"), needs_map=False)
+@command("jobs", see_also=("join", "cancel"), needs_map=False)
 def list_jobs(context: CommandContext) -> JobList | Message:
     """List running and finished background commands.
 
@@ -58,14 +58,7 @@ def list_jobs(context: CommandContext) -> JobList | Message:
     return JobList(tuple(map(_line, jobs))) if jobs else Message("no jobs (see: help jobs)")
 
 
-@command(
-    "join",
-    example="join",
-    see_also=("jobs",),
-    needs_map=False,
-    acts_outside=True,
-    completes={"job": "job"},
-)
+@command("join", see_also=("jobs",), needs_map=False, acts_outside=True, completes={"job": "job"})
 def join(context: CommandContext, job: int = 0) -> JoinReport | Message:
     """Wait for background commands and show their reports.
 
@@ -97,14 +90,7 @@ def join(context: CommandContext, job: int = 0) -> JoinReport | Message:
     return JoinReport(tuple(map(_line, chosen)), reports, conflicts)
 
 
-@command(
-    "cancel",
-    example="cancel",
-    see_also=("jobs",),
-    needs_map=False,
-    acts_outside=True,
-    completes={"job": "job"},
-)
+@command("cancel", see_also=("jobs",), needs_map=False, acts_outside=True, completes={"job": "job"})
 def cancel(context: CommandContext, job: int = 0) -> Message:
     """Stop background commands; they have no effect on the maps.
 

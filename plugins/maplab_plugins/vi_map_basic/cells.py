@@ -29,15 +29,12 @@ class SplitReport(Report):
     cells: tuple[CellLine, ...] = dataclasses.field(metadata={"title": ""})
 
 
-_CELLS = CellOptions()
-
-
 @command(
     "split_map",
     example="split_map --cell_count=2 --cell_overlap_m=2",
     see_also=("join_submaps", "save_all", "generate_summary_map_and_save_to_disk"),
 )
-def split_map(context: CommandContext, *, options: CellOptions = _CELLS) -> SplitReport:
+def split_map(context: CommandContext, *, options: CellOptions = CellOptions()) -> SplitReport:
     """Split the selected map by position into overlapping cells, each a new map in memory.
 
     The cells are named after the map: office_cell_0, office_cell_1, ... The map itself stays and is

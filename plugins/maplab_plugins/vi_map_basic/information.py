@@ -69,7 +69,7 @@ class CameraList(Report):
     cameras: tuple[CameraLine, ...]
 
 
-@command("map_stats", "ms", example="map_stats", see_also=("statistics", "map_size"))
+@command("map_stats", "ms", see_also=("statistics", "map_size"))
 def map_stats(
     context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
 ) -> MapStatistics | MapDetails:
@@ -195,16 +195,12 @@ class MemoryReport(Report):
     available_gb: float
 
 
-_UNDO = UndoOptions()
-
-
 @command(
     "memory",
-    example="memory",
     see_also=("list", "undo", "clear_storage", "resource_cache_statistics"),
     needs_map=False,
 )
-def memory(context: CommandContext, *, undo: UndoOptions = _UNDO) -> MemoryReport:
+def memory(context: CommandContext, *, undo: UndoOptions = UndoOptions()) -> MemoryReport:
     """Show the memory of maps, of undo and of the cache of maps; limit that of undo.
 
     A column that several maps or former values share counts once, for the first of them. Columns in a
@@ -251,11 +247,6 @@ def memory(context: CommandContext, *, undo: UndoOptions = _UNDO) -> MemoryRepor
     )
 
 
-_LOOPS = LoopClosureOptions()
-_ANCHORING = AnchoringOptions()
-_QUALITY = LandmarkQualityOptions()
-
-
 def subjects(session: Session) -> list[tuple[str, str]]:
     """Return what can be asked about: the missions, then the recorded closures."""
     from maplab_py.algorithms.loop_closure.closure_record import described_ids
@@ -276,9 +267,9 @@ def why(
     subject: str,
     other: str = "",
     *,
-    loop_options: LoopClosureOptions = _LOOPS,
-    anchoring: AnchoringOptions = _ANCHORING,
-    quality: LandmarkQualityOptions = _QUALITY,
+    loop_options: LoopClosureOptions = LoopClosureOptions(),
+    anchoring: AnchoringOptions = AnchoringOptions(),
+    quality: LandmarkQualityOptions = LandmarkQualityOptions(),
 ) -> ClosureExplanation | PairExplanation | MissionExplanation | LandmarkExplanation:
     """Explain a closure, a pair of missions, a mission or a landmark: every gate with its value.
 

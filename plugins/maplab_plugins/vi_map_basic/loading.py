@@ -109,9 +109,6 @@ class ReadingOptions(CacheOptions, SizeOptions):
     the map."""
 
 
-_READING = ReadingOptions()
-
-
 @command(
     "list_maps_on_file_system",
     example="list_maps_on_file_system maps",
@@ -137,7 +134,7 @@ def load(
     *,
     map_key: str = "",
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> LoadedMaps:
     """Load a map into memory and select it.
 
@@ -167,12 +164,7 @@ def load(
     return LoadedMaps((_describe(key, vi_map, map_folder),), (report,))
 
 
-@command(
-    "recover",
-    example="recover",
-    needs_map=False,
-    see_also=("load", "save"),
-)
+@command("recover", needs_map=False, see_also=("load", "save"))
 def recover(context: CommandContext, run: str = "") -> LoadedMaps:
     """Load the maps that the latest failed script left unsaved; save them where they shall stay.
 
@@ -204,7 +196,7 @@ def load_all(
     maps_folder: Path,
     *,
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> LoadedMaps:
     """Load every map below a folder, each under the name of its folder; the last is selected.
 
@@ -244,7 +236,7 @@ def load_merge_map(
     map_folder: Path,
     *,
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> MergedMaps:
     """Load a map and merge its missions into the selected map.
 
@@ -270,7 +262,7 @@ def load_merge_all_maps(
     *,
     target_map_key: str = "",
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> MergedMaps:
     """Load every map below a folder and merge all missions into the selected map or a new one.
 
@@ -297,7 +289,7 @@ def load_merge_submap(
     map_folder: Path,
     *,
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> MergedMaps:
     """Load a part of a mission and append it to that mission in the selected map.
 
@@ -325,7 +317,7 @@ def load_merge_all_submaps(
     *,
     target_map_key: str = "",
     assign_new_ids: bool = False,
-    reading: ReadingOptions = _READING,
+    reading: ReadingOptions = ReadingOptions(),
 ) -> MergedMaps:
     """Load the parts of missions below a folder in time order and join them.
 

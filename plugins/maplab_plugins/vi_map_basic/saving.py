@@ -98,10 +98,6 @@ class SaveOptions(Options):
     since 2021), legacy (maplab before 2021; binary descriptors only)"""
 
 
-_NO_MIGRATION = ResourceMigration()
-_SAVE = SaveOptions()
-
-
 @command(
     "save",
     example="save --map_folder=maps/merged",
@@ -114,8 +110,8 @@ def save(
     context: CommandContext,
     map_folder: Path | None = None,
     *,
-    options: SaveOptions = _SAVE,
-    migration: ResourceMigration = _NO_MIGRATION,
+    options: SaveOptions = SaveOptions(),
+    migration: ResourceMigration = ResourceMigration(),
 ) -> SavedMaps | SavePlan:
     """Save the selected map; the folder's old content stays until the new one is complete.
 
@@ -146,8 +142,8 @@ def save_all(
     context: CommandContext,
     maps_folder: Path | None = None,
     *,
-    options: SaveOptions = _SAVE,
-    migration: ResourceMigration = _NO_MIGRATION,
+    options: SaveOptions = SaveOptions(),
+    migration: ResourceMigration = ResourceMigration(),
 ) -> SavedMaps | SavePlan:
     """Save all maps in memory.
 

@@ -14,41 +14,26 @@ from maplab_py.viewer.options import PlaybackOptions, PointCloudOptions, Visuali
 if TYPE_CHECKING:
     from maplab_py.viewer.layers.clouds import Cloud
 
-_OPTIONS = VisualizationOptions()
-_VIEWER = ViewerOptions()
-_CLOUDS = PointCloudOptions()
-_PLAYBACK = PlaybackOptions()
 
-
-@command(
-    "visualize_xyz_pointclouds",
-    example="visualize_xyz_pointclouds",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_xyz_pointclouds", acts_outside=True, guards_effects=True)
 def visualize_xyz_pointclouds(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the clouds of plain points, coloured by height."""
     return _show(context, "point_cloud", clouds, options, display)
 
 
-@command(
-    "visualize_xyzi_pointclouds",
-    example="visualize_xyzi_pointclouds",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_xyzi_pointclouds", acts_outside=True, guards_effects=True)
 def visualize_xyzi_pointclouds(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the clouds whose points have intensities, as those of a lidar."""
     return _show(context, "point_cloud_w_intensity", clouds, options, display)
@@ -59,9 +44,9 @@ def visualize_xyzi_pointclouds_from_mission(
     context: CommandContext,
     *,
     map_mission: str = "",
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the clouds with intensities of one mission.
 
@@ -76,27 +61,22 @@ def visualize_xyzi_pointclouds_from_mission(
 def visualize_xyzi_pointclouds_sequentially(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    playback: PlaybackOptions = _PLAYBACK,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    playback: PlaybackOptions = PlaybackOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Play the missions with their clouds with intensities."""
     return _show(context, "point_cloud_w_intensity", clouds, options, display, playback=playback)
 
 
-@command(
-    "visualize_xyzrgbn_pointclouds",
-    example="visualize_xyzrgbn_pointclouds",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_xyzrgbn_pointclouds", acts_outside=True, guards_effects=True)
 def visualize_xyzrgbn_pointclouds(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the coloured clouds and meshes."""
     return _show(context, "color_point_cloud", clouds, options, display)
@@ -106,9 +86,9 @@ def visualize_xyzrgbn_pointclouds(
 def visualize_raw_depth_map_pointclouds(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the raw depth maps as points in space."""
     return _show(context, "raw_depth_maps", clouds, options, display)
@@ -118,9 +98,9 @@ def visualize_raw_depth_map_pointclouds(
 def visualize_optimized_depth_map_pointclouds(
     context: CommandContext,
     *,
-    clouds: PointCloudOptions = _CLOUDS,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    clouds: PointCloudOptions = PointCloudOptions(),
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the optimised depth maps as points in space."""
     return _show(context, "optimized_depth_maps", clouds, options, display)

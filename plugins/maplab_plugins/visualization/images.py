@@ -9,9 +9,6 @@ from maplab_plugins.visualization.following import ViewerOptions, ViewReport, sh
 from maplab_py.plugin import CommandContext, command
 from maplab_py.viewer.options import PlaybackOptions
 
-_VIEWER = ViewerOptions()
-_PLAYBACK = PlaybackOptions()
-
 
 def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewReport]:
     """Make the command that plays the missions with one type of image resource."""
@@ -19,8 +16,8 @@ def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewRe
     def play(
         context: CommandContext,
         *,
-        playback: PlaybackOptions = _PLAYBACK,
-        display: ViewerOptions = _VIEWER,
+        playback: PlaybackOptions = PlaybackOptions(),
+        display: ViewerOptions = ViewerOptions(),
     ) -> ViewReport:
         return _show(context, resource, playback, display)
 

@@ -15,10 +15,6 @@ from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
-_OPTIONS = VisualizationOptions()
-_VIEWER = ViewerOptions()
-_PLAYBACK = PlaybackOptions()
-
 
 @dataclasses.dataclass(frozen=True)
 class DifferenceReport(Report):
@@ -43,8 +39,8 @@ class DifferenceReport(Report):
 def visualize(
     context: CommandContext,
     *,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
     ground_truth: Path | None = None,
     informative_segments: Path | None = None,
 ) -> ViewReport:
@@ -73,20 +69,15 @@ def visualize(
 
 
 @command(
-    "visualize_sequentially",
-    "vs",
-    example="visualize_sequentially",
-    see_also=("visualize",),
-    acts_outside=True,
-    guards_effects=True,
+    "visualize_sequentially", "vs", see_also=("visualize",), acts_outside=True, guards_effects=True
 )
 def visualize_sequentially(
     context: CommandContext,
     *,
     chosen: MissionChoice = ALL_MISSIONS,
-    options: VisualizationOptions = _OPTIONS,
-    playback: PlaybackOptions = _PLAYBACK,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    playback: PlaybackOptions = PlaybackOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Play the missions in the browser: the map grows as it was recorded."""
     from maplab_py.viewer.building import Subject
@@ -96,17 +87,12 @@ def visualize_sequentially(
     return show(context, subject, display, playback=playback, plays=True)
 
 
-@command(
-    "visualize_landmark_observers",
-    example="visualize_landmark_observers",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_landmark_observers", acts_outside=True, guards_effects=True)
 def visualize_landmark_observers(
     context: CommandContext,
     *,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the rays from every observing camera to the good landmarks."""
     from maplab_py.viewer.building import Subject
@@ -115,14 +101,9 @@ def visualize_landmark_observers(
     return show(context, subject, display)
 
 
-@command(
-    "visualize_sensor_extrinsics",
-    example="visualize_sensor_extrinsics",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_sensor_extrinsics", acts_outside=True, guards_effects=True)
 def visualize_sensor_extrinsics(
-    context: CommandContext, *, display: ViewerOptions = _VIEWER
+    context: CommandContext, *, display: ViewerOptions = ViewerOptions()
 ) -> ViewReport:
     """Show how the sensors are mounted: each as axes on its base sensor."""
     from maplab_py.viewer.building import Subject
@@ -131,17 +112,12 @@ def visualize_sensor_extrinsics(
     return show(context, Subject(context.vi_map, title, shows_sensors=True), display)
 
 
-@command(
-    "visualize_loop_closures",
-    example="visualize_loop_closures",
-    acts_outside=True,
-    guards_effects=True,
-)
+@command("visualize_loop_closures", acts_outside=True, guards_effects=True)
 def visualize_loop_closures(
     context: CommandContext,
     *,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show loop closures on the trajectories: edges by switch value, remembered ones by weight.
 
@@ -178,8 +154,8 @@ def visualize_difference(
     with_map_key: str = "",
     with_snapshot: str = "",
     side_by_side: bool = False,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> DifferenceReport:
     """Show the selected map over or beside another state of it or another map.
 

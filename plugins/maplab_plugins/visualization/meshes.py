@@ -9,13 +9,9 @@ from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 from maplab_py.viewer.options import MeshColouring, VisualizationOptions
 
-_OPTIONS = VisualizationOptions()
-_VIEWER = ViewerOptions()
-
 
 @command(
     "visualize_mesh",
-    example="visualize_mesh",
     acts_outside=True,
     guards_effects=True,
     see_also=("create_mesh_from_tsdf_grid", "create_tsdf_from_depth_resource"),
@@ -29,8 +25,8 @@ def visualize_mesh(
     missions: MissionChoice = ALL_MISSIONS,
     dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
     dense_result_mesh_colours: bool = False,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the map with the mesh of its grids, or with a mesh from a file.
 
@@ -66,7 +62,6 @@ def visualize_mesh(
 
 @command(
     "visualize_esdf",
-    example="visualize_esdf",
     acts_outside=True,
     guards_effects=True,
     see_also=("create_esdf_from_depth_resource",),
@@ -76,8 +71,8 @@ def visualize_esdf(
     *,
     missions: MissionChoice = ALL_MISSIONS,
     dense_esdf_slice_height_m: float | None = None,
-    options: VisualizationOptions = _OPTIONS,
-    display: ViewerOptions = _VIEWER,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the map with a horizontal slice through its distance field, coloured by the distance.
 
