@@ -80,7 +80,7 @@ def test_its_options_refuse_nonsense(installed: Path, tmp_path: Path) -> None:
     save_map(simulated().maps[0], tmp_path / "map")
     done = run_maplab(installed, "-c", f"load {tmp_path / 'map'}; cfl --far_distance_m=-1")
     assert done.returncode == 2
-    assert "--far_distance_m must be greater than 0" in done.stderr
+    assert "--far_distance_m=-1: must be above 0" in done.stderr
 
 
 def test_its_residual_takes_part_in_optvi(installed: Path, tmp_path: Path) -> None:

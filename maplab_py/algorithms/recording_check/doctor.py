@@ -86,7 +86,6 @@ def diagnose(
         UserError: An option is wrong.
     """
     stream = stream or StreamOptions()
-    stream.check()
     signals = read_signals(recording, stream, first_s=first_s, progress=progress)
     return diagnose_signals(signals, stream, is_whole=not first_s)
 

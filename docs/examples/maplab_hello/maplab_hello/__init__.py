@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from maplab_py.plugin import (
     CommandContext,
     LayerPoints,
     Message,
+    Options,
     Report,
     ResidualRows,
     UserError,
@@ -25,17 +26,11 @@ from maplab_py.vimap import Backbone, BaseFrames, Missions, TransformationEdges,
 from maplab_py.vimap.ids import random_ids
 
 
-@dataclasses.dataclass(frozen=True)
-class FarLandmarkOptions:
+class FarLandmarkOptions(Options, prefix="far_"):
     """Each field becomes a flag: --far_distance_m."""
 
-    flag_prefix: ClassVar[str] = "far_"
-    distance_m: float = option(20.0, help="Landmarks beyond this are far.", unit="m")
-
-    def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
-        if self.distance_m <= 0.0:
-            raise ValueError("--far_distance_m must be greater than 0")
+    distance_m: float = option(20.0, gt=0)
+    """Landmarks beyond this are far."""
 
 
 @dataclasses.dataclass(frozen=True)
