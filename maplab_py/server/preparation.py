@@ -6,12 +6,8 @@ import contextlib
 import dataclasses
 import errno
 import hashlib
-import json
 import os
 import queue
-import select
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,8 +17,8 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.atomic import write_file
-from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, start
-from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.child_processes import Service, ServiceEnded
+from maplab_py.errors import Cancelled, MapError, MaplabError, UserError
 from maplab_py.pipeline.fingerprint import program_version
 from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.server.journal import Journal, MergedSubmap
@@ -167,7 +163,7 @@ class WorkerPool:
                 outcome = worker.run(order, is_cancelled)
             finally:
                 if outcome is None or worker.orders >= _MOST_ORDERS or not worker.is_alive:
-                    worker.kill()
+                    worker.end()
                 else:
                     self._idle.put(worker)
             if outcome is not None:
@@ -177,7 +173,7 @@ class WorkerPool:
         """Kill the workers that are idle; those that are not belong to threads that run orders."""
         with contextlib.suppress(queue.Empty):
             while True:
-                self._idle.get_nowait().kill()
+                self._idle.get_nowait().end()
 
     def _take(self) -> _Worker:
         with contextlib.suppress(queue.Empty):
@@ -185,7 +181,7 @@ class WorkerPool:
         return _Worker(self._threads, self._idle_s)
 
 
-class _Worker:
+class _Worker(Service):
     """A worker process.
 
     Attributes:
@@ -193,50 +189,23 @@ class _Worker:
     """
 
     def __init__(self, threads: int, idle_s: float) -> None:
+        super().__init__("maplab_py.server.worker", repr(idle_s), threads=threads)
         self.orders = 0
-        self._process = start(
-            [sys.executable, "-m", "maplab_py.server.worker", repr(idle_s)],
-            threads=threads,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        )
-
-    @property
-    def is_alive(self) -> bool:
-        return self._process.poll() is None
 
     def run(self, order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome | None:
         """Run an order; None where the process had ended before it got the order."""
         self.orders += 1
-        stdin, stdout = self._process.stdin, self._process.stdout
-        assert stdin is not None
-        assert stdout is not None
-        with contextlib.suppress(BrokenPipeError):
-            stdin.write(order.as_line().encode("utf-8", "surrogateescape"))
-            stdin.flush()
-        while not select.select([stdout], [], [], SECONDS_BETWEEN_LOOKS)[0]:
-            if is_cancelled():
-                self.kill()
-                return Outcome(order.title, Ending.CANCELLED, "cancelled")
-        line = stdout.readline()
-        if line:
-            ending, error = json.loads(line)
-            return Outcome(order.title, Ending(ending), error)
-        status = self._process.wait()
-        if status == 0:
-            return None
-        if status == _KILLED:
-            return Outcome(
-                order.title,
-                Ending.OVER_MEMORY,
-                "was killed, as the system does when memory runs out",
-            )
-        return Outcome(order.title, Ending.FAILED, f"ended with status {status}")
-
-    def kill(self) -> None:
-        """End the process, and wait for its end."""
-        kill(self._process)
+        try:
+            return Outcome(order.title, *self.ask(order, is_cancelled))
+        except Cancelled:
+            return Outcome(order.title, Ending.CANCELLED, "cancelled")
+        except ServiceEnded as end:
+            if end.status == 0:
+                return None
+            if end.status == _KILLED:
+                error = "was killed, as the system does when memory runs out"
+                return Outcome(order.title, Ending.OVER_MEMORY, error)
+            return Outcome(order.title, Ending.FAILED, str(end))
 
 
 _ATTEMPTS = 3

@@ -1,9 +1,9 @@
 """The worker's side: submaps are checked and optimised, each by itself, in a process that stays.
 
 What is done to a submap is what these commands would do: load, check_map_consistency, elq,
-tie_stationary_missions if wanted, optvi, save. The process reads an order per line and answers each with
-a line, both in JSON. It stays for the next submap, because starting Python and loading the compiled
-kernels takes five times as long as the work; without orders it ends after a while.
+tie_stationary_missions if wanted, optvi, save. The process stays for the next submap, because starting
+Python and loading the compiled kernels takes five times as long as the work; without orders it ends after a
+while.
 """
 
 from __future__ import annotations
@@ -12,13 +12,11 @@ import dataclasses
 import json
 import logging
 import os
-import select
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
-from maplab_py.child_processes import end_with_parent
+from maplab_py.child_processes import serve
 from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
 from maplab_py.memory import says_not_enough
 from maplab_py.pipeline.messages import Ending
@@ -29,7 +27,7 @@ _FORMAT = "%(asctime)s  process %(process)d  %(message)s"
 
 @dataclasses.dataclass(frozen=True)
 class SubmapOrder:
-    """A submap as a worker gets it.
+    """A submap as a worker gets it, and what its result depends on.
 
     Attributes:
         title: Robot and name.
@@ -54,12 +52,6 @@ class SubmapOrder:
     def as_line(self) -> str:
         """Return the order as a line of JSON."""
         return json.dumps(dataclasses.asdict(self), default=os.fspath) + "\n"
-
-    @classmethod
-    def from_line(cls, line: str) -> SubmapOrder:
-        """Read what `as_line` returns."""
-        given: dict[str, Any] = json.loads(line)
-        return cls(**given | {name: Path(given[name]) for name in ("submap", "result", "log")})
 
 
 def prepare(order: SubmapOrder) -> str:
@@ -124,30 +116,14 @@ def answer(order: SubmapOrder) -> tuple[Ending, str]:
     return Ending.DONE, ""
 
 
-def main(idle_s: float) -> None:
-    """Answer orders until none comes for so long [s], or the pipe ends."""
-    end_with_parent()
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=_FORMAT)
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    orders = os.fdopen(os.dup(0), "rb", buffering=0)
-    os.dup2(2, 1)  # what libraries print must not be taken for an answer
-    pending = b""
-    while True:
-        while b"\n" not in pending:
-            readable, _, _ = select.select([orders], [], [], idle_s)
-            part = orders.read(1 << 16) if readable else b""
-            if not part:
-                return
-            pending += part
-        line, _, pending = pending.partition(b"\n")
-        order = SubmapOrder.from_line(line.decode("utf-8", "surrogateescape"))
-        with order.log.open("ab") as log:
-            os.dup2(log.fileno(), 1)
-            os.dup2(log.fileno(), 2)
-        ending, error = answer(order)
-        answers.write(json.dumps([ending.value, error]) + "\n")
-        answers.flush()
+def _answer_in_log(order: SubmapOrder) -> tuple[Ending, str]:
+    """Carry out an order; all output, that of libraries too, goes to its log."""
+    with order.log.open("ab") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    return answer(order)
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]))
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=_FORMAT)
+    serve(_answer_in_log, float(sys.argv[2]))

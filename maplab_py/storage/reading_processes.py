@@ -1,8 +1,6 @@
 """Read files of vertices in other processes, which send their columns back.
 
-Converting messages to columns holds Python's lock, so threads do not help. A process gets the path of a
-file on its standard input and answers on its standard output: sizes, a pickle, and the columns as they lie
-in memory.
+Converting messages to columns holds Python's lock, so threads do not help.
 """
 
 from __future__ import annotations
@@ -10,17 +8,12 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import pickle
 import queue
-import signal
-import struct
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, Any
 
+from maplab_py.child_processes import Service, ServiceEnded, processors, serve
 from maplab_py.errors import MapError
 from maplab_py.storage.file_parts import FileParts
 from maplab_py.storage.protobuf.map_files import FileKind, read_unpacked
@@ -29,49 +22,16 @@ from maplab_py.storage.protobuf.scan import MemoryBudget
 _WORTH_PROCESSES = 100_000_000
 """Bytes of the files of vertices from which processes save more time than their start takes."""
 _MOST_PROCESSES = 8
-_LENGTH = struct.Struct("<Q")
 
 Answer = FileParts | MapError | MemoryError | None
 """Content of a file, or why it cannot be read; None = the process that asked has to read it itself."""
-
-
-class _Reader:
-    """One process."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "maplab_py.storage.reading_processes"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-
-    def ask(self, path: Path, max_bytes: int, left: int) -> Answer:
-        """Let it read a file; None where it has ended."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        try:
-            _send(self._process.stdin, (str(path), max_bytes, left))
-            answer: Answer = _receive(self._process.stdout)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            return None
-        return answer
-
-    def end(self) -> None:
-        """Kill it."""
-        self._process.kill()
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            with contextlib.suppress(OSError):
-                stream.close()
-        self._process.wait()
 
 
 class PartsAhead:
     """The contents of files of vertices, in their order, as processes have read them."""
 
     def __init__(
-        self, pool: ThreadPoolExecutor, readers: queue.Queue[_Reader], paths: Sequence[Path]
+        self, pool: ThreadPoolExecutor, readers: queue.Queue[Service], paths: Sequence[Path]
     ) -> None:
         """Prepare; `start` begins."""
         self._pool, self._readers, self._paths = pool, readers, paths
@@ -97,7 +57,10 @@ class PartsAhead:
     def _ask(self, path: Path, budget: MemoryBudget) -> Answer:
         reader = self._readers.get()
         try:
-            return reader.ask(path, budget.max_bytes, budget.left)
+            answer: Answer = reader.ask((path, budget.max_bytes, budget.left))
+            return answer
+        except ServiceEnded:
+            return None
         finally:
             self._readers.put(reader)
 
@@ -110,13 +73,13 @@ def parts_ahead(files: Sequence[tuple[FileKind, Path]]) -> Iterator[PartsAhead |
     if count < 2 or _total_bytes(paths) < _WORTH_PROCESSES:
         yield None
         return
-    readers: list[_Reader] = []
-    idle: queue.Queue[_Reader] = queue.Queue()
+    readers: list[Service] = []
+    idle: queue.Queue[Service] = queue.Queue()
     pool = ThreadPoolExecutor(count)
     try:
         with contextlib.suppress(OSError):
             for _ in range(count):
-                readers.append(_Reader())
+                readers.append(Service("maplab_py.storage.reading_processes"))
                 idle.put(readers[-1])
         yield PartsAhead(pool, idle, paths) if readers else None
     finally:
@@ -127,9 +90,8 @@ def parts_ahead(files: Sequence[tuple[FileKind, Path]]) -> Iterator[PartsAhead |
 
 def _processors() -> int:
     """Return how many processors this process may use: as many as its numeric threads."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     limit = os.environ.get("NUMBA_NUM_THREADS", "")
-    return min(available or 1, int(limit) if limit.isdigit() else _MOST_PROCESSES)
+    return min(processors(), int(limit) if limit.isdigit() else _MOST_PROCESSES)
 
 
 def _total_bytes(paths: Sequence[Path]) -> int:
@@ -139,39 +101,9 @@ def _total_bytes(paths: Sequence[Path]) -> int:
         return 0
 
 
-def _send(stream: IO[bytes], value: Any) -> None:
-    """Write a value; columns are written from where they lie."""
-    buffers: list[pickle.PickleBuffer] = []
-    text = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
-    views = [memoryview(text), *(buffer.raw() for buffer in buffers)]
-    stream.write(_LENGTH.pack(len(views)))
-    stream.write(b"".join(_LENGTH.pack(view.nbytes) for view in views))
-    for view in views:
-        stream.write(view)
-    stream.flush()
-
-
-def _receive(stream: IO[bytes]) -> Any:
-    """Read what `_send` has written; raises EOFError."""
-    (count,) = _LENGTH.unpack(_exactly(stream, _LENGTH.size))
-    sizes = _exactly(stream, count * _LENGTH.size)
-    text, *buffers = [_exactly(stream, size) for (size,) in _LENGTH.iter_unpack(sizes)]
-    return pickle.loads(text, buffers=buffers)
-
-
-def _exactly(stream: IO[bytes], size: int) -> bytearray:
-    data = bytearray(size)
-    view, done = memoryview(data), 0
-    while done < size:
-        count = stream.readinto(view[done:])  # type: ignore[attr-defined]
-        if not count:
-            raise EOFError
-        done += count
-    return data
-
-
-def _read(path: Path, max_bytes: int, left: int) -> Answer:
+def _read(request: tuple[Path, int, int]) -> Answer:
     """Read a file of nothing but vertices."""
+    path, max_bytes, left = request
     parts = FileParts()
     try:
         budget = MemoryBudget(max_bytes, left)
@@ -183,17 +115,6 @@ def _read(path: Path, max_bytes: int, left: int) -> Answer:
     return None if parts.has_messages else parts
 
 
-def main() -> None:
-    """Answer until nobody asks any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asked ends this one
-    gc.disable()  # there are very many messages and no reference cycles
-    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # nothing else may write among the answers
-    with contextlib.suppress(EOFError, BrokenPipeError):
-        while True:
-            path, max_bytes, left = _receive(requests)
-            _send(answers, _read(Path(path), max_bytes, left))
-
-
 if __name__ == "__main__":
-    main()
+    gc.disable()  # there are very many messages and no reference cycles
+    serve(_read)

@@ -51,13 +51,6 @@ def process_of(log: Path) -> int:
     return int(log.read_text().split("process ")[1].split()[0])
 
 
-def test_an_order_survives_the_way_to_the_worker(order: SubmapOrder) -> None:
-    strange = dataclasses.replace(order, submap=Path("a\nb \udcff"), ties_stationary=True)
-    line = strange.as_line()
-    assert line.count("\n") == 1
-    assert SubmapOrder.from_line(line) == strange
-
-
 def test_a_worker_optimises_and_stays_for_the_next_submap(
     order: SubmapOrder, pool: WorkerPool
 ) -> None:

@@ -1,23 +1,20 @@
-"""Jobs for pycolmap, in a process of their own: `python -m maplab_py.interop.colmap.child JOB FOLDER`.
+"""Jobs for pycolmap, in a process of their own.
 
 Some functions of pycolmap abort a process that has imported cv2; nothing here imports it. A job reads and
-writes files in its folder. A failure is one line on stderr and status 1.
+writes files in its folder.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from maplab_py.child_processes import end_with_parent
+from maplab_py.child_processes import serve
 
 BINARY, TEXT = "binary", "text"
 """Folders of models below the folder of a job."""
-SYSTEM = "system: "
-"""Begins the last line of a job that the disk refused."""
 
 
 def write_text(folder: Path) -> None:
@@ -121,20 +118,17 @@ def _write_priors(store: Any, model: Any) -> None:
 JOBS = {job.__name__: job for job in (write_text, write_binary, undistort, database)}
 
 
-def main(arguments: list[str]) -> int:
-    """Run a job; return the exit status."""
-    end_with_parent()
-    name, folder = arguments
+def _answer(request: tuple[str, Path]) -> tuple[str, str]:
+    """Run a job on a folder; return what the disk said, and what pycolmap said, empty = nothing."""
+    name, folder = request
     try:
-        JOBS[name](Path(folder))
+        JOBS[name](folder)
     except OSError as error:
-        sys.stderr.write(f"{SYSTEM}{error.strerror}\n")
-        return 1
+        return error.strerror or str(error), ""
     except Exception as error:  # noqa: BLE001  (pycolmap raises its own types)
-        sys.stderr.write(f"{type(error).__name__}: {error}\n")
-        return 1
-    return 0
+        return "", f"{type(error).__name__}: {error}"
+    return "", ""
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    serve(_answer)

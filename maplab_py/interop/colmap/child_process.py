@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import subprocess
-import sys
 from pathlib import Path
 
 from maplab_py.cancellation import check_cancelled, cleaned_up
-from maplab_py.child_processes import kill, processors, start
+from maplab_py.child_processes import Service, ServiceEnded, processors
 from maplab_py.errors import MapError
 from maplab_py.interop.colmap.binary import binary_files
-from maplab_py.interop.colmap.child import BINARY, SYSTEM
+from maplab_py.interop.colmap.child import BINARY
 from maplab_py.interop.colmap.model import ColmapModel
 
 logger = logging.getLogger(__name__)
@@ -23,7 +20,6 @@ _FAILURES = {
     "undistort": "a camera of the model cannot be undistorted: let COLMAP undistort it (image_undistorter)",
     "database": "the database cannot be written: leave out --colmap_database",
 }
-_POLL_S = 0.05
 
 
 def write_job_model(model: ColmapModel, folder: Path) -> None:
@@ -45,26 +41,20 @@ def run_job(job: str, folder: Path, source: Path) -> None:
     Raises:
         MapError: pycolmap refuses the files, or dies.
     """
-    module = "maplab_py.interop.colmap.child"
     log = folder / f"{job}.log"
     with log.open("wb") as errors:
-        process = start(
-            [sys.executable, "-m", module, job, str(folder)],
-            threads=processors(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-        )
-        with cleaned_up(lambda: kill(process) if process.poll() is None else None):
-            while process.poll() is None:
-                check_cancelled()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_POLL_S)
-    if process.returncode:
+        service = Service("maplab_py.interop.colmap.child", threads=processors(), stderr=errors)
+    with cleaned_up(service.end):
+        try:
+            refusal, failure = service.ask((job, folder), _is_cancelled)
+        except ServiceEnded as end:
+            refusal, failure = "", str(end)
+    if refusal or failure:
         text = log.read_text(errors="replace").strip()
-        logger.info(
-            "pycolmap cannot do %s of %s (status %d): %s", job, source, process.returncode, text
-        )
-        last = text.rpartition("\n")[2]
-        reason = last.removeprefix(SYSTEM) if last.startswith(SYSTEM) else _FAILURES[job]
-        raise MapError(f"{source}: {reason}")
+        logger.info("pycolmap cannot do %s of %s: %s %s", job, source, refusal or failure, text)
+        raise MapError(f"{source}: {refusal or _FAILURES[job]}")
+
+
+def _is_cancelled() -> bool:
+    check_cancelled()
+    return False
