@@ -13,7 +13,7 @@ import pytest
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
-from tests.interop.mvs.test_colmap_model import read_by_colmap
+from tests.interop.test_mvs import read_by_colmap
 from tests.support.stereo_room import StereoRoom, quarter_size
 
 

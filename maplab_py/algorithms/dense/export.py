@@ -21,15 +21,15 @@ from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.mvs.colmap_model import encode_model
-from maplab_py.interop.mvs.pmvs import (
+from maplab_py.interop.mvs import (
+    MvsScene,
     bundler_text,
+    encode_model,
     file_number,
     list_text,
     option_text,
     projection_text,
 )
-from maplab_py.interop.mvs.scene import MvsScene
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report

@@ -1,4 +1,4 @@
-"""Folders for PMVS and CMVS: projection matrices, a Bundler file, and an option file.
+"""Files of programs of multi-view stereo: COLMAP's dense workspace, PMVS, CMVS and Bundler.
 
 Sources: Furukawa and Ponce's documentation of PMVS-2 and CMVS; Snavely's of Bundler v0.3, whose cameras
 look along -z with y up.
@@ -6,11 +6,78 @@ look along -z with y up.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.mvs.scene import MvsScene
+from maplab_py.interop.colmap.binary import binary_files
+from maplab_py.interop.colmap.model import (
+    MODELS,
+    PIXEL_CENTRE,
+    ColmapCamera,
+    ColmapFrames,
+    ColmapImages,
+    ColmapModel,
+    ColmapPoints,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MvsScene:
+    """Images (V) of perspective cameras (C) and points (L) with observations (O)."""
+
+    size_px: I64  # (C, 2) width and height
+    K: F64  # (C, 4) fx, fy, cx, cy [px]; the centre of the first pixel is at 0, 0
+    camera: I64  # (V,) rows of cameras
+    names: list[str]  # (V,) files of the images
+    T_C_G: F64  # (V, 7)
+    p_G: F64  # (L, 3)
+    colours: U8  # (L, 3) red, green, blue
+    landmark: I64  # (O,) rows of points
+    view: I64  # (O,) rows of images
+    uv_px: F64  # (O, 2)
+    error_px: F64  # (L,) mean reprojection error
+
+
+_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+"""Files of a dense workspace; undistorted images are not synchronised, so there are no rigs."""
+_PINHOLE = next(model.number for model in MODELS.values() if model.name == "PINHOLE")
+
+
+def encode_model(scene: MvsScene) -> dict[str, bytes]:
+    """Return the files of a model by their names; every image has its observations in their order."""
+    files = binary_files(_model(scene))
+    return {name: b"".join(files[name]) for name in _FILES}
+
+
+def _model(scene: MvsScene) -> ColmapModel:
+    centre = np.array([0.0, 0.0, PIXEL_CENTRE, PIXEL_CENTRE])
+    cameras = tuple(
+        ColmapCamera(row + 1, _PINHOLE, width, height, scene.K[row] + centre)
+        for row, (width, height) in enumerate(scene.size_px.tolist())
+    )
+    order = np.argsort(scene.view, kind="stable")
+    images = ColmapImages(
+        id=_ids(len(scene.names)),
+        camera=scene.camera + 1,
+        T_C_W=scene.T_C_G,
+        name=tuple(scene.names),
+        keypoint_count=np.bincount(scene.view, minlength=len(scene.names)),
+        uv=scene.uv_px[order] + PIXEL_CENTRE,
+        point=scene.landmark[order] + 1,
+    )
+    points = ColmapPoints(_ids(len(scene.p_G)), scene.p_G, scene.colours, scene.error_px)
+    none = np.zeros(0, dtype=np.int64)
+    return ColmapModel(
+        cameras, (), ColmapFrames(none, none, se3.identity(0), none, none), images, points
+    )
+
+
+def _ids(count: int) -> I64:
+    return np.arange(1, count + 1, dtype=np.int64)
+
 
 _BUNDLER_AXES = np.diag([1.0, -1.0, -1.0])
 _OPTIONS = (

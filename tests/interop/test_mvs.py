@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.mvs.colmap_model import encode_model
-from maplab_py.interop.mvs.pmvs import bundler_text, projection_text
-from maplab_py.interop.mvs.scene import MvsScene
+from maplab_py.interop.mvs import MvsScene, bundler_text, encode_model, projection_text
 
 READ = """
 import json, sys

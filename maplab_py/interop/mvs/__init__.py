@@ -1,1 +1,0 @@
-"""File formats of programs of multi-view stereo: COLMAP's models, Bundler's, PMVS's."""
