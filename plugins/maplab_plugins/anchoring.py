@@ -32,15 +32,9 @@ def anchor_all_missions(
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 
-    result, report = anchor_missions(
-        context.vi_map,
-        options,
-        loop_options,
-        absolute=absolute_options,
-        progress=context.progress,
+    return context.apply(
+        anchor_missions, options, loop_options, absolute=absolute_options, progress=context.progress
     )
-    context.commit(result)
-    return report
 
 
 @command("anchor_mission", "am", example="am --map_mission=59f0", see_also=("anchor_all_missions",))
@@ -78,8 +72,8 @@ def anchor_mission(
             context.commit(result)
             return report
         choice = choice_near(context.vi_map, row, context.mission_row(to), pose)
-    result, report = anchor_missions(
-        context.vi_map,
+    return context.apply(
+        anchor_missions,
         options,
         loop_options,
         missions=np.array([row]),
@@ -87,8 +81,6 @@ def anchor_mission(
         absolute=absolute_options,
         progress=context.progress,
     )
-    context.commit(result)
-    return report
 
 
 def _yaw_and_position(text: str) -> F64:

@@ -28,12 +28,10 @@ def register_point_clouds(
     """
     from maplab_py.algorithms.cloud_registration.workflow import close_cloud_loops
 
-    vi_map, report = close_cloud_loops(
-        context.vi_map,
+    return context.apply(
+        close_cloud_loops,
         context.map_folder or Path(),
         options,
         missions=missions.rows(context.vi_map),
         progress=context.progress,
     )
-    context.commit(vi_map)
-    return report

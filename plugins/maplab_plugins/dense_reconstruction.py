@@ -61,8 +61,8 @@ def stereo_dense_reconstruction(
     """
     from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
 
-    vi_map, report = reconstruct_stereo(
-        context.vi_map,
+    return context.apply(
+        reconstruct_stereo,
         context.map_folder or Path(),
         missions.rows(context.vi_map),
         StereoSettings(stereo, sgbm, bm),
@@ -70,8 +70,6 @@ def stereo_dense_reconstruction(
         overwrite=overwrite,
         progress=context.progress,
     )
-    context.commit(vi_map)
-    return report
 
 
 @command(
@@ -85,11 +83,9 @@ def convert_all_depth_maps_to_point_clouds(context: CommandContext) -> Converted
     """
     from maplab_py.algorithms.dense.clouds import convert_depth_maps
 
-    vi_map, report = convert_depth_maps(
-        context.vi_map, context.map_folder or Path(), progress=context.progress
+    return context.apply(
+        convert_depth_maps, context.map_folder or Path(), progress=context.progress
     )
-    context.commit(vi_map)
-    return report
 
 
 @command(

@@ -30,15 +30,13 @@ def extract_features(
     """
     from maplab_py.algorithms.image_features.extraction import extract_features as extract
 
-    result, report = extract(
-        context.vi_map,
+    return context.apply(
+        extract,
         context.map_folder or Path(),
         options,
         missions=chosen.rows(context.vi_map),
         progress=context.progress,
     )
-    context.commit(result)
-    return report
 
 
 @command(
@@ -58,8 +56,6 @@ def track_features(
     """
     from maplab_py.algorithms.image_features.tracks import track_features as track
 
-    result, report = track(
-        context.vi_map, options, missions=chosen.rows(context.vi_map), progress=context.progress
+    return context.apply(
+        track, options, missions=chosen.rows(context.vi_map), progress=context.progress
     )
-    context.commit(result)
-    return report

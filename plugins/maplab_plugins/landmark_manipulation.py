@@ -27,12 +27,9 @@ def retriangulate_landmarks(
     """Triangulate all landmarks from their observations and evaluate their quality."""
     from maplab_py.algorithms.landmarks.triangulation import retriangulate
 
-    missions = chosen.rows(context.vi_map)
-    result, report = retriangulate(
-        context.vi_map, options, missions=missions, progress=context.progress
+    return context.apply(
+        retriangulate, options, missions=chosen.rows(context.vi_map), progress=context.progress
     )
-    context.commit(result)
-    return report
 
 
 @command("init_track_landmarks", "itl", example="itl")
@@ -45,12 +42,9 @@ def init_track_landmarks(
     """Create landmarks for feature tracks that have none, then triangulate all."""
     from maplab_py.algorithms.landmarks.tracks import init_tracks
 
-    missions = chosen.rows(context.vi_map)
-    result, report = init_tracks(
-        context.vi_map, options, missions=missions, progress=context.progress
+    return context.apply(
+        init_tracks, options, missions=chosen.rows(context.vi_map), progress=context.progress
     )
-    context.commit(result)
-    return report
 
 
 @command("evaluate_landmark_quality", "elq", example="elq --elq_min_observers=2")
@@ -63,12 +57,9 @@ def evaluate_landmark_quality(
     """Classify every landmark as good or bad."""
     from maplab_py.algorithms.landmarks.quality import evaluate_quality
 
-    missions = chosen.rows(context.vi_map)
-    result, report = evaluate_quality(
-        context.vi_map, options, missions=missions, progress=context.progress
+    return context.apply(
+        evaluate_quality, options, missions=chosen.rows(context.vi_map), progress=context.progress
     )
-    context.commit(result)
-    return report
 
 
 @command("reset_landmark_quality", "rlq", example="rlq")
@@ -78,10 +69,9 @@ def reset_landmark_quality(
     """Set the quality of all landmarks to unknown."""
     from maplab_py.algorithms.landmarks.quality import reset_quality
 
-    missions = chosen.rows(context.vi_map)
-    result, report = reset_quality(context.vi_map, missions=missions, progress=context.progress)
-    context.commit(result)
-    return report
+    return context.apply(
+        reset_quality, missions=chosen.rows(context.vi_map), progress=context.progress
+    )
 
 
 @command("remove_bad_landmarks", "rbl", example="rbl")
@@ -91,10 +81,9 @@ def remove_bad_landmarks(
     """Remove all landmarks of quality bad; their keypoints stay."""
     from maplab_py.algorithms.landmarks.removal import remove_bad
 
-    missions = chosen.rows(context.vi_map)
-    result, report = remove_bad(context.vi_map, missions=missions, progress=context.progress)
-    context.commit(result)
-    return report
+    return context.apply(
+        remove_bad, missions=chosen.rows(context.vi_map), progress=context.progress
+    )
 
 
 @command("remove_invalid_observations", "rio", example="rio --rio_max_reprojection_error_px=10")
@@ -107,9 +96,9 @@ def remove_invalid_observations(
     """Detach observations that contradict their landmark and create new landmarks from their tracks."""
     from maplab_py.algorithms.landmarks import removal
 
-    missions = chosen.rows(context.vi_map)
-    result, report = removal.remove_invalid_observations(
-        context.vi_map, options, missions=missions, progress=context.progress
+    return context.apply(
+        removal.remove_invalid_observations,
+        options,
+        missions=chosen.rows(context.vi_map),
+        progress=context.progress,
     )
-    context.commit(result)
-    return report

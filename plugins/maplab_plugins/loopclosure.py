@@ -287,9 +287,7 @@ def remove_loopclosure(
     from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 
     ids = find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
-    result, report = remove_closures(context.vi_map, ids)
-    context.commit(result)
-    return report
+    return context.apply(remove_closures, ids)
 
 
 @command("delete_loopclosure_record")
@@ -366,9 +364,7 @@ def _close(
     from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
 
     run = insert_edges if as_edges else close_loops
-    result, report = run(context.vi_map, options, missions=missions, progress=context.progress)
-    context.commit(result)
-    return report
+    return context.apply(run, options, missions=missions, progress=context.progress)
 
 
 def _relax(

@@ -40,15 +40,13 @@ def _optimize(
 ) -> VIOptimizationReport:
     from maplab_py.algorithms.vi_optimization.optimization import optimize
 
-    result, report = optimize(
-        context.vi_map,
+    return context.apply(
+        optimize,
         options,
         missions=chosen.rows(context.vi_map),
         progress=context.progress,
         watch=context.session.watchers.during_command,
     )
-    context.commit(result)
-    return report
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,10 +19,9 @@ def keyframe_heuristic(
     """Keep keyframes and remove the vertices between them; IMU and odometry edges are joined."""
     from maplab_py.algorithms.keyframing.heuristic import keyframe
 
-    missions = chosen.rows(context.vi_map)
-    result, report = keyframe(context.vi_map, options, missions=missions, progress=context.progress)
-    context.commit(result)
-    return report
+    return context.apply(
+        keyframe, options, missions=chosen.rows(context.vi_map), progress=context.progress
+    )
 
 
 @command(

@@ -101,7 +101,4 @@ def artificially_disturb_vertices(
     """Disturb all vertices by a random walk, to test what corrects it."""
     from maplab_py.algorithms.pose_graph_manipulation.layout import disturb_vertices
 
-    missions = chosen.rows(context.vi_map)
-    result, report = disturb_vertices(context.vi_map, options, missions=missions)
-    context.commit(result)
-    return report
+    return context.apply(disturb_vertices, options, missions=chosen.rows(context.vi_map))

@@ -38,15 +38,9 @@ def import_images(
     """
     from maplab_py.interop.resources.images import import_images as attach
 
-    vi_map, report = attach(
-        context.vi_map,
-        context.mission_row(map_mission),
-        dataset_folder,
-        options,
-        progress=context.progress,
+    return context.apply(
+        attach, context.mission_row(map_mission), dataset_folder, options, progress=context.progress
     )
-    context.commit(vi_map)
-    return report
 
 
 @command(
@@ -112,16 +106,14 @@ def import_depth_maps(
     """
     from maplab_py.interop.resources.depth_maps import import_depth_maps as attach
 
-    vi_map, report = attach(
-        context.vi_map,
+    return context.apply(
+        attach,
         context.mission_row(map_mission),
         camera,
         depth_folder,
         options,
         progress=context.progress,
     )
-    context.commit(vi_map)
-    return report
 
 
 @command(
@@ -148,12 +140,10 @@ def import_point_clouds(
     """
     from maplab_py.interop.resources.point_clouds import import_point_clouds as attach
 
-    vi_map, report = attach(
-        context.vi_map,
+    return context.apply(
+        attach,
         context.mission_row(map_mission),
         point_cloud_folder,
         sensor_id,
         progress=context.progress,
     )
-    context.commit(vi_map)
-    return report

@@ -172,15 +172,9 @@ def import_bag_resources(
     """
     from maplab_py.interop.bags.importing import import_bag_resources as attach
 
-    vi_map, report = attach(
-        context.vi_map,
-        context.mission_row(map_mission),
-        rosbag_path,
-        options,
-        progress=context.progress,
+    return context.apply(
+        attach, context.mission_row(map_mission), rosbag_path, options, progress=context.progress
     )
-    context.commit(vi_map)
-    return report
 
 
 def _given(path: Path | None, flag: str) -> Path:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
 from maplab_py.array_types import I64
 from maplab_py.console.session.maps import MapManager
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
     from maplab_py.storage.native import DiskCopy
     from maplab_py.vimap import VIMap
+
+ArgumentsT = ParamSpec("ArgumentsT")
+ReportT = TypeVar("ReportT")
 
 
 class CommandContext:
@@ -79,6 +83,17 @@ class CommandContext:
     def commit(self, vi_map: VIMap) -> None:
         """Set the new value of the selected map."""
         self._drafts[self.maps.selected.key] = vi_map
+
+    def apply(
+        self,
+        edit: Callable[Concatenate[VIMap, ArgumentsT], tuple[VIMap, ReportT]],
+        *arguments: ArgumentsT.args,
+        **named: ArgumentsT.kwargs,
+    ) -> ReportT:
+        """Commit what an edit of the selected map returns, and return its report."""
+        vi_map, report = edit(self.vi_map, *arguments, **named)
+        self.commit(vi_map)
+        return report
 
     @property
     def has_drafts(self) -> bool:

@@ -164,9 +164,7 @@ def merge_map(
     if map_key == context.map_key:
         raise UserError(f"merge_map: '{map_key}' is the selected map; name another one")
     other = context.maps.get(map_key)
-    merged, report = merge_maps(context.vi_map, other.vi_map, assign_new_ids=assign_new_ids)
-    context.commit(merged)
-    return report
+    return context.apply(merge_maps, other.vi_map, assign_new_ids=assign_new_ids)
 
 
 @command("join_all_maps", example="join_all_maps --target_map_key=all", needs_map=False)
