@@ -8,18 +8,18 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import select
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from maplab_py.errors import Cancelled
-
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
 
 _PARENT_VARIABLE = "MAPLAB_ENDS_WITH_PROCESS"
 """Process whose end ends this one."""
@@ -101,9 +101,7 @@ class Service:
         self, module: str, *arguments: str, threads: int = 1, stderr: Any = subprocess.DEVNULL
     ) -> None:
         """Start it; raises OSError where the system starts no process."""
-        from multiprocessing import Pipe
-
-        self._connection, theirs = Pipe()
+        self._connection, theirs = socket.socketpair()
         try:
             self._process = start(
                 [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
@@ -138,11 +136,11 @@ class Service:
         """
         try:
             _send(self._connection, request)
-            while not self._connection.poll(SECONDS_BETWEEN_LOOKS):
+            while not _is_readable(self._connection, SECONDS_BETWEEN_LOOKS):
                 if is_cancelled():
                     raise Cancelled
             return _receive(self._connection)
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, ValueError) as error:  # or another thread has called `end`
             raise ServiceEnded(self._process.wait()) from error
         except BaseException:
             self.end()
@@ -150,8 +148,8 @@ class Service:
 
     def end(self) -> None:
         """Kill it, and wait for its end."""
-        self._connection.close()
         kill(self._process)
+        self._connection.close()
 
 
 class ServiceEnded(Exception):
@@ -165,31 +163,44 @@ class ServiceEnded(Exception):
 
 def serve(answer: Callable[[Any], Any], idle_s: float | None = None) -> None:
     """Answer the requests of the process that started this one, until none comes for so long [s]."""
-    from multiprocessing.connection import Connection
-
     end_with_parent()
     with (
-        Connection(int(sys.argv[1])) as connection,
+        socket.socket(fileno=int(sys.argv[1])) as connection,
         contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError),
     ):
-        while connection.poll(idle_s):
+        while _is_readable(connection, idle_s):
             _send(connection, answer(_receive(connection)))
 
 
-def _send(connection: Connection, value: Any) -> None:
+def _is_readable(connection: socket.socket, seconds: float | None) -> bool:
+    return bool(select.select([connection], [], [], seconds)[0])
+
+
+def _send(connection: socket.socket, value: Any) -> None:
+    """Send a value: the number and sizes of its parts, a pickle, and its arrays."""
     buffers: list[pickle.PickleBuffer] = []
     text = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
-    views = [buffer.raw() for buffer in buffers]
-    connection.send((text, [view.nbytes for view in views]))
+    views = [memoryview(text), *(buffer.raw() for buffer in buffers)]
+    sizes = [view.nbytes for view in views]
+    connection.sendall(struct.pack(f"<{len(views) + 1}Q", len(views), *sizes))
     for view in views:
-        if view.nbytes:
-            connection.send_bytes(view)
+        connection.sendall(view)
 
 
-def _receive(connection: Connection) -> Any:
-    text, sizes = connection.recv()
-    buffers = [bytearray(size) for size in sizes]
-    for buffer in buffers:
-        if buffer:
-            connection.recv_bytes_into(buffer)
+def _receive(connection: socket.socket) -> Any:
+    """Receive what `_send` sends; raises EOFError where the other side has ended."""
+    (count,) = struct.unpack("<Q", _receive_bytes(connection, 8))
+    sizes = struct.unpack(f"<{count}Q", _receive_bytes(connection, 8 * count))
+    text, *buffers = [_receive_bytes(connection, size) for size in sizes]
     return pickle.loads(text, buffers=buffers)
+
+
+def _receive_bytes(connection: socket.socket, size: int) -> bytearray:
+    data = bytearray(size)
+    view = memoryview(data)
+    while view:
+        count = connection.recv_into(view)
+        if not count:
+            raise EOFError
+        view = view[count:]
+    return data
