@@ -66,7 +66,10 @@ def parse_arguments(argv: Sequence[str]) -> Arguments:
         if arguments.mode == "command":
             _take_command_word(arguments, word, name)
         elif word == "-c":
-            arguments.mode, arguments.text = "commands", _next(rest, "-c needs the commands to run")
+            if arguments.mode in ("run", "batch"):
+                raise FlagError(f"-c cannot stand beside {arguments.mode} (see: maplab --help)")
+            commands = [arguments.text, _next(rest, "-c needs the commands to run")]
+            arguments.mode, arguments.text = "commands", "; ".join(filter(None, commands))
         elif word == "-h" or (looks_like_flag(word) and name in SWITCHES and not has_value):
             setattr(arguments, "help" if word == "-h" else name, True)
         elif looks_like_flag(word) and name == "flagfile":

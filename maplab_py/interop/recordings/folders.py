@@ -415,17 +415,21 @@ def _image_rows(path: Path) -> tuple[list[str], list[str], I64, str]:
     lines: list[int] = []
     header = ""
     for number, line in enumerate(text.splitlines(), start=1):
-        content = line.strip()
+        content = line.replace('"', "").strip()
         if not content:
             continue
         words = re.split(r"\s*[,\s]\s*", content, maxsplit=1)
         if content.startswith("#") or (not tokens and not header and not content[0].isdigit()):
             header = header or content.split(",")[0]
             continue
-        if len(words) != 2 or "/" in words[1] or not words[1]:
-            raise MapError(f"{path}:{number}: a row must be a time stamp and the name of an image")
+        name = words[-1].removeprefix("./").removeprefix("data/")
+        if len(words) != 2 or "/" in name or not name:
+            raise MapError(
+                f"{path}:{number}: a row must be a time stamp and the name of an image in data/, not "
+                f"'{content}'"
+            )
         tokens.append(words[0])
-        files.append(words[1])
+        files.append(name)
         lines.append(number)
     if not tokens:
         raise MapError(f"{path}: the recording is empty: there are no images in the table")

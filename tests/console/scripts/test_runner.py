@@ -238,12 +238,23 @@ def test_program_arguments() -> None:
         ["solve", "--ba_n", "3", "--help", "x"],
         True,
     )
+    assert parse_arguments(["-c", "load a", "--json", "-c", "elq"]).text == "load a; elq"
     assert parse_arguments([]).mode == "prompt"
     assert parse_arguments(["--help"]).help
     assert parse_arguments(["--version"]).version
 
 
-@pytest.mark.parametrize("argv", [["-c"], ["run"], ["batch"], ["--flagfile"], ["-c", "a", "b"]])
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["-c"],
+        ["run"],
+        ["batch"],
+        ["--flagfile"],
+        ["-c", "a", "b"],
+        ["run", "a.maplab", "-c", "elq"],
+    ],
+)
 def test_wrong_program_arguments(argv: list[str]) -> None:
     with pytest.raises(FlagError):
         parse_arguments(argv)

@@ -58,6 +58,19 @@ def test_the_path_may_be_mav0(folder: Path) -> None:
     assert_content(list(EventStream(open_recording(folder / "mav0"))), make_content())
 
 
+def test_names_of_images_with_their_folder_and_in_quotes(tmp_path: Path) -> None:
+    content = make_content(frames=3)
+    folder = write_folder(content, tmp_path / "room")
+    for camera, row in (("cam0", '"{}","data/{}"'), ("cam1", "{},./data/{}")):
+        table = folder / "mav0" / camera / "data.csv"
+        lines = [row.format(*line.split(",")) for line in table.read_text().splitlines()[1:]]
+        table.write_text("\n".join(['"#timestamp [ns]","filename"', *lines]) + "\n")
+    assert_content(list(EventStream(open_recording(folder))), content)
+    table.write_text(table.read_text().replace("./data/", "../"))
+    with pytest.raises(MapError, match=r"data.csv:2: .* image in data/, not '\d+,../\d+.png'"):
+        open_recording(folder)
+
+
 def test_grey_values_of_any_image(tmp_path: Path) -> None:
     content = make_content(cameras=1, frames=1, dtype=np.uint16)
     (deep,) = frame_sets(
