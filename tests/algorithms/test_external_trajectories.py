@@ -141,6 +141,10 @@ def test_kitti(tmp_path: Path) -> None:
     result = read_kitti(path, times)
     np.testing.assert_allclose(se3.local(result.T_R_B, poses.T_R_B), 0.0, atol=1e-9)
     assert np.abs(np.diff(result.times_ns) - np.diff(poses.times_ns)).max() <= 1
+    times.write_text("\n".join(map(str, (poses.times_ns + 1_403_715_273_262_142_976).tolist())))
+    stamped = read_kitti(path, times)
+    assert stamped.times_ns.tolist() == (poses.times_ns + 1_403_715_273_262_142_976).tolist()
+    assert stamped.note == f"{times}: time stamps are read as ns"
     times.write_text("0.0\n0.1\n")
     with pytest.raises(MapError, match="2 time stamps"):
         read_kitti(path, times)

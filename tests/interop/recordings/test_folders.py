@@ -15,7 +15,7 @@ import pytest
 from maplab_py.errors import FlagError, MapError, MaplabError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.opening import open_recording
-from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import CameraImage, FrameSet, ImuBatch
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
@@ -69,6 +69,40 @@ def test_names_of_images_with_their_folder_and_in_quotes(tmp_path: Path) -> None
     table.write_text(table.read_text().replace("./data/", "../"))
     with pytest.raises(MapError, match=r"data.csv:2: .* image in data/, not '\d+,../\d+.png'"):
         open_recording(folder)
+
+
+def test_an_imu_in_us_beside_images_in_ns(tmp_path: Path) -> None:
+    content = make_content(frames=6)
+    folder = write_folder(content, tmp_path / "room")
+    table = folder / "mav0/imu0/data.csv"
+    header, *rows = table.read_text().splitlines()
+    shortened = [f"{row[:16]}{row[19:]}" for row in rows]
+    table.write_text("\n".join([header, *shortened]) + "\n")
+    report = summarise(open_recording(folder))
+    assert report.imu is not None
+    assert (report.frame_sets, report.imu.samples) == (6, len(rows))
+    assert report.imu.rate_hz == pytest.approx(200.0)
+    assert any(f"{table}: time stamps are read as us: in ns" in note for note in report.notes)
+
+
+def test_missing_images_of_all_cameras_are_listed_and_left_out(tmp_path: Path) -> None:
+    content = make_content(frames=8)
+    folder = write_folder(content, tmp_path / "room")
+    missing = [
+        folder / f"mav0/cam{camera}/data/{content.stamps_ns[camera][row]}.png"
+        for camera, row in ((0, 2), (0, 3), (1, 6))
+    ]
+    for path in missing:
+        path.unlink()
+    message = r"the image is missing \(2 of 8 in cam0, 1 of 8 in cam1\).*--skip_missing_images"
+    with pytest.raises(MapError, match=message):
+        list(EventStream(open_recording(folder)))
+    skipping = SourceOptions(reading=ReadingOptions(skip_missing_images=True))
+    report = summarise(open_recording(folder, skipping))
+    assert report.frame_sets == 5
+    assert [note for note in report.notes if "missing, left out" in note] == [
+        f"missing, left out: {path}" for path in missing
+    ]
 
 
 def test_grey_values_of_any_image(tmp_path: Path) -> None:

@@ -8,12 +8,13 @@ import sqlite3
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.recordings.opening import open_recording
-from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (
@@ -215,6 +216,33 @@ def test_images_that_cannot_be_read_are_noted(
     for row, note in enumerate(notes):
         assert f"/cam{row}/image_raw at" in note
         assert f"'{encoding}' {words}" in note
+
+
+def test_videos_are_noted_and_converted_encodings_named(
+    tmp_path: Path, calibrated: SourceOptions
+) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    video = store.types["sensor_msgs/msg/CompressedImage"]
+    messages = [
+        (t, "/imu0", imu_message(store, t, values, 1))
+        for t, values in zip(CONTENT.imu_ns.tolist(), CONTENT.accel_gyro, strict=True)
+    ]
+    for t, image in zip(CONTENT.stamps_ns[0].tolist(), CONTENT.images[0], strict=True):
+        header = image_message(store, t, image, "mono8", 1).header
+        packet = np.frombuffer(b"\0\0\0\1gB" * 9, dtype=np.uint8)
+        messages.append((t, "/cam0/image_raw", video(header, "h264", packet)))
+        mosaic = image_message(store, t, image, "bayer_rggb8", 1)
+        messages.append((t, "/cam1/image_raw", mosaic))
+    write_messages(tmp_path / "v.bag", store, sorted(messages, key=lambda entry: entry[:2]))
+    assert [topic.encoding for topic in bag_info(tmp_path / "v.bag").images] == [
+        "h264",
+        "bayer_rggb8",
+    ]
+    wide = StreamOptions(nframe_sync_tolerance_ns=1_000_000)
+    notes = summarise(open_recording(tmp_path / "v.bag", calibrated), wide).notes
+    assert notes[0] == "images are converted: camera 1 bayer_rggb8"
+    assert "/cam0/image_raw at" in notes[1]
+    assert "'h264' is a video" in notes[1]
 
 
 def image_bag(tmp_path: Path, **changes: object) -> Path:
