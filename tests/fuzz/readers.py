@@ -163,14 +163,22 @@ def _table_seeds(folder: Path) -> list[bytes]:
     closures = f"- camera_from: {end}\n  camera_to: {end}\n  T_from_to: {pose}\n"
     closures += f"  covariance: {np.eye(6).tolist()}\n  switch_variable: 1.0\n"
     closures += "  switch_variable_variance: 0.1\n"
+    dated = '"time";"x [mm]";"y [mm]";"z [mm]"\n'
+    dated += "".join(f"2024-05-06T07:08:0{row}.5Z;{row},5;0;0\n" for row in range(4))
+    named = "sec,nanosec,ax [g],ay [g],az [g],gyro.x [deg/s],gyro.y [deg/s],gyro.z [deg/s],t\n"
+    named += "".join(f"5,{5_000_000 * row},0,0,1,0,0.1,0,25\n" for row in range(4))
+    driven = "time,linear.x [km/h],linear.y,linear.z,angular.x,angular.y,angular.z\n"
+    driven += "".join(f"0.{row},7,0,0,0,0,0.1\n" for row in range(4))
     kinds = ((0, tum), (0, euroc), (1, imu), (2, wheels), (3, times), (4, closures))
+    kinds += ((0, dated), (1, named), (2, driven))
     return [bytes([kind]) + text.encode() for kind, text in kinds]
 
 
 def _read_table(folder: Path, data: bytes) -> None:
     path = _named(folder, _TABLES, data)
     readers: tuple[Callable[[Path], object], ...] = (
-        *(read_trajectory, read_imu_csv, read_wheel_odometry, read_times),
+        lambda file: read_trajectory(file, needs_orientation=False),
+        *(read_imu_csv, read_wheel_odometry, read_times),
         lambda file: read_external_closures(_map(), file),
     )
     readers[_TABLES.index(path.name)](path)
@@ -192,7 +200,11 @@ def _gps_seeds(folder: Path) -> list[bytes]:
         "$GPGGA,092726.00,4717.11399,N,00833.91590,E,1,08,1.01,499.6,M,48.0,M,,*58\n"
     )
     table = "#timestamp [ns],latitude,longitude,altitude\n1403715273262142976,47.1,8.5,499\n"
-    return [b"\0" + nmea.encode(), b"\1" + (table + "1403715274262142976,47.1,8.5,5\n").encode()]
+    gns = "$GNZDA,092725.00,09,12,2002,00,00\n$GNGNS,092725.00,4717.1,N,00833.9,E,RR,8,1,9,48,,\n"
+    rtklib = "%  UTC  latitude(deg) longitude(deg)  height(m) Q\n"
+    rtklib += "".join(f"2023/11/14 22:13:2{row}.0  47.1 8.5 400 1\n" for row in range(3))
+    texts = (table + "1403715274262142976,47.1,8.5,5\n", rtklib)
+    return [b"\0" + nmea.encode(), b"\0" + gns.encode(), *(b"\1" + t.encode() for t in texts)]
 
 
 def _read_gps(folder: Path, data: bytes) -> None:
