@@ -12,10 +12,10 @@ class PipelineOptions(Options):
     """Workers of a pipeline, and treatment of tasks that fail."""
 
     scheduler: str = "none"
-    """Where tasks run: none (one after another), local:N (N processes of this machine) or tcp://HOST:PORT (a
-    Dask scheduler with its workers)."""
+    """Place of the tasks: none (one after another), local:N (N processes of this machine) or tcp://HOST:PORT
+    (a Dask scheduler with its workers)."""
     retries: int = option(1, ge=0)
-    """How often a task is tried again that failed other than by wrong usage."""
+    """Further attempts at a task that failed other than by wrong usage."""
     resume: bool = False
     """Keep the tasks that an earlier run finished; run only the others."""
     redo_changed: bool = False

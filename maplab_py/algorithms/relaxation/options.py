@@ -18,7 +18,7 @@ class RelaxationOptions(Options, prefix="relax_"):
     """
 
     robustness: str = option("gnc", choices=("gnc", "switchable", "dcs", "cauchy", "none"))
-    """How false loop closures are kept from doing harm: 'gnc' (graduated non-convexity) finds those that
+    """Treatment of false loop closures: 'gnc' (graduated non-convexity) finds those that
     agree with one another, trusts them fully and the others not at all; 'switchable' estimates a switch
     variable for each one, 'dcs' (dynamic covariance scaling) reduces their weights in closed form, 'cauchy'
     is a Cauchy loss, 'none' trusts all of them."""

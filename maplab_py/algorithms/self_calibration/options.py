@@ -44,11 +44,11 @@ class SelfCalibrationOptions(Options, prefix="sc_"):
     """Parameter groups that each keep their own segments, separated by commas; several joined by + are one
     group (imu+camera+extrinsics: a single one)."""
     metric: str = option("a_optimality", choices=METRICS)
-    """How a group's covariance becomes one number."""
+    """Number that stands for a group's covariance."""
     selection: str = option("informative", choices=SELECTIONS)
-    """Which segments to take."""
+    """Segments to take."""
     segments_per_group: int = option(8, ge=1)
-    """How many segments each group keeps."""
+    """Number of segments that each group keeps."""
     segment_keyframes: int = option(40, ge=3)
     """Keyframes of a segment."""
     seed: int = 1

@@ -19,7 +19,7 @@ class WindowOptions(Options, prefix="vio_"):
     num_recent_frames: int = option(3, ge=1)
     """Frames in the window that follow the last keyframe."""
     landmark_policy: str = option("all", choices=("all", "thesis"))
-    """Which tracks are estimated: all with parallax, or as in the thesis terminated and long ones only, the
+    """Tracks that are estimated: all with parallax, or as in the thesis terminated and long ones only, the
     best of them by score."""
     max_landmarks: int = option(300, ge=10)
     """Landmarks that the newest frame sees; the longest tracks are taken. Landmarks whose tracks have ended

@@ -35,7 +35,7 @@ class BagExportOptions(Options, prefix="bag_"):
     format: str = option("", choices=("", *FORMATS))
     """ROS 1, or ROS 2 with sqlite3 or mcap; empty = ROS 1 for files .bag, else mcap"""
     content: str = ",".join(CONTENTS)
-    """What is written, separated by commas, where the map has it"""
+    """Parts to write, separated by commas, where the map has them"""
     world_frame: str = "map"
     """Name of the global frame G"""
     odom_frame: str = "mission"
