@@ -8,7 +8,6 @@ import logging
 import os
 import time
 from collections import Counter
-from types import TracebackType
 from typing import Any, Self
 
 from maplab_py.cancellation import check_cancelled
@@ -172,12 +171,7 @@ class Cluster:
             return Outcome(title, Ending.FAILED, f"{title}: {reason}")
         return outcome
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Cancel what runs, and stop what was started."""
         self._close()
 
