@@ -229,5 +229,5 @@ def test_commands_do_the_same_on_mapped_columns(
 
 
 def test_the_size_of_the_cache_must_be_positive() -> None:
-    with pytest.raises(Exception, match="--map_cache_max_gb=0: must be a positive number"):
+    with pytest.raises(Exception, match="--map_cache_max_gb=0: must be above 0"):
         CacheOptions(map_cache_max_gb=0.0)

@@ -96,7 +96,7 @@ def test_memory_says_what_is_kept_and_bounds_it(session: Session) -> None:
 
 
 def test_a_bound_below_zero_is_refused(session: Session) -> None:
-    with pytest.raises(FlagError, match="--undo_max_gb=-1: must be a number of gigabytes"):
+    with pytest.raises(FlagError, match="--undo_max_gb=-1: must be at least 0"):
         session.run("memory", undo_max_gb=-1.0)
 
 
