@@ -77,11 +77,6 @@ def make_problem(
 
 
 def _check(options: SolverFlags) -> None:
-    if not 0.0 < options.pcg_forcing < 1.0:
-        raise FlagError(f"--ba_pcg_forcing={options.pcg_forcing:g} is not between 0 and 1")
-    for name in ("submaps", "submap_rounds"):
-        if getattr(options, name) < 0:
-            raise FlagError(f"--ba_{name}={getattr(options, name)} must not be negative")
     if options.submaps and options.linear_solver_type in ("pcg", "superlu"):
         raise FlagError(
             f"--ba_submaps factorises: drop --ba_linear_solver_type={options.linear_solver_type}, or "

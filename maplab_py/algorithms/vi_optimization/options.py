@@ -161,17 +161,17 @@ class SolverFlags(Options):
     max_memory_gb: float = 0.0
     """Memory that the direct solver may take; where it needs more, auto takes conjugate gradients; 0 = half
     of what is free."""
-    pcg_forcing: float = 0.01
+    pcg_forcing: float = option(0.01, gt=0, lt=1)
     """Share of the residual that a step by conjugate gradients may leave; 0.0001 follows the direct solver
     more closely and takes about twice as many iterations; between 0 and 1."""
     ordering: str = option("auto", choices=("auto", "minimum_degree", "nested_dissection"))
     """Elimination order of the linear solver: minimum degree, nested dissection (for trajectories that
     overlap), or whichever of them takes less work"""
-    submaps: int = 0
+    submaps: int = option(0, ge=0)
     """Number of submaps into which the problem is cut where few states connect them; keep the equations of
     one submap at a time in memory, the others in the temporary folder (TMPDIR); the steps are those of the
     direct solver; 0 = all in memory."""
-    submap_rounds: int = 0
+    submap_rounds: int = option(0, ge=0)
     """Largest number of rounds over all submaps with --ba_submaps, each of which is an iteration of the joint
     problem; 0 = --ba_num_iterations."""
     trust_region_schedule: str = option("step_quality", choices=("step_quality", "ceres"))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.transport import (
@@ -28,7 +28,7 @@ from maplab_py.interop.recordings.bag_writing import (
     format_of_path,
     write_bag,
 )
-from maplab_py.options import Options
+from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
 
@@ -42,18 +42,12 @@ class RecordingOptions(Options, prefix="record_"):
 
     topics: str = ""
     """Topics, separated by commas; empty = all of standard types"""
-    duration_s: float = 0.0
+    duration_s: float = option(0.0, ge=0, lt=1e9)
     """End after so long; 0 = until Ctrl-C or silence"""
 
     @property
     def names(self) -> list[str]:
-        """Topics to record; empty = all.
-
-        Raises:
-            FlagError: The duration is negative.
-        """
-        if not 0.0 <= self.duration_s < 1e9:
-            raise FlagError(f"--record_duration_s={self.duration_s:g}: wants 0 or more")
+        """Topics to record; empty = all."""
         return [topic_of(word) for word in self.topics.split(",") if word.strip()]
 
 

@@ -110,7 +110,7 @@ def test_steps_are_as_exact_as_the_forcing_says() -> None:
     ]
     assert iterations[0] < iterations[1]
     for forcing in (0.0, 1.0, -0.1, float("nan")):
-        with pytest.raises(FlagError, match=r"--ba_pcg_forcing=.* is not between 0 and 1"):
+        with pytest.raises(FlagError, match=r"--ba_pcg_forcing=.* must be above 0 and below 1"):
             built(pcg_forcing=forcing)
 
 
@@ -189,8 +189,8 @@ def test_submaps_say_what_is_in_memory_and_refuse_other_solvers() -> None:
     assert "GB in memory, the rest in" in line
     for flags, said in (
         ({"submaps": 4, "linear_solver_type": "pcg"}, "drop --ba_linear_solver_type=pcg"),
-        ({"submaps": -1}, "--ba_submaps=-1 must not be negative"),
-        ({"submap_rounds": -1}, "--ba_submap_rounds=-1 must not be negative"),
+        ({"submaps": -1}, "--ba_submaps=-1: must be at least 0"),
+        ({"submap_rounds": -1}, "--ba_submap_rounds=-1: must be at least 0"),
     ):
         with pytest.raises(FlagError, match=said):
             build(sessions(), VIOptimizationOptions(**flags))  # type: ignore[arg-type]
