@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from maplab_py.array_types import F64, I64, Mask
 
 YES_NO = "yes or no"
 """Unit of gates whose value is 1 = yes or 0 = no."""
+_DIGITS = 4
+"""Significant digits of flags that are proposed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,6 +52,19 @@ class Gate:
         passing = values if flag_value is None else flag_value
         return cls(name, verdict, values, limits, applying, passing, flag, unit, is_minimum)
 
+    @classmethod
+    def of_known(
+        cls,
+        name: str,
+        value: NDArray[Any],
+        threshold: float,
+        verdict: str,
+        flag: str = "",
+        **rest: Any,
+    ) -> Gate:
+        """Return a gate that applies to the rows whose value is a number."""
+        return cls.of(name, value, threshold, verdict, flag, applies=~np.isnan(value), **rest)
+
     @property
     def failed(self) -> Mask:
         """Rows (N,) whose value is beyond the threshold."""
@@ -62,10 +78,13 @@ class Gate:
         distance = np.abs(self.value - self.threshold) / size
         return np.where(self.failed, distance, 0.0)
 
-    def take(self, rows: I64 | Mask) -> Gate:
-        """Return the gate for some of the rows."""
-        names = ("value", "threshold", "applies", "flag_value")
-        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+    def passing_value(self, row: int) -> float:
+        """Return the flag's value with which a row passes, rounded so that it does."""
+        value = float(self.flag_value[row])
+        if not math.isfinite(value):
+            return value
+        scale = 10.0 ** (_DIGITS - 1 - math.floor(math.log10(max(abs(value), 1e-9))))
+        return (math.floor if self.is_minimum else math.ceil)(value * scale) / scale
 
     def describe(self, row: int) -> tuple[str, str, str]:
         """Return value, wanted values and result (passed, failed, not checked) of a row as text."""
@@ -83,3 +102,10 @@ class Gate:
 def any_failed(gates: list[Gate]) -> Mask:
     """Return which rows (N,) fail any of the gates."""
     return np.asarray(np.any([gate.failed for gate in gates], axis=0))
+
+
+def failures(gates: list[Gate]) -> tuple[I64, F64]:
+    """Return how many gates each row (N,) fails, and its shortfalls summed over them."""
+    failed = np.stack([gate.failed for gate in gates])
+    shortfall = np.stack([gate.shortfall for gate in gates])
+    return failed.sum(axis=0, dtype=np.int64), shortfall.sum(axis=0)

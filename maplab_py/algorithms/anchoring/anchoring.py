@@ -214,7 +214,7 @@ def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
         mission_B=np.maximum(A, B),
         T_A_I=T_A_I,
         T_B_I=T_B_I,
-        weight=c.inlier_count[rows].astype(np.float64),
+        weight=c.inliers[rows].astype(np.float64),
     )
 
 

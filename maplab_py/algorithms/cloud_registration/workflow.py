@@ -31,7 +31,7 @@ from maplab_py.algorithms.loop_closure.closure_table import (
     closure_edges,
     closure_ids,
 )
-from maplab_py.algorithms.loop_closure.gates import judge
+from maplab_py.algorithms.loop_closure.gates import judge, measure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import Verdict
@@ -234,36 +234,25 @@ def judge_matches(
     """
     solutions = _solutions(vi_map, scans, matches)
     query, place = scans.vertex[matches.query], scans.vertex[matches.place]
-    verdict = _fit_verdicts(matches, options)
-    left = np.flatnonzero(verdict == VERDICTS.index(Verdict.ACCEPTED))
-    support = np.zeros(len(matches), dtype=np.int64)
-    change = _corrections(vi_map, query, place, solutions.T_M_I)
-    if len(left):
-        judgement = judge(
-            vi_map,
-            query[left],
-            place[left],
-            _take(solutions, left),
-            _closure_options(options),
-            is_known=vi_map.baseframes.is_known[vi_map.missions.baseframe],
-        )
-        judgement.refuse(judgement.support < options.min_support, Verdict.NO_SUPPORT)
-        verdict[left], support[left] = judgement.verdict, judgement.support
+    is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    measured = dataclasses.replace(
+        measure(vi_map, query, place, solutions, is_known), verdict=_fit_verdicts(matches, options)
+    )
+    T_M_I, thresholds = solutions.T_M_I, _closure_options(options)
+    judged, _ = judge(vi_map, query, place, T_M_I, measured, thresholds)
+    alone = judged.accepted & (
+        judged.support < options.min_support
+    )  # inliers do not replace it here
+    judged.verdict[alone], judged.difference[alone] = VERDICTS.index(Verdict.NO_SUPPORT), 0.0
     none = np.zeros(0, dtype=np.int64)
     return Closures(
+        **vars(judged),
         id=closure_ids(vi_map, query, place) ^ _ID_OF_CLOUDS,
         query_vertex=query,
         place_vertex=place,
-        T_M_I=solutions.T_M_I,
-        T_A_B=se3.relative(solutions.T_M_I, vi_map.vertices.T_M_I[place]),
+        T_M_I=T_M_I,
+        T_A_B=se3.relative(T_M_I, vi_map.vertices.T_M_I[place]),
         covariance=solutions.covariance,
-        match_count=matches.compared,
-        inlier_count=matches.agreeing,
-        tilt_deg=np.degrees(solutions.tilt_rad),
-        correction_m=np.linalg.norm(change[:, :3], axis=1),
-        correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
-        verdict=verdict,
-        support=support,
         start=np.zeros(len(matches) + 1, dtype=np.int64),
         keypoint=none,
         landmark=none,
@@ -326,21 +315,6 @@ def _covariance(information: F64, T_I_Q: F64, T_M_I: F64) -> F64:
     covariance = J @ np.linalg.inv(information[usable]) @ np.swapaxes(J, 1, 2)
     result[usable] = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
     return result
-
-
-def _corrections(vi_map: VIMap, query: I64, place: I64, T_M_I: F64) -> F64:
-    """Return how closures change the poses of their queries in G (N, 6)."""
-    T_G_M = vi_map.T_G_M[vi_map.vertices.mission[place]]
-    return se3.local(vi_map.T_G_I[query], se3.compose(T_G_M, T_M_I))
-
-
-def _take(solutions: PoseSolutions, rows: I64) -> PoseSolutions:
-    kept = {
-        field.name: getattr(solutions, field.name)[rows]
-        for field in dataclasses.fields(solutions)
-        if field.name != "is_inlier"
-    }
-    return PoseSolutions(**kept, is_inlier=solutions.is_inlier)
 
 
 def _closure_options(options: CloudClosureOptions) -> LoopClosureOptions:

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.gate import Gate
+from maplab_py.algorithms.gate import Gate, any_failed
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance, largest_sigma
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, LandmarkQualityReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64
 from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
@@ -32,24 +32,7 @@ _REASONS = {
     "too_far": "too far away",
     "too_large_error": "with too large an error",
 }
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Verdict:
-    """Failed quality criteria (L,) of landmarks."""
-
-    too_few_observers: Mask
-    too_small_angle: Mask
-    too_uncertain: Mask
-    too_near_or_behind: Mask
-    too_far: Mask
-    too_large_error: Mask
-
-    @property
-    def is_good(self) -> Mask:
-        """Landmarks that pass all criteria."""
-        reasons = [getattr(self, field.name) for field in dataclasses.fields(self)]
-        return np.asarray(~np.any(reasons, axis=0))
+"""Verdicts of the criteria, counted by fields of the report, in words."""
 
 
 def evaluate_quality(
@@ -76,12 +59,23 @@ def evaluate_quality(
     """
     progress.check()
     rows = np.flatnonzero(landmark_mask(vi_map, missions))
-    verdict = judge(vi_map, rows, options)
+    judged, reasons = _judge(vi_map, rows, options)
+    before, after = vi_map.landmarks.quality[rows], judged.landmarks.quality[rows]
+    return judged, _report(before, after, reasons)
+
+
+def _judge(
+    vi_map: VIMap, rows: I64, options: LandmarkQualityOptions
+) -> tuple[VIMap, dict[str, int]]:
+    """Return the map with the quality of some landmarks, and how many of them fail each criterion."""
+    gates = criteria(vi_map, rows, options)
     quality = vi_map.landmarks.quality.copy()
-    before = quality[rows]
-    quality[rows] = np.where(verdict.is_good, LandmarkQuality.GOOD, LandmarkQuality.BAD)
-    report = _report(before, quality[rows], _counts(verdict))
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), report
+    quality[rows] = np.where(any_failed(gates), LandmarkQuality.BAD, LandmarkQuality.GOOD)
+    counts = {
+        name: int(any_failed([gate for gate in gates if gate.verdict == name]).sum())
+        for name in _REASONS
+    }
+    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), counts
 
 
 def reset_quality(
@@ -97,18 +91,10 @@ def reset_quality(
     return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), report
 
 
-def judge(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> Verdict:
-    """Return the failed criteria of landmarks (N,); observations of all missions count."""
-    failed = {f.name: np.zeros(len(landmarks), dtype=np.bool_) for f in dataclasses.fields(Verdict)}
-    for gate in criteria(vi_map, landmarks, options):
-        failed[gate.verdict] |= gate.failed
-    return Verdict(**failed)
-
-
 def criteria(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> list[Gate]:
     """Return the criteria for landmarks (N,): those of camera landmarks, then those of lidar landmarks.
 
-    Their verdicts are the fields of `Verdict`.
+    Observations of all missions count.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -231,12 +217,7 @@ def _report(
         good_before=int(old[good]),
         bad_before=int(old[bad]),
         unknown_before=int(old[unknown]),
-        too_few_observers=reasons.get("too_few_observers", 0),
-        too_small_angle=reasons.get("too_small_angle", 0),
-        too_uncertain=reasons.get("too_uncertain", 0),
-        too_near_or_behind=reasons.get("too_near_or_behind", 0),
-        too_far=reasons.get("too_far", 0),
-        too_large_error=reasons.get("too_large_error", 0),
+        **reasons,
         note=note,
     )
 
@@ -269,19 +250,13 @@ def evaluate_unknown_quality(
         return vi_map, ()
     progress.check()
     rows = np.flatnonzero(unknown)
-    verdict = judge(vi_map, rows, LandmarkQualityOptions())
-    quality = vi_map.landmarks.quality.copy()
-    quality[rows] = np.where(verdict.is_good, LandmarkQuality.GOOD, LandmarkQuality.BAD)
-    judged = vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality))
-    bad = int(np.count_nonzero(~verdict.is_good))
-    note = mostly_bad(bad, len(rows), _counts(verdict))
-    notes = (f"evaluated the quality of {len(rows)} landmarks first", note)
+    judged, reasons = _judge(vi_map, rows, LandmarkQualityOptions())
+    bad = int(np.count_nonzero(judged.landmarks.quality[rows] == LandmarkQuality.BAD))
+    notes = (
+        f"evaluated the quality of {len(rows)} landmarks first",
+        mostly_bad(bad, len(rows), reasons),
+    )
     return judged, tuple(text for text in notes if text)
-
-
-def _counts(verdict: Verdict) -> dict[str, int]:
-    """Return the number of landmarks that fail each criterion."""
-    return {f.name: int(getattr(verdict, f.name).sum()) for f in dataclasses.fields(verdict)}
 
 
 @dataclasses.dataclass(frozen=True)

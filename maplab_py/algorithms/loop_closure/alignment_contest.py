@@ -64,6 +64,19 @@ class Contest:
             return np.zeros(0, dtype=np.int64)
         return self.pair.alignments[self.winner].rows
 
+    def largest_rival_share(self) -> float:
+        """Return how many stretches only a rival explains, per stretch that only the best one does."""
+        best = self.pair.alignments[0]
+        shares = [0.0]
+        for number, rival in enumerate(self.pair.alignments[1:], start=1):
+            if is_refuted(self.unmatched[number], self.unmatched[0]):
+                continue
+            for side in (0, 1):
+                ours = len(np.setdiff1d(best.stretches(side), rival.stretches(side)))
+                theirs = len(np.setdiff1d(rival.stretches(side), best.stretches(side)))
+                shares.append(theirs / max(ours, 1))
+        return max(shares)
+
 
 @dataclasses.dataclass(frozen=True)
 class AlignmentChoice:

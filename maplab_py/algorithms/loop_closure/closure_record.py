@@ -48,15 +48,24 @@ class ClosureRecord(Table):
     place: NDArray[np.uint64] = column(np.uint64, 2)  # vertex id
     T_A_B: NDArray[np.float64] = column(np.float64, 7)  # as verified
     sigma: NDArray[np.float32] = column(np.float32, 6)  # of it: position [m], angle [rad]
+    use: NDArray[np.int8] = column(np.int8)  # index into USES
+    weight: NDArray[np.float32] = column(np.float32, fill=1.0)  # weight after relaxation
+    # the fields of closure_table.GateValues, as judged; older records lack those with a fill value
+    verdict: NDArray[np.int8] = column(np.int8)
     matches: NDArray[np.int32] = column(np.int32)
     inliers: NDArray[np.int32] = column(np.int32)
     tilt_deg: NDArray[np.float32] = column(np.float32)
+    rotation_sigma_deg: NDArray[np.float32] = column(np.float32, fill=np.nan)
     correction_m: NDArray[np.float32] = column(np.float32)
     correction_deg: NDArray[np.float32] = column(np.float32)
+    is_related: NDArray[np.bool_] = column(np.bool_, fill=True)
+    between_m: NDArray[np.float32] = column(np.float32, fill=np.nan)
+    rival_share: NDArray[np.float32] = column(np.float32, fill=np.nan)
+    rival_stretches: NDArray[np.float32] = column(np.float32, fill=np.nan)
+    is_decided: NDArray[np.float32] = column(np.float32, fill=np.nan)
+    follows: NDArray[np.float32] = column(np.float32, fill=np.nan)
     support: NDArray[np.int32] = column(np.int32)
-    verdict: NDArray[np.int8] = column(np.int8)  # index into closures.VERDICTS
-    use: NDArray[np.int8] = column(np.int8)  # index into USES
-    weight: NDArray[np.float32] = column(np.float32, fill=1.0)  # weight after relaxation
+    difference: NDArray[np.float32] = column(np.float32, fill=np.nan)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -192,7 +201,7 @@ def _decode(content: bytes) -> LoopRecord:
             columns.setdefault(table, {})[name] = array
             place += array.nbytes
         return LoopRecord(
-            ClosureRecord(**columns["closures"]),
+            ClosureRecord.filled(len(columns["closures"]["id"]), **columns["closures"]),
             MergedLandmarks(**columns["landmarks"]),
             MergedKeypoints(**columns["keypoints"]),
             MergePairs(**columns["pairs"]),

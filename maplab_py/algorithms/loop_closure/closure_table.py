@@ -20,7 +20,38 @@ VERDICTS = tuple(Verdict)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Closures:
+class GateValues:
+    """Verdicts on closures (N) and the values that the gates compare with their thresholds.
+
+    Values of gates that a closure did not reach, or that it does not have, are not-a-number.
+    """
+
+    verdict: NDArray[np.int8]  # index into VERDICTS
+    matches: I64  # keypoints with a match in the place
+    inliers: I64
+    tilt_deg: F64
+    rotation_sigma_deg: F64  # about the worst axis
+    correction_m: F64  # change of the query's position, in G
+    correction_deg: F64  # change of the query's attitude
+    is_related: Mask  # ends in one mission, or in two whose base frames are known
+    between_m: F64  # path between the ends, inside one mission
+    rival_share: F64  # inliers of another place / of the best
+    rival_stretches: (
+        F64  # stretches that only another alignment of the missions explains / only the best
+    )
+    is_decided: F64  # 1 where an alignment of the missions wins
+    follows: F64  # 1 where the closure supports the best alignment
+    support: I64  # other query vertices with consistent closures
+    difference: F64  # from closures nearby, relative to the tolerances
+
+    @property
+    def accepted(self) -> Mask:
+        """Mask (N,) of the closures that no gate has rejected."""
+        return np.asarray(self.verdict == VERDICTS.index(Verdict.ACCEPTED))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Closures(GateValues):
     """Poses of query vertices relative to places; M is the mission frame of the place."""
 
     id: NDArray[np.uint64]  # (N, 2)
@@ -29,13 +60,6 @@ class Closures:
     T_M_I: F64  # (N, 7) of the query, as verified
     T_A_B: F64  # (N, 7) pose of the place's vertex (B) in the query (A)
     covariance: F64  # (N, 6, 6) of T_M_I, [dp, dtheta]
-    match_count: I64  # (N,) keypoints with a match in the place
-    inlier_count: I64  # (N,)
-    tilt_deg: F64  # (N,)
-    correction_m: F64  # (N,) change of the query's position, in G
-    correction_deg: F64  # (N,) change of the query's attitude
-    verdict: NDArray[np.int8]  # (N,) index into VERDICTS
-    support: I64  # (N,) number of other query vertices with consistent closures
     start: I64  # (N + 1,) inlier matches of closure i are rows start[i] .. start[i + 1] - 1
     keypoint: I64  # keypoint row of the map
     landmark: I64  # landmark row
@@ -54,11 +78,6 @@ class Closures:
             if field.name != "start"
         }
         return Closures(**columns, start=starts_of_counts(np.diff(self.start)[rows]))
-
-    @property
-    def accepted(self) -> Mask:
-        """Mask (N,) of the closures that passed all gates."""
-        return np.asarray(self.verdict == VERDICTS.index(Verdict.ACCEPTED))
 
     def refused_by_reason(self) -> dict[str, int]:
         """Count the rejected closures by reason."""

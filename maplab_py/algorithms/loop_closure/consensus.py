@@ -35,7 +35,6 @@ class ConsensusRule:
     yaw_tolerance_rad: float = 0.025
     drift_ratio: float = 0.02  # per arc length between the queries plus that between the places
     yaw_drift_rad_per_m: float = 4e-4  # over the same way
-    min_support: int = 2
     lone_inliers: int = 50  # required inliers of a closure without neighbours
     max_difference: float = 1.0  # factor on the tolerances
 
@@ -57,8 +56,12 @@ def check_consensus(
     T_M_I: F64,
     inliers: I64,
     rule: ConsensusRule,
-) -> tuple[I64, Mask, Mask]:
-    """Return support (N,), and which closures are supported and which contradicted (N,)."""
+) -> tuple[I64, F64]:
+    """Return the query vertices (N,) that support closures, and the differences (N,) from neighbours.
+
+    A closure whose difference reaches `max_difference` is contradicted. Closures that need no support,
+    because they have many inliers and no neighbours, have not-a-number.
+    """
     mission = vi_map.vertices.mission
     pair = mission[query_vertex].astype(np.int64) * len(vi_map.missions) + mission[place_vertex]
     way = path_lengths(vi_map)
@@ -68,40 +71,46 @@ def check_consensus(
         _compare(i, j, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, rule)
         for i, j in _neighbours(order)
     ]
-    compared = _Compared(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    by_difference = np.lexsort((columns[2], columns[0]))
+    compared = _Compared(*(column[by_difference] for column in columns))
     alive = np.ones(len(query_vertex), dtype=np.bool_)
     # a wrong closure may contradict correct ones: test twice, the second time with survivors only
     for _ in range(2):
-        support, for_, against = compared.votes(inliers, alive)
-        contradicted = against > for_
-        alive = alive & ~contradicted & (support > 0)
-    lone = (support == 0) & (against == 0) & (inliers >= rule.lone_inliers)
-    supported = (support >= rule.min_support) | lone
-    return support, supported, contradicted
+        support, difference, is_alone = compared.votes(inliers, alive, rule.max_difference)
+        alive = alive & ~(difference >= rule.max_difference) & (support > 0)
+    lone = is_alone & (inliers >= rule.lone_inliers)
+    return support, np.where(lone, np.nan, difference)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Compared:
-    """Pairs (P,) of neighbouring closures: j judges i."""
+    """Pairs (P,) of neighbouring closures, ordered by i and difference: j judges i."""
 
     i: I64
     j: I64
-    supports: Mask  # agrees, for another query vertex
-    agrees: Mask
-    contradicts: Mask  # disagrees so near by that drift cannot be the reason
+    difference: F64  # relative to the tolerances; below `max_difference` the two agree
+    is_near: Mask  # so near by that drift cannot be the reason of a disagreement
+    is_other: Mask  # of another query vertex
 
-    def votes(self, inliers: I64, alive: Mask) -> tuple[I64, F64, F64]:
-        """Return support by distinct query vertices, and the inliers that support and contradict."""
-        count = len(inliers)
+    def votes(self, inliers: I64, alive: Mask, max_difference: float) -> tuple[I64, F64, Mask]:
+        """Return support by distinct query vertices, differences, and which closures nobody judges.
 
-        def total(judges: Mask) -> F64:
-            rows = judges & alive[self.j]
-            weights = inliers[self.j[rows]].astype(np.float64)
-            return np.bincount(self.i[rows], weights, minlength=count).astype(np.float64)
-
-        supporting = self.i[self.supports & alive[self.j]]
+        The difference of a closure is the smallest one beyond which the inliers that contradict it are
+        not more than its own and those that agree.
+        """
+        count, here = len(inliers), alive[self.j]
+        i, weight, difference = self.i[here], inliers[self.j[here]] * 1.0, self.difference[here]
+        agrees, near = difference < max_difference, weight * self.is_near[here]
+        supporting = i[agrees & self.is_other[here]]
         support = np.bincount(supporting, minlength=count).astype(np.int64)
-        return support, inliers + total(self.agrees), total(self.contradicts)
+        against = np.bincount(i, near * ~agrees, minlength=count)
+        left = inliers - np.bincount(i, near, minlength=count)  # if nobody agreed
+        gained = np.append(0.0, np.cumsum(weight + near))
+        enough = left[i] + gained[1:] - gained[np.searchsorted(i, i)] >= 0.0
+        smallest = np.where(left >= 0.0, 0.0, np.inf)
+        np.minimum.at(smallest, i[enough], difference[enough])
+        return support, smallest, (support == 0) & (against == 0.0)
 
 
 def _neighbours(order: I64) -> Iterator[tuple[I64, I64]]:
@@ -125,7 +134,7 @@ def _compare(
     T_A_I: F64,
     T_B_I: F64,
     rule: ConsensusRule,
-) -> tuple[I64, I64, Mask, Mask, Mask]:
+) -> tuple[I64, I64, F64, Mask, Mask]:
     """Return the columns of `_Compared` for those of some pairs that are near each other."""
     between = np.abs(way[query[i]] - way[query[j]])
     near = (pair[i] == pair[j]) & (between < _REACH_M)
@@ -137,6 +146,7 @@ def _compare(
     largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
     # position of query i implied by closure j
     apart_m = np.linalg.norm(yaw.transform(E[j], T_A_I[i, 4:]) - T_B_I[i, 4:], axis=1)
-    agrees = apart_m < rule.max_difference * largest_m
-    agrees &= np.abs(yaw.wrap(E[i, 3] - E[j, 3])) < rule.max_difference * largest_rad
-    return i, j, agrees & (query[i] != query[j]), agrees, ~agrees & (between < _NEAR_M)
+    turn_rad = np.abs(yaw.wrap(E[i, 3] - E[j, 3]))
+    difference = np.maximum(apart_m / largest_m, turn_rad / largest_rad)
+    difference[np.isnan(difference)] = np.inf
+    return i, j, difference, between < _NEAR_M, query[i] != query[j]

@@ -23,7 +23,7 @@ from maplab_py.algorithms.loop_closure.features import (
     map_features,
     points_in_mission,
 )
-from maplab_py.algorithms.loop_closure.gates import judge
+from maplab_py.algorithms.loop_closure.gates import judge, measure
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import I64
@@ -176,27 +176,22 @@ def _closures(
     s, query = search.solutions, candidates.query_vertex
     place = _most_seen(vi_map, search, candidates.place_vertex)
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe] & trust_base_frames
-    judgement = judge(vi_map, query, place, s, options, is_known=is_known, choice=choice)
+    measured = measure(vi_map, query, place, s, is_known)
+    judged, contests = judge(vi_map, query, place, s.T_M_I, measured, options, choice=choice)
     closures = Closures(
+        **vars(judged),
         id=closure_ids(vi_map, query, place),
         query_vertex=query,
         place_vertex=place,
         T_M_I=s.T_M_I,
         T_A_B=se3.relative(s.T_M_I, vi_map.vertices.T_M_I[place]),
         covariance=s.covariance,
-        match_count=s.keypoint_count,
-        inlier_count=s.inlier_count,
-        tilt_deg=np.degrees(s.tilt_rad),
-        correction_m=judgement.correction_m,
-        correction_deg=judgement.correction_deg,
-        verdict=judgement.verdict,
-        support=judgement.support,
         start=search.start,
         keypoint=features.keypoint[search.feature],
         landmark=search.landmark,
         bits=search.bits,
     )
-    return closures, tuple(judgement.contests)
+    return closures, tuple(contests)
 
 
 def _most_seen(vi_map: VIMap, search: PoseSearch, place: I64) -> I64:

@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.gate import Gate, any_failed
+from maplab_py.algorithms.gate import Gate, any_failed, failures
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.detection import detect
+from maplab_py.algorithms.loop_closure.gates import closure_gates, judge
 from maplab_py.algorithms.loop_closure.listing import describe_closure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
-from maplab_py.algorithms.loop_closure.recorded_gates import (
-    Acceptance,
-    acceptance,
-    recorded_gates,
-    shortfalls,
-)
 from maplab_py.algorithms.loop_closure.reports import OF_CLOUDS, Verdict
 from maplab_py.array_types import I64, Mask
+from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex, to_hex_list
 
 _NEAREST = 5
-_REASONS = {
-    Verdict.CONTRADICTED: "closures nearby disagree",
-    Verdict.AMBIGUOUS: "another place looks the same",
-}
-"""Reasons to refuse a closure that passes all gates on its own pose."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +112,7 @@ def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> Clo
     """Return the gates of a recorded closure (a row of the closures of `read_record`)."""
     closures = read_record(vi_map).closures
     line = describe_closure(vi_map, row)
-    gates = recorded_gates(vi_map, closures, options)
+    gates = closure_gates(closures, options)
     lines = [
         GateLine(gate.name, *gate.describe(row), gate.flag) for gate in gates if gate.applies[row]
     ]
@@ -138,7 +131,7 @@ def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> Clo
         weight=line.weight,
         gates=tuple(lines),
         summary=_summary_of_closure(
-            verdict, failed, line.merged, acceptance(vi_map, closures, row, gates, options)
+            verdict, failed, line.merged, acceptance(vi_map, closures, row, options)
         ),
     )
 
@@ -179,8 +172,8 @@ def explain_pair(
         chosen = _between(vi_map, recorded, first, second)
         if not chosen.any():
             return _without_candidates((names[0], names[1]), detection.best_votes, options)
-    gates = [gate.take(chosen) for gate in recorded_gates(vi_map, recorded, options)]
     closures = recorded.take(chosen)
+    gates = closure_gates(closures, options)
     accepted = int(np.count_nonzero(closures.verdict == VERDICTS.index(Verdict.ACCEPTED)))
     lines = [_pair_gate(gate) for gate in gates if gate.failed.any()]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe[[first, second]]]
@@ -288,14 +281,65 @@ def _summary_of_closure(
     if acceptance.verdict is Verdict.ACCEPTED:
         return f"{text} {flags} would accept it."
     return (
-        f"{text} {flags} would not suffice: it would then be refused because "
-        f"{_REASONS[acceptance.verdict]}, and no flag moves that."
+        f"{text} {flags} would not suffice: it would then be refused ({acceptance.verdict.value}), "
+        "and no flag moves that."
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Acceptance:
+    """Flags that move the gates that a closure fails, and the verdict with them."""
+
+    flags: tuple[str, ...]  # --NAME=VALUE
+    verdict: Verdict
+
+
+def acceptance(
+    vi_map: VIMap, closures: ClosureRecord, row: int, options: LoopClosureOptions
+) -> Acceptance | None:
+    """Return the flags with which a recorded closure passes its gates; None if a gate has no flag.
+
+    Recorded closures are judged again with these flags, which admit others of them as well. A search
+    may estimate other poses.
+
+    Args:
+        vi_map: The map.
+        closures: All recorded closures.
+        row: The closure.
+        options: The present flags.
+    """
+    query = vi_map.vertex_index.rows(closures.query).astype(np.int64)
+    place = vi_map.vertex_index.rows(closures.place).astype(np.int64)
+    T_M_I = se3.compose(vi_map.vertices.T_M_I[place], se3.inverse(closures.T_A_B))
+    by_clouds = np.isin(closures.verdict, [VERDICTS.index(verdict) for verdict in OF_CLOUDS])
+    verdict = np.where(by_clouds, closures.verdict, VERDICTS.index(Verdict.ACCEPTED))
+    fields = {f.name: getattr(closures, f.name) for f in dataclasses.fields(GateValues)}
+    measured = GateValues(**fields | {"verdict": verdict.astype(np.int8)})
+    failed = [gate for gate in closure_gates(closures, options) if gate.failed[row]]
+    changes: dict[str, Any] = {}
+    moved = options
+    decided = Verdict.ACCEPTED
+    while failed:
+        values = {gate.flag: gate.passing_value(row) for gate in failed}
+        wanted = {name.removeprefix("--lc_"): value for name, value in values.items()}
+        if (
+            not all(map(math.isfinite, wanted.values()))
+            or "" in wanted
+            or wanted.items() <= changes.items()
+        ):
+            break
+        changes |= wanted
+        kinds = {name: type(getattr(options, name)) for name in changes}
+        moved = dataclasses.replace(options, **{n: kinds[n](v) for n, v in changes.items()})
+        judged, _ = judge(vi_map, query, place, T_M_I, measured, moved)
+        decided = VERDICTS[judged.verdict[row]]
+        failed = [gate for gate in closure_gates(judged, moved) if gate.failed[row]]
+    flags = tuple(f"--lc_{name}={getattr(moved, name):g}" for name in changes)
+    return Acceptance(flags, decided) if flags else None
+
+
 def _near_misses(closures: ClosureRecord, gates: list[Gate]) -> tuple[NearMiss, ...]:
-    total = shortfalls(gates)
-    failed = np.sum([gate.failed for gate in gates], axis=0)
+    failed, total = failures(gates)
     refused = _refused_rows(closures, gates)
     order: I64 = refused[np.lexsort((total[refused], failed[refused]))][:_NEAREST]
     ids = to_hex_list(closures.id)

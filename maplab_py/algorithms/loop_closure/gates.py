@@ -1,17 +1,19 @@
 """Acceptance gates of closures; the verdict is the first gate that a closure fails.
 
-Closures of a search and those of the record are measured alike and pass the same gates.
+`judge` is the only place that decides. What the gates compared is stored with each closure
+(`GateValues`), and `closure_gates` makes the table of gates from it for reports.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.algorithms.gate import Gate
+from maplab_py.algorithms.gate import YES_NO, Gate
+from maplab_py.algorithms.landmarks.keypoint_rays import largest_sigma
 from maplab_py.algorithms.loop_closure.alignment_contest import (
     AlignmentChoice,
     Contest,
@@ -21,7 +23,7 @@ from maplab_py.algorithms.loop_closure.alignment_contest import (
     with_choice,
 )
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus, path_lengths
 from maplab_py.algorithms.loop_closure.mission_alignment import (
     AgreementRule,
@@ -37,7 +39,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import banned
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.geometry import se3, so3, symmetric
+from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.absolute_pose import PoseSolutions
@@ -46,126 +48,11 @@ _DRIFT_OFFSET_M = 0.5
 _USUAL_DRIFT_RATIO = 0.02
 """Drift relative to the path length, which closures between ambiguous places must not exceed.
 Between missions of known base frames the path begins at their starts: anchoring leaves drift."""
+_MARGIN = 1e-3
+"""Added to a value that must stay below its flag."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MeasuredClosures:
-    """Measurements (N) that the gates test, and the relations of the ends of closures."""
-
-    query: I64  # (N,) vertices
-    place: I64  # (N,)
-    mission_query: I64
-    mission_place: I64
-    way_query_m: F64  # arc length along the mission
-    way_place_m: F64
-    T_M_I: F64  # (N, 7) of the query, in the mission of the place
-    matches: I64
-    inliers: I64
-    tilt_deg: F64
-    rotation_sigma_deg: F64  # about the worst axis, NaN where the rotation is not determined
-    correction_m: F64
-    correction_deg: F64
-    related: Mask  # ends in one mission, or in two whose base frames are known
-
-    @classmethod
-    def of_solutions(
-        cls, vi_map: VIMap, query: I64, place: I64, s: PoseSolutions, is_known: Mask
-    ) -> MeasuredClosures:
-        """Measure estimated poses; `is_known` (M,) are missions whose base frames are trusted."""
-        T_G_M = vi_map.T_G_M[vi_map.vertices.mission[place]]
-        change = se3.local(vi_map.T_G_I[query], se3.compose(T_G_M, s.T_M_I))
-        return cls(
-            **_ends(vi_map, query, place, is_known),
-            T_M_I=s.T_M_I,
-            matches=s.keypoint_count,
-            inliers=s.inlier_count,
-            tilt_deg=np.degrees(s.tilt_rad),
-            rotation_sigma_deg=_rotation_sigma_deg(s.covariance),
-            correction_m=np.linalg.norm(change[:, :3], axis=1),
-            correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
-        )
-
-    @classmethod
-    def of_record(cls, vi_map: VIMap, c: ClosureRecord) -> MeasuredClosures:
-        """Measure recorded closures."""
-        query, place = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
-        # the record has the deviations about three axes; their largest and their norm are bounds of
-        # that about the worst axis, and the verdict tells which of them applies
-        sigma_rad = np.where(
-            c.verdict == VERDICTS.index(Verdict.ACCEPTED),
-            c.sigma[:, 3:].max(axis=1, initial=0.0),
-            np.linalg.norm(c.sigma[:, 3:], axis=1),
-        )
-        is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
-        return cls(
-            **_ends(vi_map, query.astype(np.int64), place.astype(np.int64), is_known),
-            T_M_I=se3.compose(vi_map.vertices.T_M_I[place], se3.inverse(c.T_A_B)),
-            matches=c.matches.astype(np.int64),
-            inliers=c.inliers.astype(np.int64),
-            tilt_deg=c.tilt_deg.astype(np.float64),
-            rotation_sigma_deg=np.degrees(sigma_rad),
-            correction_m=c.correction_m.astype(np.float64),
-            correction_deg=c.correction_deg.astype(np.float64),
-        )
-
-    def take(self, rows: I64) -> MeasuredClosures:
-        """Return some of the closures."""
-        return MeasuredClosures(
-            **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)}
-        )
-
-    @property
-    def same(self) -> Mask:
-        """Closures (N,) inside one mission."""
-        return np.asarray(self.mission_query == self.mission_place)
-
-    @property
-    def between_m(self) -> F64:
-        """Length (N,) of the path between the ends, inside one mission."""
-        return np.abs(self.way_query_m - self.way_place_m)
-
-    @property
-    def is_usual(self) -> Mask:
-        """Closures (N,) that correct no more than odometry usually drifts."""
-        since = np.where(self.same, self.between_m, self.way_query_m + self.way_place_m)
-        return np.asarray(self.correction_m <= _DRIFT_OFFSET_M + _USUAL_DRIFT_RATIO * since)
-
-    def is_far(self, options: LoopClosureOptions) -> Mask:
-        """Return which closures (N,) inside a mission correct more than it can have drifted."""
-        drift_m = _DRIFT_OFFSET_M + options.max_drift_ratio * self.between_m
-        return np.asarray(self.same & (self.correction_m > drift_m))
-
-    def paired(self, vi_map: VIMap, stretch: I64) -> PairedClosures:
-        """Return the closures as relative poses of their missions."""
-        return PairedClosures.of(
-            (self.mission_query, self.mission_place),
-            (vi_map.vertices.T_M_I[self.query], self.T_M_I),
-            (self.way_query_m, self.way_place_m),
-            (stretch[self.query], stretch[self.place]),
-            self.inliers.astype(np.float64),
-        )
-
-
-def _ends(vi_map: VIMap, query: I64, place: I64, is_known: Mask) -> dict[str, NDArray[Any]]:
-    mission, way = vi_map.vertices.mission.astype(np.int64), path_lengths(vi_map)
-    a, b = mission[query], mission[place]
-    return {
-        "query": query, "place": place, "mission_query": a, "mission_place": b,
-        "way_query_m": way[query], "way_place_m": way[place],
-        "related": np.asarray((a == b) | (is_known[a] & is_known[b])),
-    }  # fmt: skip
-
-
-def _rotation_sigma_deg(covariance: F64) -> F64:
-    """Return the deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta]."""
-    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
-    sigma_rad = np.full(len(covariance), np.nan)
-    largest = symmetric.eigen(covariance[known, 3:, 3:])[0][:, -1]
-    sigma_rad[known] = np.sqrt(np.maximum(largest, 0.0))
-    return np.asarray(np.degrees(sigma_rad))
-
-
-def pose_gates(c: MeasuredClosures, o: LoopClosureOptions) -> list[Gate]:
+def pose_gates(c: GateValues | ClosureRecord, o: LoopClosureOptions) -> list[Gate]:
     """Return the gates on the pose of a closure."""
     return [
         Gate.of(
@@ -187,161 +74,251 @@ def pose_gates(c: MeasuredClosures, o: LoopClosureOptions) -> list[Gate]:
     ]  # fmt: skip
 
 
-def correction_gates(c: MeasuredClosures, o: LoopClosureOptions) -> list[Gate]:
+def correction_gates(c: GateValues | ClosureRecord, o: LoopClosureOptions) -> list[Gate]:
     """Return the gates on the correction that a closure makes."""
     return [
         Gate.of(
-            "correction", c.correction_m, _DRIFT_OFFSET_M + o.max_drift_ratio * c.between_m,
-            Verdict.IMPLAUSIBLE.value, "--lc_max_drift_ratio", "m", applies=c.same,
+            "correction", c.correction_m, np.float64(_DRIFT_OFFSET_M) + o.max_drift_ratio * c.between_m,
+            Verdict.IMPLAUSIBLE.value, "--lc_max_drift_ratio", "m", applies=~np.isnan(c.between_m),
             flag_value=(c.correction_m - _DRIFT_OFFSET_M) / np.maximum(c.between_m, 1e-9),
         ),
         Gate.of(
             "correction of the position", c.correction_m, o.max_delta_position_m,
             Verdict.IMPLAUSIBLE.value, "--lc_max_delta_position_m", "m",
-            applies=c.related & (o.max_delta_position_m >= 0.0),
+            applies=c.is_related & (o.max_delta_position_m >= 0.0),
         ),
         Gate.of(
             "correction of the attitude", c.correction_deg, o.max_delta_rotation_deg,
             Verdict.IMPLAUSIBLE.value, "--lc_max_delta_rotation_deg", "deg",
-            applies=c.related & (o.max_delta_rotation_deg >= 0.0),
+            applies=c.is_related & (o.max_delta_rotation_deg >= 0.0),
         ),
     ]  # fmt: skip
 
 
-def shares_of_rivals(c: MeasuredClosures, geometric: Mask, options: LoopClosureOptions) -> F64:
-    """Return the inliers (N,) of the strongest other place / of the best; `geometric` pass on pose."""
-    rule = AmbiguityRule(_DRIFT_OFFSET_M, options.max_drift_ratio)
-    return rival_shares(
-        c.query, c.way_place_m, c.mission_place, c.T_M_I, c.inliers, c.is_far(options), geometric,
-        rule,
+def place_gates(c: GateValues | ClosureRecord, o: LoopClosureOptions) -> list[Gate]:
+    """Return the gates that compare a closure with other places and alignments of missions."""
+    alike = functools.partial(Gate.of_known, verdict=Verdict.AMBIGUOUS.value)
+    return [
+        alike(
+            "inliers of another place / of the best", c.rival_share,
+            np.nextafter(o.ambiguous_inlier_ratio, 0.0), flag="--lc_ambiguous_inlier_ratio",
+            flag_value=c.rival_share + _MARGIN,
+        ),
+        alike(
+            "stretches only another alignment explains / only the best", c.rival_stretches,
+            o.max_ambiguous_ratio, flag="--lc_max_ambiguous_ratio",
+        ),
+        alike(
+            "an alignment of the missions wins", c.is_decided, 1.0, unit=YES_NO, is_minimum=True
+        ),
+        alike("agrees with the best alignment", c.follows, 1.0, unit=YES_NO, is_minimum=True),
+    ]  # fmt: skip
+
+
+def neighbour_gates(c: GateValues | ClosureRecord, o: LoopClosureOptions) -> list[Gate]:
+    """Return the gates that compare a closure with those nearby."""
+    differs = Gate.of_known(
+        "difference from closures nearby / tolerance", c.difference,
+        np.nextafter(o.max_neighbour_difference, 0.0), Verdict.CONTRADICTED.value,
+        "--lc_max_neighbour_difference", flag_value=c.difference + _MARGIN,
     )  # fmt: skip
+    agrees = Gate.of(
+        "query vertices nearby that agree", c.support, o.min_support, Verdict.NO_SUPPORT.value,
+        "--lc_min_support", is_minimum=True, applies=differs.applies & ~differs.failed,
+    )  # fmt: skip
+    return [differs, agrees]
 
 
-def looks_alike(c: MeasuredClosures, shares: F64, options: LoopClosureOptions) -> Mask:
-    """Return which related closures (N,) are ambiguous; odometry and known base frames resolve it."""
-    ambiguous = (shares > 0.0) & (shares >= options.ambiguous_inlier_ratio)
-    return np.asarray(ambiguous & c.related & ~c.is_usual)
+def closure_gates(c: GateValues | ClosureRecord, options: LoopClosureOptions) -> list[Gate]:
+    """Return all gates of judged closures, in the order in which they are applied."""
+    stages = (pose_gates, correction_gates, place_gates, neighbour_gates)
+    by_hand = c.verdict == VERDICTS.index(Verdict.REMOVED)
+    return [
+        *(gate for stage in stages for gate in stage(c, options)),
+        Gate.of("removed by hand", by_hand, 0.0, Verdict.REMOVED.value, unit=YES_NO),
+    ]
 
 
-def contests_of_missions(
-    vi_map: VIMap, c: MeasuredClosures, candidate: Mask, geometric: Mask, o: LoopClosureOptions
-) -> list[Contest]:
-    """Weigh the alignments of missions for which closures between unrelated missions vote.
-
-    Closures with far places of the query's mission show which places look alike.
-
-    Args:
-        vi_map: The map.
-        c: Closures (N).
-        candidate: Closures (N,) that passed all gates so far.
-        geometric: Closures (N,) that passed the gates on their poses.
-        o: Thresholds.
-    """
-    stretch = trajectory_stretches(vi_map)
-    is_alias = geometric & c.is_far(o) & (c.inliers >= AmbiguityRule.min_inliers)
-    voting = (candidate & ~c.related) | is_alias
-    pairs = alignments_of_pairs(c.paired(vi_map, stretch), voting, AgreementRule())
-    names = [to_hex(words)[:8] for words in vi_map.missions.id]
-    return decide(vi_map, pairs, stretch, ContestRule(o.max_ambiguous_ratio), names)
-
-
-def consensus(
-    vi_map: VIMap, c: MeasuredClosures, options: LoopClosureOptions
-) -> tuple[I64, Mask, Mask]:
-    """Return support (N,), and which closures neighbours support and which they contradict (N,)."""
-    rule = ConsensusRule(
-        min_support=options.min_support, max_difference=options.max_neighbour_difference
-    )
-    return check_consensus(vi_map, c.query, c.place, c.T_M_I, c.inliers, rule)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Judgement:
-    """Verdicts on closures (N) and the quantities that the gates test."""
-
-    verdict: NDArray[np.int8]  # (N,) index into VERDICTS
-    support: I64  # (N,)
-    correction_m: F64  # (N,)
-    correction_deg: F64  # (N,)
-    contests: list[Contest] = dataclasses.field(default_factory=list)  # of missions to be aligned
-
-    def refuse(self, which: Mask, reason: Verdict) -> None:
-        """Reject closures unless another gate has rejected them before."""
-        self.verdict[self.passing & which] = VERDICTS.index(reason)
-
-    @property
-    def passing(self) -> Mask:
-        """Closures (N,) that no gate has rejected."""
-        return np.asarray(self.verdict == VERDICTS.index(Verdict.ACCEPTED))
-
-
-def judge(
-    vi_map: VIMap,
-    query: I64,
-    place: I64,
-    solutions: PoseSolutions,
-    options: LoopClosureOptions,
-    *,
-    is_known: Mask,
-    choice: AlignmentChoice | None = None,
-) -> Judgement:
-    """Apply all gates: geometry, plausible drift, ambiguity, consensus of neighbours.
+def measure(
+    vi_map: VIMap, query: I64, place: I64, solutions: PoseSolutions, is_known: Mask
+) -> GateValues:
+    """Measure closures (N) with estimated poses, before any of them is compared with others.
 
     Args:
         vi_map: The map.
         query: Query vertices (N,).
         place: Vertices of the places (N,).
         solutions: Estimated poses.
-        options: Thresholds.
         is_known: Missions (M,) whose base frames are to be trusted.
+    """
+    a, b = vi_map.vertices.mission[query], vi_map.vertices.mission[place]
+    way_m = path_lengths(vi_map)
+    change = se3.local(vi_map.T_G_I[query], se3.compose(vi_map.T_G_M[b], solutions.T_M_I))
+    return GateValues(
+        verdict=np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8),
+        matches=solutions.keypoint_count,
+        inliers=solutions.inlier_count,
+        tilt_deg=np.degrees(solutions.tilt_rad),
+        rotation_sigma_deg=_rotation_sigma_deg(solutions.covariance),
+        correction_m=np.linalg.norm(change[:, :3], axis=1),
+        correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
+        is_related=np.asarray((a == b) | (is_known[a] & is_known[b])),
+        between_m=np.where(a == b, np.abs(way_m[query] - way_m[place]), np.nan),
+        **_not_compared(len(query)),
+    )
+
+
+def _not_compared(count: int) -> dict[str, Any]:
+    """Return the values of gates that compare closures, as of closures that did not reach them."""
+    names = ("rival_share", "rival_stretches", "is_decided", "follows", "difference")
+    unknown = {name: np.full(count, np.nan) for name in names}
+    return {**unknown, "support": np.zeros(count, dtype=np.int64)}
+
+
+def _rotation_sigma_deg(covariance: F64) -> F64:
+    """Return the deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta]."""
+    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
+    sigma_deg = np.full(len(covariance), np.nan)
+    sigma_deg[known] = np.degrees(largest_sigma(covariance[known, 3:, 3:]))
+    return sigma_deg
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Judgement:
+    """Closures (N) whose verdicts and values are filled in."""
+
+    vi_map: VIMap
+    query: I64  # (N,) vertices
+    place: I64  # (N,)
+    T_M_I: F64  # (N, 7) of the query, in the mission of the place
+    values: GateValues  # changed in place
+    options: LoopClosureOptions
+
+    def refuse(self, which: Mask, reason: Verdict) -> None:
+        """Reject closures unless another gate has rejected them before."""
+        self.values.verdict[self.values.accepted & which] = VERDICTS.index(reason)
+
+    def refuse_by(self, gates: list[Gate]) -> None:
+        """Reject closures that fail gates."""
+        for gate in gates:
+            self.refuse(gate.failed, Verdict(gate.verdict))
+
+    @functools.cached_property
+    def way_m(self) -> tuple[F64, F64]:
+        """Arc lengths (N,) along the missions to the query and to the place."""
+        way_m = path_lengths(self.vi_map)
+        return way_m[self.query], way_m[self.place]
+
+    @functools.cached_property
+    def missions(self) -> tuple[I64, I64]:
+        """Missions (N,) of the query and of the place."""
+        mission = self.vi_map.vertices.mission.astype(np.int64)
+        return mission[self.query], mission[self.place]
+
+    @functools.cached_property
+    def stretch(self) -> I64:
+        """Stretch (V,) of each vertex."""
+        return trajectory_stretches(self.vi_map)
+
+    @functools.cached_property
+    def is_usual(self) -> Mask:
+        """Closures (N,) that correct no more than odometry usually drifts."""
+        between_m, correction_m = self.values.between_m, self.values.correction_m
+        since_m = np.where(np.isnan(between_m), sum(self.way_m), between_m)
+        return np.asarray(correction_m <= _DRIFT_OFFSET_M + _USUAL_DRIFT_RATIO * since_m)
+
+    @functools.cached_property
+    def is_far(self) -> Mask:
+        """Closures (N,) inside a mission that correct more than it can have drifted."""
+        drift_m = _DRIFT_OFFSET_M + self.options.max_drift_ratio * self.values.between_m
+        return np.asarray(self.values.correction_m > drift_m)
+
+    @functools.cached_property
+    def paired(self) -> PairedClosures:
+        """The closures as relative poses of their missions."""
+        return PairedClosures.of(
+            self.missions,
+            (self.vi_map.vertices.T_M_I[self.query], self.T_M_I),
+            self.way_m,
+            (self.stretch[self.query], self.stretch[self.place]),
+            self.values.inliers.astype(np.float64),
+        )
+
+
+def judge(
+    vi_map: VIMap,
+    query: I64,
+    place: I64,
+    T_M_I: F64,
+    measured: GateValues,
+    options: LoopClosureOptions,
+    *,
+    choice: AlignmentChoice | None = None,
+) -> tuple[GateValues, list[Contest]]:
+    """Apply all gates: geometry, plausible drift, ambiguity, consensus of neighbours.
+
+    Args:
+        vi_map: The map.
+        query: Query vertices (N,).
+        place: Vertices of the places (N,).
+        T_M_I: Poses (N, 7) of the queries in the missions of the places.
+        measured: Values of `measure`; closures that are not accepted there stay refused.
+        options: Thresholds.
         choice: An alignment of two missions that a person has chosen.
+
+    Returns:
+        The values with those that compare closures, and the contests of missions to be aligned.
 
     Raises:
         UserError: The chosen alignment does not exist.
     """
-    c = MeasuredClosures.of_solutions(vi_map, query, place, solutions, is_known)
-    judgement = Judgement(
-        verdict=np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8),
-        support=np.zeros(len(query), dtype=np.int64),
-        correction_m=c.correction_m,
-        correction_deg=c.correction_deg,
-    )
-    judgement.refuse(banned(vi_map, query, place), Verdict.REMOVED)
-    for gate in pose_gates(c, options):
-        judgement.refuse(gate.failed, Verdict(gate.verdict))
-    judgement.refuse(np.isnan(c.rotation_sigma_deg), Verdict.FEW_INLIERS)
-    geometric = judgement.passing
-    for gate in correction_gates(c, options):
-        judgement.refuse(gate.failed, Verdict(gate.verdict))
-    shares = shares_of_rivals(c, geometric, options)
-    judgement.refuse(looks_alike(c, shares, options), Verdict.AMBIGUOUS)
-    judgement.refuse(_repeats(vi_map, c, judgement.passing & c.same, options), Verdict.AMBIGUOUS)
-    contests = contests_of_missions(vi_map, c, judgement.passing, geometric, options)
+    verdict = measured.verdict.copy()
+    v = dataclasses.replace(measured, verdict=verdict, **_not_compared(len(query)))
+    j = Judgement(vi_map, query, place, T_M_I, v, options)
+    j.refuse(banned(vi_map, query, place), Verdict.REMOVED)
+    j.refuse_by(pose_gates(v, options))
+    j.refuse(np.isnan(v.rotation_sigma_deg), Verdict.FEW_INLIERS)
+    geometric = v.accepted
+    j.refuse_by(correction_gates(v, options))
+    rows = np.flatnonzero(v.accepted & v.is_related & ~j.is_usual)
+    v.rival_share[rows] = rival_shares(j, geometric)[rows]
+    j.refuse_by(place_gates(v, options))
+    v.follows[_repeats(j)] = 0.0
+    contests = _contests(j, geometric, choice)
+    j.refuse_by(place_gates(v, options))
+    rows = np.flatnonzero(v.accepted)
+    if len(rows):
+        rule = ConsensusRule(max_difference=options.max_neighbour_difference)
+        v.support[rows], v.difference[rows] = check_consensus(
+            vi_map, query[rows], place[rows], T_M_I[rows], v.inliers[rows], rule
+        )
+        j.refuse_by(neighbour_gates(v, options))
+    return v, contests
+
+
+def _contests(j: Judgement, geometric: Mask, choice: AlignmentChoice | None) -> list[Contest]:
+    """Weigh the alignments of missions for which closures between unrelated missions vote.
+
+    Closures with far places of the query's mission show which places look alike. `geometric` (N,) are
+    those that passed the gates on their poses.
+    """
+    v, rule = j.values, ContestRule(j.options.max_ambiguous_ratio)
+    voting = v.accepted & ~v.is_related
+    v.follows[voting] = 0.0
+    is_alias = geometric & j.is_far & (v.inliers >= _MIN_RIVAL_INLIERS)
+    pairs = alignments_of_pairs(j.paired, voting | is_alias, AgreementRule())
+    names = [to_hex(words)[:8] for words in j.vi_map.missions.id]
+    contests = decide(j.vi_map, pairs, j.stretch, rule, names)
+    is_open = [contest.winner < 0 for contest in contests]
     if choice is not None:
         contests = with_choice(contests, choice)
-    judgement.contests.extend(contests)
-    follows = np.zeros(len(query), dtype=np.bool_)
-    for contest in contests:
-        follows[contest.accepted] = True
-    judgement.refuse(~c.related & ~follows, Verdict.AMBIGUOUS)
-    left = np.flatnonzero(judgement.passing)
-    if len(left):
-        support, supported, contradicted = consensus(vi_map, c.take(left), options)
-        judgement.support[left] = support
-        judgement.verdict[left[contradicted]] = VERDICTS.index(Verdict.CONTRADICTED)
-        judgement.verdict[left[~supported & ~contradicted]] = VERDICTS.index(Verdict.NO_SUPPORT)
-    return judgement
-
-
-def _repeats(
-    vi_map: VIMap, c: MeasuredClosures, candidate: Mask, options: LoopClosureOptions
-) -> Mask:
-    """Return which closures (N,) inside missions join places that only look alike."""
-    stretch = trajectory_stretches(vi_map)
-    rule = ContestRule(options.max_ambiguous_ratio)
-    return with_places_that_look_alike(
-        vi_map, c.paired(vi_map, stretch), candidate, c.is_usual, stretch, rule
-    )
+    for contest, was_open in zip(contests, is_open, strict=True):
+        rows = contest.pair.rows
+        v.is_decided[rows] = contest.winner >= 0
+        if contest.winner < 0 or not was_open:  # a person's choice needs no majority
+            v.rival_stretches[rows] = contest.largest_rival_share()
+        v.follows[contest.pair.alignments[max(contest.winner, 0)].rows] = 1.0
+    return contests
 
 
 # Ambiguous places: queries that match several places of a mission, or a distant place of their own.
@@ -350,59 +327,35 @@ def _repeats(
 # two places about equally well, its appearance does not determine the place. A closure with a third
 # mission that observed only one of the two places is then unreliable too.
 
-
-@dataclasses.dataclass(frozen=True)
-class AmbiguityRule:
-    """Criteria for distinct places and for a significant second place."""
-
-    drift_offset_m: float
-    drift_ratio: float  # fraction of the arc length between the places
-    max_turn_rad: float = 0.3
-    min_inliers: int = 20  # of a distant place of the query's mission
+_MAX_TURN_RAD = 0.3
+"""Angle between the poses that two places give, beyond which they are different places."""
+_MIN_RIVAL_INLIERS = 20
+"""Inliers of a distant place of the query's mission that reveal that places look alike."""
 
 
-def rival_shares(
-    query_vertex: I64,
-    place_way_m: F64,
-    place_mission: I64,
-    T_M_I: F64,
-    inliers: I64,
-    is_far_same_mission: Mask,
-    candidate: Mask,
-    rule: AmbiguityRule,
-) -> F64:
+def rival_shares(j: Judgement, candidate: Mask) -> F64:
     """Return the inliers (N,) of each query's strongest other place relative to the best place.
 
-    A distant place of the query's mission counts as equally strong.
-
-    Args:
-        query_vertex: Query (N,) of each closure.
-        place_way_m: Arc length (N,) of the place along its mission.
-        place_mission: Mission (N,) of the place.
-        T_M_I: Estimated poses (N, 7).
-        inliers: Inliers (N,).
-        is_far_same_mission: Closures (N,) with a place of the query's mission beyond any plausible drift.
-        candidate: Closures (N,) that passed the geometric gates.
-        rule: Criteria for distinct places.
+    A distant place of the query's mission counts as equally strong. Candidates (N,) passed the gates on
+    their poses.
     """
+    inliers, place_way_m, mission = j.values.inliers, j.way_m[1], j.missions[1]
     rows = np.flatnonzero(candidate)
-    order = rows[np.lexsort((-inliers[rows], place_mission[rows], query_vertex[rows]))]
-    is_best = np.ones(len(order), dtype=np.bool_)
-    is_best[1:] = (query_vertex[order[1:]] != query_vertex[order[:-1]]) | (
-        place_mission[order[1:]] != place_mission[order[:-1]]
-    )
-    best = order[np.flatnonzero(is_best)[np.cumsum(is_best) - 1]] if len(order) else order
-    apart = np.linalg.norm(T_M_I[order, 4:] - T_M_I[best, 4:], axis=1)
-    between = se3.relative(T_M_I[best], T_M_I[order])
-    turn = np.linalg.norm(so3.log(between[:, :4]), axis=1)
-    drift = rule.drift_offset_m + rule.drift_ratio * np.abs(place_way_m[order] - place_way_m[best])
-    is_other = (apart > drift) | (turn > rule.max_turn_rad)
-    queries, of_closure = np.unique(query_vertex, return_inverse=True)
+    order = rows[np.lexsort((-inliers[rows], mission[rows], j.query[rows]))]
+    pair = j.query[order] * len(j.vi_map.missions) + mission[order]
+    _, first, number = np.unique(pair, return_index=True, return_inverse=True)
+    best = order[first[number]]
+    apart_m = np.linalg.norm(j.T_M_I[order, 4:] - j.T_M_I[best, 4:], axis=1)
+    between = se3.relative(j.T_M_I[best], j.T_M_I[order])
+    turn_rad = np.linalg.norm(so3.log(between[:, :4]), axis=1)
+    way_m = np.abs(place_way_m[order] - place_way_m[best])
+    is_other = apart_m > _DRIFT_OFFSET_M + j.options.max_drift_ratio * way_m
+    is_other |= turn_rad > _MAX_TURN_RAD
+    queries, of_closure = np.unique(j.query, return_inverse=True)
     shares = np.zeros(len(queries))
     share = inliers[order] / np.maximum(inliers[best], 1)
     np.maximum.at(shares, of_closure[order], np.where(is_other, share, 0.0))
-    far = candidate & is_far_same_mission & (inliers >= rule.min_inliers)
-    np.maximum.at(shares, of_closure[far], 1.0)
+    shares[of_closure[candidate & j.is_far & (inliers >= _MIN_RIVAL_INLIERS)]] = 1.0
     return np.asarray(shares[of_closure])
 
 
@@ -425,31 +378,17 @@ _MAX_NEW_SHARE = 1.0 / 3.0
 """Share of its stretches that only a group may explain if it loses."""
 
 
-def with_places_that_look_alike(
-    vi_map: VIMap,
-    closures: PairedClosures,
-    candidate: Mask,
-    is_usual: Mask,
-    stretch: I64,
-    rule: ContestRule,
-) -> Mask:
-    """Return which closures (N,) join places of a mission that only look alike.
-
-    Args:
-        vi_map: The map.
-        closures: Closures, A and B being the same mission for the candidates.
-        candidate: Closures (N,) inside missions that passed all other gates.
-        is_usual: Closures (N,) that correct no more than odometry usually drifts.
-        stretch: Stretch (V,) of each vertex.
-        rule: Criteria.
-    """
-    refused = np.zeros(len(candidate), dtype=np.bool_)
-    if not (candidate & ~is_usual).any():
-        return refused
-    for pair in alignments_of_pairs(closures, candidate, AgreementRule()):
-        for rival in _rivals(vi_map, pair, is_usual, stretch, rule):
-            refused[rival.rows] = True
-    return refused & candidate & ~is_usual
+def _repeats(j: Judgement) -> Mask:
+    """Return which closures (N,) join places of their mission that only look alike."""
+    refused = np.zeros(len(j.query), dtype=np.bool_)
+    candidate = j.values.accepted & (j.missions[0] == j.missions[1])
+    unusual = candidate & ~j.is_usual
+    if unusual.any():
+        rule = ContestRule(j.options.max_ambiguous_ratio)
+        for pair in alignments_of_pairs(j.paired, candidate, AgreementRule()):
+            for rival in _rivals(j.vi_map, pair, j.is_usual, j.stretch, rule):
+                refused[rival.rows] = True
+    return np.asarray(refused & unusual)
 
 
 def _rivals(

@@ -71,7 +71,7 @@ def guided_matches(
         options: Tolerances.
     """
     rows = np.flatnonzero(usable)
-    rows = rows[np.lexsort((rows, -closures.inlier_count[rows], closures.query_vertex[rows]))]
+    rows = rows[np.lexsort((rows, -closures.inliers[rows], closures.query_vertex[rows]))]
     _, first = np.unique(closures.query_vertex[rows], return_index=True)
     rows = rows[first]
     search = _Search(vi_map, closures, options)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.gate import failures
 from maplab_py.algorithms.loop_closure.closure_record import (
     USES,
     ClosureRecord,
@@ -18,8 +19,8 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     read_record,
 )
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.gates import closure_gates
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.recorded_gates import recorded_gates, shortfalls
 from maplab_py.algorithms.loop_closure.reports import ClosureLine, ClosureReport, Verdict
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
@@ -68,7 +69,7 @@ def list_closures(
     if reason:
         chosen = chosen & np.isin(c.verdict, _verdicts_with(reason))
     key = {
-        "near_miss": np.zeros(len(c)) if sort_by != "near_miss" else near_miss_order(vi_map, c),
+        "near_miss": near_miss_order(c),
         "time": np.zeros(len(c)),
         "gap": -gap,
         "correction": -c.correction_m,
@@ -110,16 +111,9 @@ def _verdicts_with(reason: str) -> list[int]:
     return codes
 
 
-def near_miss_order(vi_map: VIMap, closures: ClosureRecord) -> F64:
-    """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses.
-
-    Args:
-        vi_map: The map.
-        closures: All recorded closures (N).
-    """
-    gates = recorded_gates(vi_map, closures, LoopClosureOptions())
-    total = shortfalls(gates)
-    failed = np.sum([gate.failed for gate in gates], axis=0)
+def near_miss_order(closures: ClosureRecord) -> F64:
+    """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses."""
+    failed, total = failures(closure_gates(closures, LoopClosureOptions()))
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)
 
 

@@ -16,7 +16,7 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     read_record,
     write_record,
 )
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, Closures
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, Closures, GateValues
 from maplab_py.algorithms.loop_closure.consensus import path_lengths
 from maplab_py.algorithms.loop_closure.merging import MergeResult
 from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verdict
@@ -104,13 +104,7 @@ def _closure_rows(
         place=vi_map.vertices.id[c.place_vertex],
         T_A_B=c.T_A_B,
         sigma=sigma,
-        matches=c.match_count,
-        inliers=c.inlier_count,
-        tilt_deg=c.tilt_deg,
-        correction_m=c.correction_m,
-        correction_deg=c.correction_deg,
-        support=c.support,
-        verdict=c.verdict,
+        **{field.name: getattr(c, field.name) for field in dataclasses.fields(GateValues)},
         use=np.where(served, USES.index(use), 0),
         weight=np.ones(len(c)) if weight is None else weight,
     ).take(np.sort(first))

@@ -209,11 +209,11 @@ def _explanation(detection: Detection, options: LoopClosureOptions) -> str:
             f"--lc_min_verify_matches_num={options.min_verify_matches_num} from one vertex "
             "(merged landmarks are not matched)"
         )
-    best = int(np.argmax(c.inlier_count))
-    ratio = c.inlier_count / np.maximum(c.match_count, 1)
+    best = int(np.argmax(c.inliers))
+    ratio = c.inliers / np.maximum(c.matches, 1)
     refused = ", ".join(f"{why}: {n}" for why, n in c.refused_by_reason().items())
     return (
-        f"no loop closures: best of {len(c)} candidates has {c.inlier_count[best]} inliers (needed "
+        f"no loop closures: best of {len(c)} candidates has {c.inliers[best]} inliers (needed "
         f"{options.min_inlier_count}), ratio {ratio[best]:.2f} (needed "
         f"{options.min_inlier_ratio:g}), tilt {c.tilt_deg[best]:.1f} deg, {c.support[best]} "
         f"supporters (needed {options.min_support}), correction {c.correction_m[best]:.2f} m; "

@@ -68,7 +68,7 @@ def _chosen_refused(
     wanted = refused[np.isin(record.verdict[refused], codes)]
     chosen = wanted
     if len(wanted) > limit:
-        order = near_miss_order(drawing.vi_map, record)[wanted]
+        order = near_miss_order(record)[wanted]
         chosen = np.sort(wanted[np.argsort(order, kind="stable")[:limit]])
     losses = (
         (len(refused) - len(wanted), "for another reason"),

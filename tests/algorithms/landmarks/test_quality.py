@@ -7,13 +7,14 @@ import warnings
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.gate import any_failed
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import (
+    criteria,
     evaluate_quality,
     evaluate_unknown_quality,
-    judge,
     mostly_bad,
     predicted_sigma,
     reset_quality,
@@ -46,11 +47,20 @@ def with_two_observers(vi_map: VIMap, *, far_apart: bool) -> tuple[VIMap, np.nda
     return remove_observations(vi_map, removed), many
 
 
+def is_good(vi_map: VIMap, landmarks: np.ndarray, options: LandmarkQualityOptions) -> np.ndarray:
+    return ~any_failed(criteria(vi_map, landmarks, options))
+
+
+def fails(vi_map: VIMap, landmarks: np.ndarray, criterion: str) -> np.ndarray:
+    gates = criteria(vi_map, landmarks, DEFAULT)
+    return any_failed([gate for gate in gates if gate.verdict == criterion])
+
+
 def test_two_observers_at_a_wide_angle_are_enough():
     vi_map, landmarks = with_two_observers(make_map(TWICE)[0], far_apart=True)
     assert np.all(np.diff(vi_map.observation_start)[landmarks] == 2)
     assert len(landmarks) > 100
-    assert np.mean(judge(vi_map, landmarks, DEFAULT).is_good) > 0.9
+    assert np.mean(is_good(vi_map, landmarks, DEFAULT)) > 0.9
 
 
 @pytest.mark.parametrize("coordinate", [1e12, 1e160, -1e300])
@@ -59,7 +69,7 @@ def test_landmarks_at_infinity_are_bad(coordinate):
     far = with_p_G(vi_map, landmarks, np.full((len(landmarks), 3), coordinate))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not judge(far, landmarks, DEFAULT).is_good.any()
+        assert not is_good(far, landmarks, DEFAULT).any()
 
 
 def test_a_landmark_at_its_camera_is_bad():
@@ -68,17 +78,16 @@ def test_a_landmark_at_its_camera_is_bad():
     origins = rays_in_G(vi_map, keypoints)[0]
     for offset_m in (0.0, 1e-9, 1e-160):
         near = with_p_G(vi_map, landmarks, origins + offset_m)
-        assert not judge(near, landmarks, DEFAULT).is_good.any()
+        assert not is_good(near, landmarks, DEFAULT).any()
 
 
 def test_two_observers_side_by_side_are_not():
     slow = [Walk(room=1, vertices=40)]
     vi_map, landmarks = with_two_observers(make_map(slow)[0], far_apart=False)
-    verdict = judge(vi_map, landmarks, DEFAULT)
-    assert np.mean(verdict.too_uncertain) > 0.9
-    assert not verdict.too_few_observers.any()
+    assert np.mean(fails(vi_map, landmarks, "too_uncertain")) > 0.9
+    assert not fails(vi_map, landmarks, "too_few_observers").any()
     unlimited = LandmarkQualityOptions(max_relative_sigma=-1.0, min_observation_angle_deg=0.0)
-    assert judge(vi_map, landmarks, unlimited).is_good.all()
+    assert is_good(vi_map, landmarks, unlimited).all()
 
 
 def test_more_rays_of_a_narrow_view_count():
@@ -94,7 +103,7 @@ def test_a_landmark_beside_its_rays_is_uncertain_and_one_wrong_keypoint_does_not
     usual = predicted_sigma(vi_map, landmarks)
     beside = with_p_G(vi_map, landmarks, vi_map.p_G[landmarks] + [0.0, 1.0, 0.0])
     assert np.all(predicted_sigma(beside, landmarks) > 10.0 * usual)
-    assert judge(beside, landmarks, DEFAULT).too_uncertain.all()
+    assert fails(beside, landmarks, "too_uncertain").all()
     uv = vi_map.keypoints.uv_px.copy()
     first = vi_map.observations[vi_map.observation_start[landmarks]]
     uv[first] += 100.0

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
-from maplab_py.algorithms.loop_closure.gates import AmbiguityRule, rival_shares
+from maplab_py.algorithms.loop_closure.gates import rival_shares
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.geometry import se3
 from tests.algorithms.loop_closure.rooms import Walk, make_map
-
-RULE = AmbiguityRule(drift_offset_m=0.5, drift_ratio=0.1)
 
 
 def queries(p, way, inliers, *, far_own=None, mission=None):
@@ -16,16 +17,19 @@ def queries(p, way, inliers, *, far_own=None, mission=None):
     T = se3.identity(count)
     T[:, 4:] = p
     query = np.array([7, 7, 8][:count])
-    shares = rival_shares(
-        query,
-        np.asarray(way, dtype=float),
-        np.zeros(count, dtype=np.int64) if mission is None else np.asarray(mission),
-        T,
-        np.asarray(inliers),
-        np.zeros(count, dtype=bool) if far_own is None else np.asarray(far_own),
-        np.ones(count, dtype=bool),
-        RULE,
+    mission = np.zeros(count, dtype=np.int64) if mission is None else np.asarray(mission)
+    way = np.asarray(way, dtype=float)
+    judgement = SimpleNamespace(
+        vi_map=SimpleNamespace(missions=range(2)),
+        query=query,
+        T_M_I=T,
+        missions=(mission, mission),
+        way_m=(way, way),
+        values=SimpleNamespace(inliers=np.asarray(inliers)),
+        is_far=np.zeros(count, dtype=bool) if far_own is None else np.asarray(far_own),
+        options=LoopClosureOptions(max_drift_ratio=0.1),
     )
+    shares = rival_shares(judgement, np.ones(count, dtype=bool))
     return np.unique(query[shares >= 0.5]).tolist()
 
 

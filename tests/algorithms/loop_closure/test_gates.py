@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus
-from maplab_py.algorithms.loop_closure.gates import Judgement, judge
+from maplab_py.algorithms.loop_closure.gates import judge, measure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.geometry import se3, so3
@@ -55,19 +55,14 @@ def solutions(vi_map: VIMap, query: np.ndarray, *, off_m: np.ndarray) -> PoseSol
     )
 
 
-def judged(found: PoseSolutions, query: np.ndarray, **options: float) -> Judgement:
-    return judge(
-        two_laps(),
-        query,
-        query + PLACE,
-        found,
-        LoopClosureOptions(**options),
-        is_known=np.array([True]),
-    )
+def judged(found: PoseSolutions, query: np.ndarray, **options: float) -> GateValues:
+    vi_map, place = two_laps(), query + PLACE
+    measured = measure(vi_map, query, place, found, np.array([True]))
+    return judge(vi_map, query, place, found.T_M_I, measured, LoopClosureOptions(**options))[0]
 
 
-def verdicts(judgement: Judgement) -> list[Verdict]:
-    return [VERDICTS[row] for row in judgement.verdict]
+def verdicts(judged: GateValues) -> list[Verdict]:
+    return [VERDICTS[row] for row in judged.verdict]
 
 
 def test_tilted_closures_are_refused_and_say_so() -> None:
@@ -85,11 +80,13 @@ def test_tilted_closures_are_refused_and_say_so() -> None:
 
 
 def consensus(query: list[int], place: list[int], off_m: list[float], inliers: list[int]):
+    """Return support, which closures are supported by two or need no support, and contradicted ones."""
     vi_map = two_laps()
     T_M_I = solutions(vi_map, np.array(query), off_m=np.array(off_m)).T_M_I
-    return check_consensus(
+    support, difference = check_consensus(
         vi_map, np.array(query), np.array(place), T_M_I, np.array(inliers), ConsensusRule()
     )
+    return support, (support >= 2) | np.isnan(difference), difference >= 1.0
 
 
 def test_a_query_does_not_support_itself() -> None:

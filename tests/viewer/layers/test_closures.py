@@ -147,7 +147,7 @@ def test_refused_closures_are_restricted_to_a_reason(closed: VIMap) -> None:
 
 
 def test_the_best_refused_closures_are_drawn(closed: VIMap) -> None:
-    order = near_miss_order(closed, read_record(closed).closures)
+    order = near_miss_order(read_record(closed).closures)
     rows = np.array(_rows(closed, accepted=False))
     best = rows[np.argsort(order[rows], kind="stable")[:2]]
     layer = _refused(closed, max_refused_closures=2)
