@@ -29,6 +29,7 @@ from maplab_py.algorithms.self_calibration.segments.database import (
 )
 from maplab_py.errors import MaplabError
 from maplab_py.interop.bags.listing import bag_info
+from maplab_py.interop.calibration_export import exported
 from maplab_py.interop.calibration_import import import_calibration
 from maplab_py.interop.colmap.exporting import export_colmap
 from maplab_py.interop.colmap.features import ColmapDatabase
@@ -46,6 +47,7 @@ from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.interop.wheel_odometry import read_wheel_odometry
+from maplab_py.sensors import CameraRig, Imu
 from maplab_py.sensors.sensors_yaml import read_sensors, write_sensors
 from maplab_py.server.options import MapServerOptions
 from maplab_py.server.service import answers
@@ -118,7 +120,12 @@ def _calibration_seeds(folder: Path) -> list[bytes]:
         *(small_files.CAMERA_INFO, small_files.ECHOED, small_files.KANNALA, sensor_yaml(0)),
     ]
     seeds = [b"\0" + text.encode() for text in texts]
-    seeds.append(b"\1" + small_files.realsense().encode())
+    sensors = _map().sensors
+    ids = [
+        next(k for k, v in sensors.sensors.items() if isinstance(v, t)) for t in (Imu, CameraRig)
+    ]
+    (basalt,) = exported(sensors, *ids, "basalt", imu_rate_hz=200.0).values()
+    seeds += [b"\1" + text.encode() for text in (small_files.realsense(), basalt)]
     seeds.append(b"\2RadTan 458 457 320 240 -0.28 0.07 0 0\n640 480\ncrop\n640 480\n")
     seeds.append(b"\3# cameras\n1 OPENCV 640 480 500 500 320 240 0.1 0 0 0\n")
     return seeds
@@ -201,8 +208,7 @@ def _gps_seeds(folder: Path) -> list[bytes]:
     )
     table = "#timestamp [ns],latitude,longitude,altitude\n1403715273262142976,47.1,8.5,499\n"
     gns = "$GNZDA,092725.00,09,12,2002,00,00\n$GNGNS,092725.00,4717.1,N,00833.9,E,RR,8,1,9,48,,\n"
-    rtklib = "%  UTC  latitude(deg) longitude(deg)  height(m) Q\n"
-    rtklib += "".join(f"2023/11/14 22:13:2{row}.0  47.1 8.5 400 1\n" for row in range(3))
+    rtklib = "% UTC latitude(deg) longitude(deg) height(m)\n2023/11/14 22:13:20.0 47.1 8.5 400\n"
     texts = (table + "1403715274262142976,47.1,8.5,5\n", rtklib)
     return [b"\0" + nmea.encode(), b"\0" + gns.encode(), *(b"\1" + t.encode() for t in texts)]
 
