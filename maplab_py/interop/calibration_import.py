@@ -52,7 +52,7 @@ from maplab_py.interop.colmap.reading import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
 from maplab_py.sensors.sensor_set import Sensor
-from maplab_py.sensors.sensors_yaml import note_unread_keys, read_sensors
+from maplab_py.sensors.sensors_yaml import note_unread_keys, sensors_of
 from maplab_py.sensors.yaml_entry import Entry
 
 ANY_DEVICE = DeviceOptions()
@@ -352,7 +352,7 @@ def _read(path: Path) -> Parts | SensorSet:
         if is_format(entry):
             return read(entry)
     if _is_maplab(entry):
-        return read_sensors(path)
+        return sensors_of(entry.content, str(path))
     raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
 
 

@@ -101,12 +101,15 @@ def parse_sensors(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) ->
         MapError: One line that names the source, the sensor and the key.
     """
     value = parse_yaml(text, source, max_bytes)
-    if value is None:
-        return SensorSet()
-    top = Entry(value, source)
+    return SensorSet() if value is None else sensors_of(value, source)
+
+
+def sensors_of(content: Any, source: str) -> SensorSet:
+    """Return the sensors of the parsed content of a sensors.yaml; see `parse_sensors`."""
+    top = Entry(content, source)
     if "sensors" not in top and ("cameras" in top or "sigmas" in top or "imu_sigmas" in top):
         kind = "NCAMERA" if "cameras" in top else "IMU"
-        sensor = _parse_sensor({"sensor_type": kind, **value}, source)
+        sensor = _parse_sensor({"sensor_type": kind, **content}, source)
         return SensorSet({sensor.id: sensor})
     sensors: dict[str, Sensor] = {}
     taken: set[str] = set()

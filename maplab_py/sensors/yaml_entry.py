@@ -53,6 +53,11 @@ class Entry:
         """Yield all keys in the order of the file."""
         return iter(self._values)
 
+    @property
+    def content(self) -> Mapping[str, Any]:
+        """All keys and values as parsed."""
+        return self._values
+
     def raw(self, key: str) -> Any:
         """Return the value of a key as parsed and count the key as understood.
 
