@@ -60,7 +60,8 @@ class OdometryOptions(Options, prefix="vio_"):
     """Calibration that is estimated beside the motion, separated by commas: extrinsics, time_offset (of the
     images on the clock of the IMU), intrinsics, line_delay; or none"""
     apply_calibration: bool = True
-    """Give the map the calibration that was estimated, where it differs significantly"""
+    """Give the map the calibration that was estimated, where it differs significantly; and read a recording
+    that does not start in the units, axes and calibration that check_recording finds"""
     imu_noise: str = option("auto", choices=("auto", "file"))
     """Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that it
     cannot be"""

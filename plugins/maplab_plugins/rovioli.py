@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -112,15 +113,13 @@ def rovioli(
             on_estimate = live_source.publish
         else:
             recording, status = open_source(datasource_folder, data, source), str
-        mapping = Mapping(
-            recording,
-            run,
-            observer=_Several(observers),
-            on_estimate=on_estimate,
-            status=status,
-            keeps_states=not is_live or run.output.export_estimated_poses_to_csv is not None,
-        )
-        _run_checked(context, mapping, None if is_live else recording, is_to_end)
+        keeps_states = not is_live or run.output.export_estimated_poses_to_csv is not None
+        make = functools.partial(
+            Mapping, options=run, observer=_Several(observers), on_estimate=on_estimate,
+            status=status, keeps_states=keeps_states,
+        )  # fmt: skip
+        is_repeatable = None if is_live else writer is None
+        mapping = _run(context, make, recording, is_to_end, is_repeatable=is_repeatable)
         if writer is not None:
             writer.finish(mapping)
         name, progress = recording.name, context.progress
@@ -140,35 +139,30 @@ def _tell_pushed(context: CommandContext, writer: SubmapWriter, submaps: SubmapO
     return writer.pushed > 0 and writer.is_whole
 
 
-def _run_checked(
+def _run(
     context: CommandContext,
-    mapping: Mapping,
-    recording: Recording | None,
+    make: Callable[[Recording], Mapping],
+    recording: Recording,
     is_to_end: Callable[[], bool],
-) -> None:
-    """Look at the first seconds, run, and tell the cause where the odometry does not start.
-
-    Args:
-        context: Of the command.
-        mapping: The run.
-        recording: Its recording; None = it is live and cannot be read twice.
-        is_to_end: Tells whether the user ends the run.
+    *,
+    is_repeatable: bool | None,
+) -> Mapping:
+    """Run over a recording; one that is live (None) can be neither checked nor repeated.
 
     Raises:
         UserError: No map can be made of the recording.
         EstimationError: The odometry has not started.
     """
-    from maplab_py.algorithms.recording_check.doctor import check_first_seconds, explain_refusal
+    from maplab_py.frontend.checked_run import run_checked
 
-    stream = mapping.options.stream
-    doubts = check_first_seconds(recording, stream) if recording is not None else ()
-    try:
-        mapping.run(context.progress, is_to_end=is_to_end)
-    except EstimationError as error:
-        if recording is None:
-            raise
-        raise EstimationError(explain_refusal(recording, stream, str(error))) from error
-    mapping.statistics.notes.extend(doubts)
+    progress = context.progress
+    if is_repeatable is not None:
+        return run_checked(
+            make, recording, progress, is_to_end=is_to_end, is_repeatable=is_repeatable
+        )
+    mapping = make(recording)
+    mapping.run(progress, is_to_end=is_to_end)
+    return mapping
 
 
 def _check_output(output: OutputOptions) -> None:

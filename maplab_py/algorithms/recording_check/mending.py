@@ -1,0 +1,133 @@
+"""A recording that is read with what its check has shown: units, axes, calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from maplab_py.algorithms.recording_check.correction import correct
+from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose, first_cause
+from maplab_py.algorithms.recording_check.findings import Verdict
+from maplab_py.algorithms.recording_check.inertial_checks import (
+    accel_unit,
+    measured_quiet,
+    raw_axes_agree,
+)
+from maplab_py.array_types import F64
+from maplab_py.interop.device import RecordedSensors
+from maplab_py.interop.recordings.options import StreamOptions
+from maplab_py.interop.recordings.protocol import (
+    CameraImage,
+    ImuBatch,
+    Item,
+    PartSpan,
+    Recording,
+    TrackedFrameSet,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MendedRecording:
+    """A recording with another calibration, and samples in the units and axes that it expects."""
+
+    plain: Recording
+    device: RecordedSensors
+    accel: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times accelerations
+    gyro: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times rates
+    words: tuple[str, ...] = ()  # what is mended
+
+    @property
+    def name(self) -> str:
+        """File or folder."""
+        return self.plain.name
+
+    @property
+    def kind(self) -> str:
+        """Kind of the recording."""
+        return self.plain.kind
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first item."""
+        return self.plain.start_ns
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the reader, and what is mended."""
+        note = (
+            f"does not work as it is; read with what check_recording finds: {', '.join(self.words)} "
+            "(--vio_apply_calibration=false refuses that)"
+        )
+        return (*self.plain.notes, note)
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return the parts between restarts of the clock."""
+        return self.plain.parts()
+
+    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+        """Yield the items of the recording, mended; see `Recording`."""
+        old = [camera.time_offset_ns for camera in self.plain.device.cameras]
+        shift_ns = [
+            camera.time_offset_ns - before_ns
+            for camera, before_ns in zip(self.device.cameras, old, strict=True)
+        ]
+        imu = self.device.imu
+        for item in self.plain.items(start_ns, end_ns):
+            if isinstance(item, ImuBatch) and imu is not None:
+                accel, gyro = item.accel_gyro[:, :3], item.accel_gyro[:, 3:]
+                values = np.concatenate([accel @ self.accel.T, gyro @ self.gyro.T], axis=1)
+                yield ImuBatch.of(imu, item.times_ns, values)
+            elif isinstance(item, CameraImage):
+                yield dataclasses.replace(item, time_ns=item.time_ns + shift_ns[item.camera])
+            elif isinstance(item, TrackedFrameSet):
+                yield dataclasses.replace(item, time_ns=item.time_ns + shift_ns[0])
+            else:
+                yield item
+
+
+def mended(recording: Recording, stream: StreamOptions) -> MendedRecording | None:
+    """Return a recording with what its check finds wrong, and can put right; None if nothing.
+
+    Raises:
+        MapError: A table of it is damaged.
+    """
+    diagnosis = diagnose(recording, stream)
+    first = first_cause(diagnosis)
+    if first is None or first.verdict is Verdict.HOPELESS or not diagnosis.cameras:
+        return None
+    read = _with_samples(recording, diagnosis)
+    if read.words:
+        diagnosis = diagnose(read, stream)
+    corrected = correct(diagnosis)
+    if corrected.device is diagnosis.signals.device:
+        words = read.words
+    else:
+        words = (*read.words, *(n for n in corrected.notes if not n.startswith("not of the")))
+    words = tuple(word for word in words if word != "nothing to correct")
+    return dataclasses.replace(read, device=corrected.device, words=words) if words else None
+
+
+def _with_samples(recording: Recording, diagnosis: Diagnosis) -> MendedRecording:
+    """Return a recording whose samples are in the units and axes of the calibration."""
+    signals, first = diagnosis.signals, diagnosis.cameras[0]
+    accel, gyro, words = np.eye(3), np.eye(3), []
+    quiet = measured_quiet(signals)
+    unit = accel_unit(quiet) if quiet is not None else 1.0
+    wrong = {f.check: f for f in diagnosis.findings if f.verdict is Verdict.WRONG}
+    if "unit of the accelerometer" in wrong and unit != 1.0:
+        accel = unit * accel
+        words.append(f"accelerations times {unit:.6g}")
+    if "unit of the gyroscope" in wrong and first.unit != 1.0:
+        gyro = first.unit * gyro
+        words.append(f"rates times {first.unit:.6g}")
+    if axes := wrong.get("axes of the gyroscope"):
+        gyro = first.axes @ gyro
+        if raw_axes_agree(signals, unit * signals.imu.accel_gyro[:, :3], first):
+            accel = first.axes @ accel
+        words.append(f"axes {axes.observed}")
+    if "sign of the accelerometer" in wrong:
+        accel = -accel
+        words.append("accelerations times -1")
+    return MendedRecording(recording, recording.device, accel, gyro, tuple(words))
