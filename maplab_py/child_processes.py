@@ -102,7 +102,7 @@ class Service:
     ) -> None:
         """Start it; raises OSError where the system starts no process."""
         self._connection, theirs = socket.socketpair()
-        try:
+        with theirs:
             self._process = start(
                 [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
                 threads=threads,
@@ -112,11 +112,6 @@ class Service:
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
             )
-        except OSError:
-            self._connection.close()
-            raise
-        finally:
-            theirs.close()
 
     @property
     def is_alive(self) -> bool:
