@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from maplab_py.array_types import F32, I8, I32, I64, U64
 
@@ -59,10 +59,3 @@ class Neighbours:
 
     row: I32  # (Q, k), -1 where there are fewer than k
     distance: F32  # (Q, k) as `differences`, or squared in the projected space; inf where none
-
-
-class DescriptorIndex(Protocol):
-    """A search structure over a database of descriptors."""
-
-    def nearest(self, queries: DescriptorSet, k: int, rule: MatchRule) -> Neighbours:
-        """Return the nearest database descriptors that the rule allows, one per label."""

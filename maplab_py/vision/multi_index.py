@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet, MatchRule, Neighbours
 from maplab_py.vision.kmeans import kmeans, nearest_centre
+from maplab_py.vision.projection import learn_projection
 from maplab_py.vision.search_kernels import Cells, search_cells
 
+_SHORT = DescriptorKind(8)
 _DESCRIPTORS_PER_CELL = 40
 _MIN_WORDS, _MAX_WORDS = 4, 256
 
@@ -77,3 +80,23 @@ class InvertedMultiIndex:
         row[valid] = self._rows[row[valid]]
         distance[~valid] = np.inf
         return Neighbours(row, distance)
+
+
+def compile_kernels(kind: DescriptorKind = _SHORT) -> None:
+    """Compile the projection and the search on random tracks.
+
+    Args:
+        kind: Descriptors of 8 bytes; bits and numbers have kernels of their own.
+    """
+    label = np.repeat(np.arange(60), 5)
+    descriptors = np.random.default_rng(0).integers(0, 256, (60, 8), dtype=np.uint8)[label]
+    database = DescriptorSet(
+        projected=learn_projection(descriptors, label, kind=kind, dimensions=4).project(
+            descriptors
+        ),
+        words=kind.comparable(descriptors),
+        label=label,
+        session=np.zeros(len(label), dtype=np.int32),
+        time_ns=np.zeros(len(label), dtype=np.int64),
+    )
+    InvertedMultiIndex(database, cells_per_query=4).nearest(database, 2, MatchRule())

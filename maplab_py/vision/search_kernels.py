@@ -86,18 +86,6 @@ def _allowed(queries, q, database, d, rule):  # type: ignore[no-untyped-def]
     return not (rule.other_sessions_only or near)
 
 
-@compiled(parallel=True)
-def search_all(queries, database, rule, row, distance):  # type: ignore[no-untyped-def]
-    """Compare every query with every database descriptor; distances are differences."""
-    k = row.shape[1]
-    for q in prange(len(queries.words)):
-        labels = np.full(k, -1, dtype=np.int64)
-        for d in range(len(database.words)):
-            value = np.float32(difference(queries.words, q, database.words, d))
-            if value < distance[q, k - 1] and _allowed(queries, q, database, d, rule):
-                _insert(row[q], distance[q], labels, d, database.label[d], value)
-
-
 @compiled()
 def _word_distances(point, offset, centres, result):  # type: ignore[no-untyped-def]
     """Fill in squared distances of one half (every other dimension) to the words."""

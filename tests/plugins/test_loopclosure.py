@@ -119,9 +119,3 @@ def test_a_projection_for_other_descriptors_is_told(tmp_path: Path) -> None:
     report = session.run("lc", lc_projection_matrix_filename=str(tmp_path / "short.npz"))
     assert report.accepted > 0
     assert "learned a projection from the map" in report.notes[0]
-
-
-@pytest.mark.parametrize("engine", ["kd", "hamming"])
-def test_other_engines_find_the_same_places(engine: str) -> None:
-    report = session_of(TWICE).run("lc", lc_detector_engine=engine)
-    assert report.accepted >= 22

@@ -44,6 +44,16 @@ def descriptor_set(descriptors: NDArray[np.uint8], label, *, session=0, time_ns=
     )
 
 
+def nearest_by_bits(database: DescriptorSet, queries: DescriptorSet) -> NDArray[np.int64]:
+    """Return the fewest different bits (Q,) from descriptors of other labels, of an exhaustive search."""
+    fewest = np.empty(len(queries), dtype=np.int64)
+    for query, (words, label) in enumerate(zip(queries.words, queries.label, strict=True)):
+        other = (database.label != label) | (label < 0)
+        bits = np.bitwise_count(database.words ^ words).sum(axis=1, dtype=np.int64)
+        fewest[query] = bits[other].min()
+    return fewest
+
+
 def pose_problems(
     count: int,
     matches: int,

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numba
 import numpy as np
 import pytest
 
 from maplab_py.vision.descriptors import differences, pack_words
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.index_engines import INDEX_ENGINES, HammingIndex, make_index
+from maplab_py.vision.index import MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
-from tests.vision.synthetic import descriptor_set, tracks
+from tests.vision.synthetic import descriptor_set, nearest_by_bits, tracks
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +38,16 @@ def test_descriptors_of_different_lengths_are_not_compared():
         differences(np.zeros((1, 6), np.uint64), rows, np.zeros((1, 8), np.uint64), rows)
 
 
-def test_exhaustive_index_finds_the_nearest(features):
-    descriptors, database = features
-    queries = np.arange(0, len(database), 97)
-    found = HammingIndex(database).nearest(database.take(queries), 1, MatchRule())
-    for query, row, distance in zip(queries, found.row[:, 0], found.distance[:, 0], strict=True):
-        others = np.flatnonzero(database.label != database.label[query])
-        best = exact_bits(descriptors, np.full(len(others), query), others).min()
-        assert distance == best
-        assert exact_bits(descriptors, [query], [row])[0] == best
+def test_multi_index_recall_by_bits(features):
+    _, database = features
+    is_query = np.arange(len(database)) % 6 == 5  # the last of each track, of no landmark yet
+    queries = database.take(np.flatnonzero(is_query)[::2])
+    queries = dataclasses.replace(queries, label=np.full(len(queries), -1))
+    rest = database.take(np.flatnonzero(~is_query))
+    found = InvertedMultiIndex(rest, cells_per_query=32).nearest(queries, 1, MatchRule())
+    exact = nearest_by_bits(rest, queries)
+    assert np.all(found.distance[:, 0] >= exact)
+    assert np.mean(found.distance[:, 0] == exact) >= 0.9
 
 
 def test_multi_index_recall_in_projected_space(features):
@@ -62,10 +64,9 @@ def test_multi_index_recall_in_projected_space(features):
     assert np.mean(found.distance[:, 0] <= exact * 1.0001 + 1e-6) >= 0.9
 
 
-@pytest.mark.parametrize("engine", INDEX_ENGINES)
-def test_each_label_once_nearest_first(features, engine):
+def test_each_label_once_nearest_first(features):
     _, database = features
-    index = make_index(engine, database, seed=0, words_per_query=32)
+    index = InvertedMultiIndex(database, cells_per_query=32)
     found = index.nearest(database.take(np.arange(300)), 4, MatchRule())
     assert np.all(np.diff(found.distance, axis=1) >= 0)
     for query, rows in enumerate(found.row):
@@ -78,22 +79,21 @@ def test_each_label_once_nearest_first(features, engine):
 def test_a_bound_on_differences_leaves_out_nothing_that_is_nearer(features, share):
     _, database = features
     queries = database.take(np.arange(300))
-    index = make_index("imi", database, seed=0, words_per_query=32)
+    index = InvertedMultiIndex(database, cells_per_query=32)
     whole = index.nearest(queries, 4, MatchRule())
     bits = float(np.floor(np.quantile(whole.distance, share)))
-    index = make_index("imi", database, seed=0, words_per_query=32, max_difference=bits)
+    index = InvertedMultiIndex(database, cells_per_query=32, max_distance=bits)
     bounded = index.nearest(queries, 4, MatchRule())
     within = whole.distance <= bits
     assert 0 < within.sum() < within.size
     np.testing.assert_array_equal(bounded.row, np.where(within, whole.row, -1))
 
 
-@pytest.mark.parametrize("engine", INDEX_ENGINES)
-def test_rule_keeps_near_times_and_own_session_out(engine):
+def test_rule_keeps_near_times_and_own_session_out():
     descriptors, label = tracks(200, 6, flips=0.08, seed=8)
     time_ns = np.tile(np.arange(6) * 10**9, 200)
     database = descriptor_set(descriptors, label, time_ns=time_ns)
-    index = make_index(engine, database, seed=0, words_per_query=256)
+    index = InvertedMultiIndex(database, cells_per_query=256)
     unlabelled = database.take(np.arange(len(label)))
     object.__setattr__(unlabelled, "label", np.full(len(label), -1))
     found = index.nearest(unlabelled, 3, MatchRule(min_time_ns=2 * 10**9))
@@ -117,43 +117,7 @@ def test_multi_index_is_the_same_on_any_number_of_threads(features):
     assert answers[0] == answers[1]
 
 
-def test_empty_database_has_no_neighbours(features):
+def test_an_empty_index_has_no_neighbours(features):
     _, database = features
-    nothing = database.take(np.zeros(0, dtype=np.int64))
-    found = HammingIndex(nothing).nearest(database.take(np.arange(5)), 2, MatchRule())
-    assert np.all(found.row == -1)
-
-
-def sessions_of(features, count=3):
-    _, database = features
-    session = (database.label % count).astype(np.int32)
-    return DescriptorSet(
-        database.projected, database.words, database.label, session, database.time_ns
-    )
-
-
-@pytest.mark.parametrize("engine", INDEX_ENGINES)
-def test_an_empty_index_has_no_neighbours(features, engine):
-    database = sessions_of(features)
-    index = make_index(engine, database.take(np.arange(0)), seed=0, words_per_query=8)
+    index = InvertedMultiIndex(database.take(np.arange(0)))
     assert np.all(index.nearest(database.take(np.arange(5)), 2, MatchRule()).row == -1)
-
-
-def test_tree_finds_the_exact_neighbours_that_the_rule_allows(features):
-    database = sessions_of(features)
-    queries = np.arange(0, len(database), 101)
-    index = make_index("kd", database, seed=0, words_per_query=0)
-    for rule in (MatchRule(), MatchRule(other_sessions_only=True)):
-        found = index.nearest(database.take(queries), 3, rule)
-        for query, row, distance in zip(queries, found.row, found.distance, strict=True):
-            gap = np.sum((database.projected - database.projected[query]) ** 2, axis=1)
-            gap[database.label == database.label[query]] = np.inf
-            if rule.other_sessions_only:
-                gap[database.session == database.session[query]] = np.inf
-            best = {}
-            for i in np.argsort(gap, kind="stable"):
-                best.setdefault(int(database.label[i]), float(gap[i]))
-                if len(best) == 3:
-                    break
-            np.testing.assert_allclose(distance, list(best.values()), rtol=1e-4)
-            assert len(set(database.label[row].tolist())) == 3

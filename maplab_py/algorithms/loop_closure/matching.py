@@ -25,7 +25,7 @@ from maplab_py.distinct import distinct
 from maplab_py.memory import available_bytes
 from maplab_py.vision.descriptors import differences
 from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.index_engines import make_index
+from maplab_py.vision.multi_index import InvertedMultiIndex
 
 _NEIGHBOURS = 3
 _QUERIES_AT_ONCE = 1 << 18
@@ -95,7 +95,6 @@ def _in_all_missions(
     asked = d if len(queries) == len(d) else d.take(queries)
     others = MatchRule(rule.min_time_ns, True)
     rows = nearest_rows(
-        options.detector_engine,
         d.take(database),
         asked,
         _neighbours(options),
@@ -121,7 +120,7 @@ def _in_chosen_missions(
 ) -> Matches:
     """Return the matches of each query with the missions chosen for it; see `remembered`."""
     setting = (
-        f"chosen missions {options.detector_engine} {options.num_neighbors} {options.seed} "
+        f"chosen missions {options.num_neighbors} {options.seed} "
         f"{options.num_words_for_nn_search} {options.max_missions_per_query} "
         f"{_largest(features, options)!r} {features.kind!r} {rule!r}"
     )
@@ -178,12 +177,11 @@ def _nearest(
 ) -> tuple[I64, I64]:
     """Return the pairs of query features and their nearest database features, not remembered."""
     d = features.descriptors
-    index = make_index(
-        options.detector_engine,
+    index = InvertedMultiIndex(
         d.take(database),
         seed=options.seed,
-        words_per_query=options.num_words_for_nn_search,
-        max_difference=max_difference,
+        cells_per_query=options.num_words_for_nn_search,
+        max_distance=max_difference,
     )
     parts = []
     for begin in range(0, len(query), _QUERIES_AT_ONCE):
@@ -273,7 +271,6 @@ _memory = SearchMemory()
 
 
 def nearest_rows(
-    engine: str,
     database: DescriptorSet,
     queries: DescriptorSet,
     k: int,
@@ -289,7 +286,6 @@ def nearest_rows(
     The index is built only if one of the searches is not remembered.
 
     Args:
-        engine: One of `vision.index_engines.INDEX_ENGINES`.
         database: What to search in.
         queries: What to search for (Q).
         k: Neighbours.
@@ -299,19 +295,15 @@ def nearest_rows(
         max_difference: Neighbours that differ by more are not wanted.
         memory: Where results are kept.
     """
-    setting = f"{engine} {seed} {words_per_query} {k} {max_difference!r}"
+    setting = f"{seed} {words_per_query} {k} {max_difference!r}"
     common = hashlib.blake2b(setting.encode(), digest_size=32)
     for descriptors in (database, queries):
         _add(common, descriptors)
     keys = [_key(common, rule) for rule in rules]
     results = [memory.get(key) for key in keys]
     if any(rows is None for rows in results):
-        index = make_index(
-            engine,
-            database,
-            seed=seed,
-            words_per_query=words_per_query,
-            max_difference=max_difference,
+        index = InvertedMultiIndex(
+            database, seed=seed, cells_per_query=words_per_query, max_distance=max_difference
         )
         for number, (rule, key) in enumerate(zip(rules, keys, strict=True)):
             if results[number] is None:

@@ -44,9 +44,6 @@ class FeatureTypeOptions(Options, prefix="lc_"):
 class LoopClosureOptions(FeatureTypeOptions):
     """Recognition, verification and use of places. maplab's names where it has the option."""
 
-    detector_engine: str = option("imi", choices=("imi", "kd", "hamming"))
-    """Descriptor index: imi (inverted multi-index), kd (KD-tree, exact in the projected space) or hamming
-    (exhaustive, slow)"""
     projection_matrix_filename: str = ""
     """Projection of descriptors that train_projection_matrix wrote; empty, or of another length of
     descriptors = learned from the tracks of the map"""

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 
 from maplab_py.algorithms.vi_optimization.options import SolverFlags
 from maplab_py.errors import FlagError
 from maplab_py.estimation.linear.ordering import OrderingKind
-from maplab_py.estimation.linear.superlu import SuperLU
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
-from maplab_py.estimation.problem.problem import DirectSolver, Problem
+from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver_choice import SolverCosts, predict_costs
 from maplab_py.estimation.problem.submaps import SubmapProblem
 from maplab_py.estimation.states import States
@@ -42,14 +39,14 @@ def make_problem(
         FlagError: A number is out of range, or flags contradict each other.
         NotEnoughMemory: The solver does not fit.
     """
-    _check(options)
-    solver: DirectSolver = partial(SupernodalCholesky, tell=progress.line)
-    if options.linear_solver_type == "superlu":
-        solver = SuperLU
+    if options.submaps and options.linear_solver_type == "pcg":
+        raise FlagError(
+            "--ba_submaps factorises: drop --ba_linear_solver_type=pcg, or --ba_submaps"
+        )
 
     def direct() -> Problem:
         with _limited(options):
-            return Problem(states, visual, terms, solver, OrderingKind(options.ordering))
+            return Problem(states, visual, terms, OrderingKind(options.ordering), progress.line)
 
     def iterative(budget: float = np.inf) -> Problem:
         settings = IterativeOptions(forcing=options.pcg_forcing, budget=budget)
@@ -74,14 +71,6 @@ def make_problem(
     if options.linear_solver_type != "auto" or visual is None or obstacle:
         return _with_remedy(direct, remedy="" if obstacle else _REMEDY)
     return _automatic(visual, options, direct, iterative, progress)
-
-
-def _check(options: SolverFlags) -> None:
-    if options.submaps and options.linear_solver_type in ("pcg", "superlu"):
-        raise FlagError(
-            f"--ba_submaps factorises: drop --ba_linear_solver_type={options.linear_solver_type}, or "
-            "--ba_submaps"
-        )
 
 
 def _automatic(

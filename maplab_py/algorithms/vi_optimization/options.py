@@ -155,9 +155,9 @@ class SolverFlags(Options):
     """Largest number of iterations; it stops earlier once it has converged."""
     max_time_seconds: float = 1e6
     """Stop after this time."""
-    linear_solver_type: str = option("auto", choices=("auto", "multifrontal", "pcg", "superlu"))
+    linear_solver_type: str = option("auto", choices=("auto", "multifrontal", "pcg"))
     """Block Cholesky (multifrontal), conjugate gradients (pcg), or whichever of them is predicted to be
-    faster and fits; superlu is slower than multifrontal and gives the same answer"""
+    faster and fits"""
     max_memory_gb: float = 0.0
     """Memory that the direct solver may take; where it needs more, auto takes conjugate gradients; 0 = half
     of what is free."""

@@ -70,7 +70,7 @@ class VIOptimizationReport(Report):
     median_reprojection_after_px: float
     missions: list[MissionReprojection]
     gauge: str
-    linear_solver: str  # multifrontal, superlu, pcg, 8 submaps, or pcg, then multifrontal
+    linear_solver: str  # multifrontal, pcg, 8 submaps, or pcg, then multifrontal
     linear_iterations: int  # of conjugate gradients, in all
     singular_at: list[str]  # states that the measurements do not determine without damping
     calibration: list[CalibratedParameter]

@@ -1,25 +1,28 @@
-"""Solvers of matrices that are given as a list of blocks, and the Cholesky one of them."""
+"""Block-sparse Cholesky of matrices that are given as a list of blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from maplab_py.array_types import F64, I64
-from maplab_py.estimation.linear.assembled import AssembledSolver
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern, joint_covariance
 from maplab_py.estimation.linear.protocol import FactorStatistics
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 
 
-class BlockListSolver:
-    """A `protocol.LinearSolver` that sums listed blocks in the storage of another solver."""
+class BlockCholesky:
+    """Factorises and solves A x = b for matrices A of one block structure.
 
-    storage: ClassVar[Callable[..., AssembledSolver]]
+    A is symmetric, (num_nodes * node_size) square and given by its lower blocks: block b has the
+    block row `block_rows[b]` >= `block_cols[b]`. Entry (r, c) of `values[b]` is the entry
+    (block_rows[b] * node_size + r, block_cols[b] * node_size + c) of A. Of diagonal blocks only
+    the lower triangle is read. Blocks that occur several times are added. The constructor analyses the
+    structure; `factor` may then be called any number of times.
+    """
 
     def __init__(
         self,
@@ -36,7 +39,7 @@ class BlockListSolver:
             NotEnoughMemory: The factor would not fit into memory.
         """
         self._pattern = pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
-        self._solver = type(self).storage(
+        self._solver = SupernodalCholesky(
             pattern.rows, pattern.cols, num_nodes, node_size, ordering
         )
         self._places = self._solver.places(pattern.rows, pattern.cols)
@@ -48,10 +51,10 @@ class BlockListSolver:
         return self._solver.statistics
 
     def factor(self, values: F64) -> None:
-        """Factorise the matrix with blocks (B, d, d); see `protocol.LinearSolver`.
+        """Factorise A from its blocks (B, d, d).
 
         Raises:
-            NotPositiveDefinite: A pivot is not positive.
+            NotPositiveDefinite: A pivot is not positive (or not a number).
         """
         checked = self._pattern.check_values(values)
         self._values = None
@@ -61,16 +64,21 @@ class BlockListSolver:
         self._values = checked
 
     def solve(self, right_side: F64, *, refinements: int = 0) -> F64:
-        """Return x of A x = b for b (n,) or (n, k); see `protocol.LinearSolver`."""
+        """Return x of A x = b for b (n,) or (n, k), n = num_nodes * node_size.
+
+        Args:
+            right_side: b.
+            refinements: Steps of iterative refinement, x += A^-1 (b - A x).
+        """
         values = self._factorised()
         return self._pattern.refined(self._solver.solve, values, right_side, refinements)
 
     def marginal_covariance(self, nodes: ArrayLike) -> F64:
-        """Return the joint covariance of some nodes; see `protocol.LinearSolver`."""
+        """Return the rows and columns of A^-1 of nodes (k,) in their order, (k * node_size) square."""
         return joint_covariance(self.solve, nodes, self._pattern.num_nodes, self._pattern.node_size)
 
     def inverse_blocks(self) -> F64:
-        """Return the inverse at every given block; see `protocol.LinearSolver`."""
+        """Return A^-1 at every given block, in the layout of `values`; diagonal blocks are full."""
         self._factorised()
         return self._solver.inverse_blocks(self._pattern.rows, self._pattern.cols, self._places)
 
@@ -78,15 +86,6 @@ class BlockListSolver:
         if self._values is None:
             raise ValueError("factor() has to succeed before the factor can be used")
         return self._values
-
-
-class BlockCholesky(BlockListSolver):
-    """Supernodal Cholesky factorisation of listed blocks.
-
-    The constructor analyses the structure; `factor` may then be called any number of times.
-    """
-
-    storage = SupernodalCholesky
 
 
 def compile_kernels() -> None:

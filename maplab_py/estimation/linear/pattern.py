@@ -15,7 +15,7 @@ from maplab_py.compilation import compiled
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BlockPattern:
-    """Places of the lower blocks of a symmetric block matrix (see `protocol.LinearSolver`)."""
+    """Places of the lower blocks of a symmetric block matrix (see `block_cholesky.BlockCholesky`)."""
 
     rows: I32
     cols: I32

@@ -23,7 +23,7 @@ from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
 from maplab_py.estimation.linear.selected_inverse import invert_panels
 from maplab_py.estimation.linear.single_solve import solve_single
-from maplab_py.estimation.linear.symbolic import FrontPlan, analyse, most_below
+from maplab_py.estimation.linear.symbolic import analyse, most_below
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.memory import require_memory
 
@@ -32,53 +32,12 @@ _WORTH_TELLING = 1e8
 """Bytes of a factor from which users want to know its size."""
 
 
-class BlockStorage:
-    """The lower triangle of a symmetric block matrix, laid out by a plan.
-
-    `numbers` may be written to by any kernel that knows the layout.
-    """
-
-    def __init__(self, plan: FrontPlan) -> None:
-        """Make room; the numbers are undefined until `clear`."""
-        self.plan = plan
-        self.layout = BlockLayout(plan.node_size, *layout_of_panels(plan))
-        self.numbers = np.empty(int(plan.panel_start[-1]))
-        every = np.arange(len(plan.order), dtype=np.int32)
-        self._diagonal_places = self.places(every, every)
-
-    def places(self, rows: I32, cols: I32) -> I32:
-        """Return what `add` needs to know about blocks (B,) of the pattern."""
-        return np.asarray(panel_places(self.plan, self.layout.position, rows, cols))
-
-    def clear(self) -> None:
-        """Set the matrix to zero."""
-        self.numbers.fill(0.0)
-
-    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
-        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
-        add_blocks(self.layout, rows, cols, places, values, self.numbers)
-
-    def add_to_diagonal(self, added: F64) -> None:
-        """Add numbers (num_nodes, d) to the diagonal."""
-        add_to_diagonal(self.layout, self._diagonal_places, added, self.numbers)
-
-    def project(self, is_restricted: Mask, projector: F64, size: F64) -> None:
-        """Turn the matrix A into P A P + s (I - P); see `block_storage.project_panels`."""
-        every = 0, len(self.plan.parent)
-        project_panels(self.plan, is_restricted, projector, size, self.numbers, *every)
-
-    def blocks(self, rows: I32, cols: I32) -> F64:
-        """Return blocks (B, d, d) of the matrix as it was summed."""
-        return np.asarray(
-            read_blocks(self.layout, rows, cols, self.places(rows, cols), self.numbers)
-        )
-
-
-class SupernodalCholesky(BlockStorage):
-    """Supernodal Cholesky factorisation; a `assembled.AssembledSolver`.
+class SupernodalCholesky:
+    """Supernodal Cholesky factorisation, in whose storage the lower blocks of A are summed.
 
     The constructor analyses the structure. `clear`, `add` and `factorise` may then follow each other any
-    number of times. The factor replaces the matrix.
+    number of times. The factor replaces the matrix. Any kernel that knows the layout may write to
+    `numbers`.
     """
 
     def __init__(
@@ -116,14 +75,41 @@ class SupernodalCholesky(BlockStorage):
                 f"{1e-9 * symbolic.statistics.flops:.0f} Gflop an iteration"
             )
         require_memory(needed, f"the factor of {num_nodes * node_size} unknowns")
-        super().__init__(plan)
+        self.plan = plan
+        self.layout = BlockLayout(node_size, *layout_of_panels(plan))
+        self.numbers = np.empty(int(plan.panel_start[-1]))  # undefined until `clear`
+        every = np.arange(num_nodes, dtype=np.int32)
+        self._diagonal_places = self.places(every, every)
         self._blas = Blas.workspace()
         self._is_factorised = False
 
     def clear(self) -> None:
         """Set the matrix to zero; the factor is gone."""
         self._is_factorised = False
-        super().clear()
+        self.numbers.fill(0.0)
+
+    def places(self, rows: I32, cols: I32) -> I32:
+        """Return what `add` needs to know about blocks (B,) of the pattern."""
+        return np.asarray(panel_places(self.plan, self.layout.position, rows, cols))
+
+    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
+        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
+        add_blocks(self.layout, rows, cols, places, values, self.numbers)
+
+    def add_to_diagonal(self, added: F64) -> None:
+        """Add numbers (num_nodes, d) to the diagonal."""
+        add_to_diagonal(self.layout, self._diagonal_places, added, self.numbers)
+
+    def project(self, is_restricted: Mask, projector: F64, size: F64) -> None:
+        """Turn the matrix A into P A P + s (I - P); see `block_storage.project_panels`."""
+        every = 0, len(self.plan.parent)
+        project_panels(self.plan, is_restricted, projector, size, self.numbers, *every)
+
+    def blocks(self, rows: I32, cols: I32) -> F64:
+        """Return blocks (B, d, d) of the matrix as it was summed."""
+        return np.asarray(
+            read_blocks(self.layout, rows, cols, self.places(rows, cols), self.numbers)
+        )
 
     def factorise(self) -> None:
         """Overwrite the matrix by its factor.

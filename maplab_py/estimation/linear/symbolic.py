@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import I32, I64
 from maplab_py.compilation import compiled
 from maplab_py.estimation.linear.ordering import AUTOMATIC
-from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct, upper_columns
+from maplab_py.estimation.linear.pattern import BlockPattern, upper_columns
 from maplab_py.estimation.linear.protocol import FactorStatistics
 from maplab_py.estimation.linear.quotient_graph import inverse_order
 
@@ -76,22 +76,6 @@ def analyse(
     first_node = supernodes(structure_start, parent, pattern.node_size)
     return _plan_fronts(
         pattern, order, *_fronts(first_node, structure_start, structure, pattern.node_size)
-    )
-
-
-def plan_of_matrix(pattern: BlockPattern, order: I64) -> FrontPlan:
-    """Return a plan whose panels hold the matrix itself in some order, every node one supernode."""
-    n, d = pattern.num_nodes, pattern.node_size
-    start, rows = _lower_columns(pattern, inverse_order(order))
-    return FrontPlan(
-        node_size=d,
-        order=np.asarray(order, dtype=np.int64),
-        first_node=np.arange(n + 1, dtype=np.int64),
-        below_start=start,
-        below=rows,
-        below_in_parent=np.full(len(rows), -1, dtype=np.int64),
-        parent=np.full(n, -1, dtype=np.int64),
-        panel_start=_offsets((1 + np.diff(start)) * d * d),
     )
 
 
@@ -156,15 +140,6 @@ def _offsets(counts: NDArray[np.int64]) -> I64:
     start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=start[1:])
     return start
-
-
-def _lower_columns(pattern: BlockPattern, position: I64) -> tuple[I64, I64]:
-    """Return the strictly lower pattern by columns: (offsets (n + 1,), rows)."""
-    r, c = position[pattern.rows], position[pattern.cols]
-    key = np.minimum(r, c) * pattern.num_nodes + np.maximum(r, c)
-    key = sorted_distinct(key[r != c])
-    col, row = key // max(pattern.num_nodes, 1), key % max(pattern.num_nodes, 1)
-    return _offsets(np.bincount(col, minlength=pattern.num_nodes)), row
 
 
 @compiled()

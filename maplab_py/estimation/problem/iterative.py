@@ -17,11 +17,11 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.schur_products import multiply_factors
-from maplab_py.estimation.linear.assembled import AssembledSolver
 from maplab_py.estimation.linear.conjugate_gradients import CGResult, conjugate_gradients
 from maplab_py.estimation.linear.ordering import Ordering
+from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.preconditioner import Preconditioner
-from maplab_py.estimation.problem.problem import DirectSolver, Linearization, Problem
+from maplab_py.estimation.problem.problem import Linearization, Problem
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.problem.reduced_operator import Evaluation, ReducedOperator
 from maplab_py.estimation.states import States
@@ -93,19 +93,14 @@ class IterativeProblem(Problem):
         """Iterations of every linear system that was solved for a step."""
         super().__init__(states, visual, factors)
 
-    def _analyse(
-        self,
-        states: States,
-        linear_solver: DirectSolver,  # noqa: ARG002
-        ordering: Ordering,  # noqa: ARG002
-    ) -> None:
+    def _analyse(self, states: States, ordering: Ordering) -> None:  # noqa: ARG002
         self._products = None if self.visual is None else VisualProducts(self.visual)
         nodes = [term.nodes for term in self.factors]
         self._preconditioner = Preconditioner(states, nodes, self.visual is not None)
         self._held = np.zeros(0, dtype=np.int64)
 
     @property
-    def solver(self) -> AssembledSolver | None:
+    def solver(self) -> SupernodalCholesky | None:
         """The direct linear solver, once it has taken over."""
         return None if self._direct is None else self._direct.solver
 

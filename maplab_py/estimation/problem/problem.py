@@ -10,19 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64
-from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces
+from maplab_py.estimation.linear.assembled import BlockPlaces
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import joint_covariance
-from maplab_py.estimation.linear.superlu import SuperLU
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.states import NODE_NAMES, NODES_PER_VERTEX, States
 from maplab_py.estimation.terms import factor as factor_terms
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
-
-DirectSolver = Callable[..., AssembledSolver]
-"""Makes a solver for lower blocks at rows and columns, a number and size of nodes, and an ordering."""
 
 SMALLEST_DAMPED, LARGEST_DAMPED = 1e-6, 1e32
 
@@ -68,22 +64,31 @@ class Problem:
         states: States,
         visual: VisualTerms | None,
         factors: Sequence[FactorTerm],
-        linear_solver: DirectSolver = SupernodalCholesky,
         ordering: OrderingKind = OrderingKind.AUTO,
+        tell: Callable[[str], None] | None = None,
     ) -> None:
-        """Analyse the structure of the normal equations for states of this layout."""
+        """Analyse the structure of the normal equations for states of this layout.
+
+        Args:
+            states: States of this layout.
+            visual: Observations of landmarks, None without.
+            factors: All other terms.
+            ordering: Orders the nodes.
+            tell: Shows how large the factor is.
+        """
         self.num_nodes = states.num_nodes
         self.visual, self.factors = visual, tuple(factors)
         self._projector = np.tile(np.eye(3), (self.num_nodes, 1, 1))
         self._restricted = np.zeros(self.num_nodes, dtype=np.bool_)
         self.restrict(*states.blocks.padding(states.num_vertex_nodes))
-        self._analyse(states, linear_solver, Ordering(ordering, states.node_positions))
+        self._tell = tell
+        self._analyse(states, Ordering(ordering, states.node_positions))
 
-    def _analyse(self, states: States, linear_solver: DirectSolver, ordering: Ordering) -> None:
+    def _analyse(self, states: States, ordering: Ordering) -> None:
         """Analyse the blocks of the normal equations and make room for them."""
         self._assembled: Linearization | None = None  # whose matrix is in the solver's storage
         rows, cols = self.block_places(states)
-        self._solver = linear_solver(rows, cols, self.num_nodes, 3, ordering)
+        self._solver = SupernodalCholesky(rows, cols, self.num_nodes, 3, ordering, self._tell)
         del rows, cols
         self._visual_places = None
         if self.visual is not None:
@@ -123,14 +128,14 @@ class Problem:
         return self._projector
 
     @property
-    def solver(self) -> AssembledSolver | None:
+    def solver(self) -> SupernodalCholesky | None:
         """The direct linear solver; None where there is none."""
         return self._solver
 
     @property
     def linear_solver(self) -> str:
         """Name of the linear solver."""
-        return "superlu" if isinstance(self._solver, SuperLU) else "multifrontal"
+        return "multifrontal"
 
     @property
     def linear_iterations(self) -> int:

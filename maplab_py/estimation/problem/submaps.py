@@ -20,15 +20,15 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.kernels.visual_arguments import VisualTarget
-from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces
+from maplab_py.estimation.linear.assembled import BlockPlaces
 from maplab_py.estimation.linear.nested_dissection import has_metis
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.submap_solver import SubmapCholesky
+from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.problem import (
     LARGEST_DAMPED,
     SMALLEST_DAMPED,
-    DirectSolver,
     Linearization,
     Problem,
 )
@@ -106,21 +106,16 @@ class SubmapProblem(Problem):
         """
         if visual is not None and visual.estimates_cameras:
             raise ValueError("submaps do not support cameras that are estimated")
-        self._wanted, self._tell = submaps, tell
+        self._wanted = submaps
         self._make_direct = make_direct or partial(Problem, states, visual, factors)
         self._covariance_problem: Problem | None = None
         self._eliminated: tuple[Linearization, float] | None = None  # and damping of the nodes
         self._singular: NotPositiveDefinite | None = None
         if ordering is OrderingKind.AUTO and (has_metis() or visual is not None):
             ordering = OrderingKind.NESTED_DISSECTION
-        super().__init__(states, visual, factors, ordering=ordering)
+        super().__init__(states, visual, factors, ordering, tell)
 
-    def _analyse(
-        self,
-        states: States,
-        linear_solver: DirectSolver,  # noqa: ARG002
-        ordering: Ordering,
-    ) -> None:
+    def _analyse(self, states: States, ordering: Ordering) -> None:
         rows, cols = self.block_places(states)
         if self.visual is not None:
             self.visual.forget_plan()
@@ -175,7 +170,7 @@ class SubmapProblem(Problem):
         return self._submaps.count
 
     @property
-    def solver(self) -> AssembledSolver | None:
+    def solver(self) -> SupernodalCholesky | None:
         """None: the matrix is never in one storage."""
         return None
 

@@ -19,7 +19,7 @@ from maplab_py.estimation.kernels.visual_arguments import (
     VisualSums,
     VisualTarget,
 )
-from maplab_py.estimation.linear.assembled import AssembledSolver, BlockPlaces, BlockSums
+from maplab_py.estimation.linear.assembled import BlockPlaces, BlockSums
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
@@ -250,7 +250,7 @@ class VisualTerms:
         rows, cols = np.concatenate([row, border_row]), np.concatenate([col, border_col])
         return rows.astype(np.int32), cols.astype(np.int32)
 
-    def places(self, states: States, solver: AssembledSolver) -> VisualPlaces:
+    def places(self, states: States, solver: SupernodalCholesky) -> VisualPlaces:
         """Find where the blocks lie in the storage of a solver that has analysed them."""
         rows, cols = self.plan.rows, self.plan.cols
         parts = [np.zeros(0, dtype=np.int32)]

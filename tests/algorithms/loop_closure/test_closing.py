@@ -24,10 +24,9 @@ def relative_errors(truth, edges):
     return position, np.degrees(np.linalg.norm(turn, axis=1))
 
 
-@pytest.mark.parametrize("engine", ["imi", "hamming"])
-def test_a_place_seen_twice_gives_true_edges(engine):
+def test_a_place_seen_twice_gives_true_edges():
     vi_map, truth = make_map(TWICE)
-    edges, report = find_loop_closures(vi_map, LoopClosureOptions(detector_engine=engine))
+    edges, report = find_loop_closures(vi_map)
     assert report.failure == ""
     assert report.accepted_vertices >= 22
     position, turn_deg = relative_errors(truth, edges)

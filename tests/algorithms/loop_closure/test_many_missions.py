@@ -79,7 +79,7 @@ def test_a_repeated_search_of_chosen_missions_builds_no_index(room, monkeypatch)
     _, features = room
     monkeypatch.setattr(matching.remembered, "__defaults__", (SearchMemory(),))
     first, _ = match_features(features, LIMITED, RULE, apart=True)
-    monkeypatch.delattr(matching, "make_index")
+    monkeypatch.delattr(matching, "InvertedMultiIndex")
     again, _ = match_features(features, LIMITED, RULE, apart=False)  # both are searched anyway
     np.testing.assert_array_equal(first.database, again.database)
     half = np.arange(len(features)) % 2 == 0

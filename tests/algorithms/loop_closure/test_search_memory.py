@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from maplab_py.algorithms.loop_closure import matching
 from maplab_py.algorithms.loop_closure.matching import SearchMemory, nearest_rows
 from maplab_py.array_types import I32
 from maplab_py.vision.descriptors import pack_words
-from maplab_py.vision.index import DescriptorIndex, DescriptorSet, MatchRule
-from maplab_py.vision.index_engines import make_index
+from maplab_py.vision.index import DescriptorSet, MatchRule
+from maplab_py.vision.multi_index import InvertedMultiIndex
 from maplab_py.vision.projection import learn_projection
 
 ANY = MatchRule()
@@ -38,25 +39,11 @@ class _Counted:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.built = 0
-        monkeypatch.setattr(matching, "make_index", self)
+        monkeypatch.setattr(matching, "InvertedMultiIndex", self)
 
-    def __call__(
-        self,
-        engine: str,
-        database: DescriptorSet,
-        *,
-        seed: int,
-        words_per_query: int,
-        max_difference: float,
-    ) -> DescriptorIndex:
+    def __call__(self, database: DescriptorSet, **settings: Any) -> InvertedMultiIndex:
         self.built += 1
-        return make_index(
-            engine,
-            database,
-            seed=seed,
-            words_per_query=words_per_query,
-            max_difference=max_difference,
-        )
+        return InvertedMultiIndex(database, **settings)
 
 
 @pytest.fixture
@@ -73,7 +60,6 @@ def _search(
     max_difference: float = np.inf,
 ) -> list[I32]:
     return nearest_rows(
-        "hamming",
         database,
         queries,
         k,
@@ -86,7 +72,7 @@ def _search(
 
 
 def test_the_result_is_that_of_the_index(descriptors: DescriptorSet) -> None:
-    index = make_index("hamming", descriptors, seed=0, words_per_query=4)
+    index = InvertedMultiIndex(descriptors, cells_per_query=4)
     memory = SearchMemory()
     for _ in range(2):
         results = _search(memory, descriptors, descriptors, [ANY, OTHERS])

@@ -22,7 +22,6 @@ from tests.support.scene import Scene, corrupted
     [
         {"trust_region_schedule": "ceres"},
         {"use_nonmonotonic_steps": True},
-        {"linear_solver_type": "superlu"},
         {"trust_region_schedule": "ceres", "use_nonmonotonic_steps": True},
     ],
 )

@@ -8,7 +8,6 @@ import pytest
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.superlu import SuperLU
 from maplab_py.estimation.linear.supernodal import SCRATCH_SIZE
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.linear.symbolic import analyse
@@ -16,7 +15,6 @@ from tests.benchmarks.solution import effort
 from tests.estimation.linear.systems import STRUCTURES, system
 
 D = 3
-STORAGES = (SupernodalCholesky, SuperLU)
 
 
 def arrow(branches: int, length: int, trunk: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -75,12 +73,11 @@ def test_hardly_anything_is_stored_above_the_diagonal() -> None:
     assert lower <= stored <= 1.1 * lower
 
 
-@pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("name", STRUCTURES)
-def test_blocks_come_back_as_they_were_summed(storage: type, name: str) -> None:
+def test_blocks_come_back_as_they_were_summed(name: str) -> None:
     rows, cols, n, values, dense = system(name, D, seed=1)
     rows, cols = rows.astype(np.int32), cols.astype(np.int32)
-    solver = storage(rows, cols, n, D)
+    solver = SupernodalCholesky(rows, cols, n, D)
     places = solver.places(rows, cols)
     solver.clear()
     solver.add(rows, cols, places, values)
@@ -92,8 +89,7 @@ def test_blocks_come_back_as_they_were_summed(storage: type, name: str) -> None:
     np.testing.assert_allclose(np.tril(found), 2.0 * np.tril(blocks), atol=1e-12)
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_projection_and_damping_are_those_of_dense_algebra(storage: type) -> None:
+def test_projection_and_damping_are_those_of_dense_algebra() -> None:
     rows, cols, n, values, dense = system("cameras", D, seed=4)
     rng = np.random.default_rng(0)
     is_restricted = rng.random(n) < 0.4
@@ -105,7 +101,7 @@ def test_projection_and_damping_are_those_of_dense_algebra(storage: type) -> Non
     projector[fixed] = 0.0
     added, size = rng.uniform(0.1, 1.0, (n, D)), rng.uniform(1.0, 2.0, n)
     rows, cols = rows.astype(np.int32), cols.astype(np.int32)
-    solver = storage(rows, cols, n, D)
+    solver = SupernodalCholesky(rows, cols, n, D)
     solver.clear()
     solver.add(rows, cols, solver.places(rows, cols), values)
     solver.add_to_diagonal(added)
@@ -120,10 +116,9 @@ def test_projection_and_damping_are_those_of_dense_algebra(storage: type) -> Non
     np.testing.assert_allclose(solver.solve(b), np.linalg.solve(wanted, b), atol=1e-9)
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_factor_that_is_gone_is_not_used(storage: type) -> None:
+def test_a_factor_that_is_gone_is_not_used() -> None:
     node = np.zeros(1, dtype=np.int32)
-    solver = storage(node, node, 1, D)
+    solver = SupernodalCholesky(node, node, 1, D)
     solver.clear()
     solver.add_to_diagonal(np.full((1, D), 2.0))
     solver.factorise()
