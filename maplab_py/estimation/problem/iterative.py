@@ -81,7 +81,7 @@ class IterativeProblem(Problem):
         """
         if visual is not None and visual.estimates_cameras:
             raise ValueError("conjugate gradients do not support cameras that are estimated")
-        self._options, self._tell = options or IterativeOptions(), tell
+        self._options = options or IterativeOptions()
         self._make_direct = make_direct or partial(Problem, states, visual, factors)
         self._evaluated: Evaluation | None = None
         self._direct: Problem | None = None  # after it has taken over
@@ -91,7 +91,7 @@ class IterativeProblem(Problem):
         self._is_direct_refused = False
         self.iterations: list[int] = []
         """Iterations of every linear system that was solved for a step."""
-        super().__init__(states, visual, factors)
+        super().__init__(states, visual, factors, tell=tell)
 
     def _analyse(self, states: States, ordering: Ordering) -> None:  # noqa: ARG002
         self._products = None if self.visual is None else VisualProducts(self.visual)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
 from maplab_py.interop.recordings.bag_files import (
@@ -481,8 +480,7 @@ class BagRecording:
 
     def _batch(self, times_ns: list[int], samples: list[tuple[float, ...]]) -> Iterator[ImuBatch]:
         assert self.device.imu is not None  # its topic is read
-        values: F64 = np.array(samples, dtype=np.float64)
-        times: I64 = np.array(times_ns, dtype=np.int64)
+        values, times = np.array(samples, dtype=np.float64), np.array(times_ns, dtype=np.int64)
         is_number = np.isfinite(values).all(axis=1)
         if not is_number.all():
             stream, clock = self._streams[0], self._clocks[0]
