@@ -98,7 +98,7 @@ def read_text(
 ) -> str:
     """Return the text of a file with line ends `\\n`; see `read_bytes`.
 
-    UTF-16 is known by its byte order mark.
+    With the encoding utf-8-sig, for which a byte order mark may come first, that of UTF-16 counts, too.
 
     Raises:
         OSError: The file cannot be read.
@@ -106,7 +106,8 @@ def read_text(
         UserError: It is larger than max_bytes.
     """
     content = read_bytes(path, max_bytes, remedy=remedy, error=error)
-    text = content.decode("utf-16" if content.startswith(_UTF_16) else encoding)
+    is_utf_16 = encoding == "utf-8-sig" and content.startswith(_UTF_16)
+    text = content.decode("utf-16" if is_utf_16 else encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

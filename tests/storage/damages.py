@@ -128,7 +128,7 @@ _FILES = {
     "sensors.yaml missing": Damage(removed("vi_map/sensors.yaml"), "vi_map/sensors.yaml"),
     "sensors.yaml truncated": Damage(cut("vi_map/sensors.yaml", 300), "vi_map/sensors.yaml"),
     "sensors.yaml no text": Damage(
-        content("vi_map/sensors.yaml", b"\xfe\xfe"), "vi_map/sensors.yaml", ("UTF-8",)
+        content("vi_map/sensors.yaml", b"\xff\xfe"), "vi_map/sensors.yaml", ("UTF-8",)
     ),
     "sensors.yaml with an alias bomb": Damage(yaml_bomb, "vi_map/sensors.yaml", ("aliases",)),
     "sensors.yaml of absurd size": Damage(
