@@ -28,7 +28,6 @@ def test_warmup_compiles_every_kernel_that_place_recognition_calls():
         kmeans._nearest,
         projection._sum_table,
         search_kernels.differences_between,
-        search_kernels.search_all,
         search_kernels.search_cells,
         track_union._unite,
         pose_kernels.search_poses,
@@ -38,12 +37,8 @@ def test_warmup_compiles_every_kernel_that_place_recognition_calls():
 
 def test_warmup_compiles_the_search_of_numbers():
     jobs()["descriptors of numbers"]()
-    for kernel in (search_kernels.search_all, search_kernels.search_cells):
-        words = {
-            str(signature[-5 if kernel is search_kernels.search_all else 1])
-            for signature in kernel.signatures
-        }
-        assert any("int8" in text for text in words)
+    words = {str(signature[1]) for signature in search_kernels.search_cells.signatures}
+    assert any("int8" in text for text in words)
     assert len(epipolar_matching._fill.signatures) >= 2
 
 
