@@ -13,15 +13,17 @@ import pytest
 
 import maplab_py
 from tests.support.coverage import NO_BROWSER, NO_DATA, not_run_here
+from tests.support.data import shared_data
 
+ONLY_INSTALLED = pytest.mark.skipif(
+    not os.environ.get("MAPLAB_TEST_INSTALLED"), reason="only .ci/run installs the wheel"
+)
 IMPORTED_FROM = (
     "import maplab_py, maplab_plugins; print(maplab_py.__file__, maplab_plugins.__file__)"
 )
 
 
-@pytest.mark.skipif(
-    not os.environ.get("MAPLAB_TEST_INSTALLED"), reason="only .ci/run installs the wheel"
-)
+@ONLY_INSTALLED
 def test_the_installed_packages_are_tested() -> None:
     installed = Path(sysconfig.get_path("purelib")).resolve()
     for package in (maplab_py, maplab_plugins):
@@ -31,6 +33,17 @@ def test_the_installed_packages_are_tested() -> None:
     )
     for file in done.stdout.split():
         assert installed in Path(file).resolve().parents
+
+
+@ONLY_INSTALLED
+@pytest.mark.slow
+@pytest.mark.parametrize("line", ["demo", "rovioli {} --save_map_folder=map; optvi; relax; lc"])
+def test_the_wheel_brings_all_kernels_of_the_readme(tmp_path: Path, line: str) -> None:
+    words = line.format(shared_data("euroc_mh01_10s")) if "{}" in line else line
+    environment = {**os.environ, "MAPLAB_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "maplab_py", "--discard", "-c", words]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path, env=environment)
+    assert [path.name for path in (tmp_path / "cache").rglob("*.nbc")] == []
 
 
 def test_programs_that_tests_start_import_the_package_that_is_tested(tmp_path: Path) -> None:

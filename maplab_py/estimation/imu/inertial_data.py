@@ -84,8 +84,8 @@ class InertialData:
             self.sample_start,
             self.timestamp_ns,
             self.accel_gyro,
-            np.array(np.broadcast_to(gyro_bias, shape), dtype=np.float64),
-            np.array(np.broadcast_to(accel_bias, shape), dtype=np.float64),
+            np.array(np.broadcast_to(gyro_bias, shape), dtype=np.float64, order="C"),
+            np.array(np.broadcast_to(accel_bias, shape), dtype=np.float64, order="C"),
             self.imu_of_edge,
             *self.corrections,
         )
