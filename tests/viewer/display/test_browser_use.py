@@ -105,8 +105,7 @@ def test_the_panel_of_many_layers_needs_no_scrolling(browser: Any) -> None:
     assert len(scene.layers) == 13
     page = Page(browser, viewer.url, (1280, 720))
     assert page.wait_until(lambda: page.page.get_by_text("more layers").count() == 1)
-    page.settle(2000)
-    assert page.page.evaluate(_OVERFLOWING) == 0
+    assert page.wait_until(lambda: page.page.evaluate(_OVERFLOWING) == 0, 30.0)
     assert not page.checkbox("Cameras 14").is_visible()
     page.click(page.page.get_by_text("more layers"))
     assert page.wait_until(lambda: page.checkbox("Cameras 14").is_visible())
