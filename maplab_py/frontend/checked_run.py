@@ -5,11 +5,16 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
-from maplab_py.algorithms.recording_check.doctor import check_first_seconds, explain_refusal
+from maplab_py.algorithms.recording_check.doctor import (
+    Diagnosis,
+    check_first_seconds,
+    diagnose,
+    explain_refusal,
+)
 from maplab_py.algorithms.recording_check.mending import mended
 from maplab_py.errors import EstimationError, MapError
 from maplab_py.frontend.mapping import Mapping
-from maplab_py.frontend.run_options import RunOptions
+from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.progress import SILENT, Progress
 
@@ -46,28 +51,33 @@ def run_checked(
     try:
         mapping.run(progress, is_to_end=is_to_end)
     except EstimationError as caught:
+        if mapping.is_ended_early:
+            raise
         error = caught
     estimated = mapping.statistics.estimated_frames
     is_lost = not mapping.is_ended_early and estimated < _LEAST_SHARE * mapping.statistics.frames
-    if error is not None or (is_lost and is_repeatable):
-        again = _mended(recording, mapping.options)
-        if again is not None:
-            second = make(again)
-            with contextlib.suppress(EstimationError):
-                second.run(progress, is_to_end=is_to_end)
-            if second.statistics.estimated_frames > estimated:
-                return second
+    if error is None and not (is_lost and is_repeatable):
+        mapping.statistics.notes.extend(doubts)
+        return mapping
+    diagnosis = _diagnose(recording, stream, progress)
+    again = None
+    if diagnosis is not None and mapping.options.odometry.apply_calibration:
+        again = mended(recording, diagnosis, stream)
+    if again is not None:
+        second = make(again)
+        with contextlib.suppress(EstimationError):
+            second.run(progress, is_to_end=is_to_end)
+        if second.statistics.estimated_frames > estimated:
+            return second
     if error is not None:
-        raise EstimationError(explain_refusal(recording, stream, str(error))) from error
+        raise EstimationError(explain_refusal(diagnosis, recording.name, str(error))) from error
     mapping.statistics.notes.extend(doubts)
     return mapping
 
 
-def _mended(recording: Recording, options: RunOptions) -> Recording | None:
-    """Return the recording with what its check finds, unless the user does not want that."""
-    if not options.odometry.apply_calibration:
-        return None
+def _diagnose(recording: Recording, stream: StreamOptions, progress: Progress) -> Diagnosis | None:
+    """Diagnose a whole recording; None where a table of it is damaged."""
     try:
-        return mended(recording, options.stream)
+        return diagnose(recording, stream, progress=progress)
     except MapError:
         return None

@@ -314,3 +314,13 @@ def _frames(update: OdometryUpdate) -> Sequence[TrackedFrame | None]:
     if update.tracks is not None:
         return update.tracks.frames
     return described_frames(update.tracked.cameras, update.images, update.time_ns)
+
+
+def load_kernels() -> None:
+    """Load the machine code of the odometry, for which the first images of a robot would wait."""
+    from maplab_py.estimation.window.warmup import window_jobs
+    from maplab_py.frontend.initialization import gyro_bias
+    from maplab_py.vision.tracking import tracker
+
+    for load in (*window_jobs().values(), tracker.compile_kernels, gyro_bias.compile_kernels):
+        load()

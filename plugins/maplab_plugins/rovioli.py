@@ -85,7 +85,7 @@ def rovioli(
     from maplab_plugins.live import live_run
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
-    from maplab_py.frontend.mapping import Mapping
+    from maplab_py.frontend.mapping import Mapping, load_kernels
     from maplab_py.server.submap_sources import SubmapWriter
 
     _check_output(run.output)
@@ -106,6 +106,7 @@ def rovioli(
         on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None
         if is_live:
             _check_live(datasource_folder, data, run)
+            load_kernels()
             live_source = stack.enter_context(
                 live_run(context, data.type, source, network, live, run.stream)
             )

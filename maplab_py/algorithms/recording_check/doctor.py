@@ -40,7 +40,7 @@ from maplab_py.algorithms.recording_check.turn_checks import (
     check_unit,
 )
 from maplab_py.array_types import F64
-from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.options import StreamOptions
@@ -50,10 +50,6 @@ from maplab_py.vimap import VIMap
 
 QUICK_S = 4.0
 """Seconds at the beginning that a run looks at before it starts."""
-_OF_CALIBRATION = (
-    "unit", "axes", "sign", "time offset", "rotation", "cameras", "scale", "shutter"
-)  # fmt: skip
-"""Beginnings of the checks that a map's tracks and samples allow, and that bend a map."""
 _STEREO_PX, _SWAPPED_SHARE, _FITS_PX, _UNLIKE_SCALE = 1.2, 0.5, 0.4, 0.015
 
 
@@ -100,7 +96,7 @@ def diagnose_signals(
         return Diagnosis(signals, tuple(findings), ())
     cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
     findings += check_images(signals)
-    findings += _check_motion(signals, cameras)
+    findings += [*_check_motion(signals, cameras), *_check_noise(signals, cameras)]
     return Diagnosis(signals, tuple(findings), cameras)
 
 
@@ -140,17 +136,12 @@ def check_first_seconds(recording: Recording, stream: StreamOptions) -> tuple[st
     return (f"first {QUICK_S:g} s: {first.line} (check_recording tells more)",)
 
 
-def explain_refusal(recording: Recording, stream: StreamOptions, reason: str) -> str:
+def explain_refusal(diagnosis: Diagnosis | None, name: str, reason: str) -> str:
     """Return why odometry has not started: what is wrong with the recording, else the given reason."""
-    try:
-        first = first_cause(diagnose(recording, stream))
-    except MaplabError:
-        return reason
+    first = None if diagnosis is None else first_cause(diagnosis)
     if first is None:
         return reason
-    return (
-        f"{recording.name}: the odometry has not started: {first.line} (check_recording tells more)"
-    )
+    return f"{name}: the odometry has not started: {first.line} (check_recording tells more)"
 
 
 def check_map(vi_map: VIMap) -> tuple[str, ...]:
@@ -161,13 +152,13 @@ def check_map(vi_map: VIMap) -> tuple[str, ...]:
     counts = np.bincount(vi_map.vertices.mission, minlength=len(vi_map.missions))
     try:
         recording = MapRecording(vi_map, int(np.argmax(counts)))
-        if recording.device.imu is None:
-            return ()
-        findings = diagnose(recording).findings
+        signals = read_signals(recording)
     except MapError:
         return ()
-    chosen = [f for f in findings if f.check.startswith(_OF_CALIBRATION)]
-    first = cause(chosen)
+    if cannot_work(signals, is_whole=True):
+        return ()
+    cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
+    first = cause(tuple(_check_motion(signals, cameras)))
     return () if first is None else (f"this recording shows: {first.line}",)
 
 
@@ -194,8 +185,13 @@ def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[
     yield from _check_stereo(cameras, _stereo_fits(signals))
     yield check_scale(cameras)
     yield from check_shutter(cameras, signals.device.cameras)
+
+
+def _check_noise(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
+    """Yield findings on the noise figures of the IMU."""
     if signals.device.imu is not None:
-        units = (accel_unit(quiet) if quiet is not None else 1.0, first.unit)
+        quiet = measured_quiet(signals)
+        units = (accel_unit(quiet) if quiet is not None else 1.0, cameras[0].unit)
         yield from check_noise(signals.device.imu, quiet, units)
 
 

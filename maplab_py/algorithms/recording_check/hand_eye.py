@@ -241,9 +241,8 @@ def _linearise(
 
 def _eliminated(residual: F64, J: F64, weight: F64, variance: float) -> tuple[F64, F64]:
     """Return the normal equations of the common unknowns, without those of each pair's direction."""
-    WJ = weight[..., None] * J
-    H = np.einsum("pki,pkj->pij", WJ, J)
-    g = np.einsum("pki,pk->pi", WJ, residual)
+    JtW = (weight[..., None] * J).swapaxes(1, 2)
+    H, g = JtW @ J, (JtW @ residual[..., None])[..., 0]
     # without parallax, noise alone makes the direction look as if it could explain everything
     noise = variance * weight.sum(axis=1)
     of_direction = H[:, _UNKNOWNS:, _UNKNOWNS:] + _DIRECTION_DAMPING * noise[
@@ -251,5 +250,5 @@ def _eliminated(residual: F64, J: F64, weight: F64, variance: float) -> tuple[F6
     ] * np.eye(2)
     gain = H[:, :_UNKNOWNS, _UNKNOWNS:] @ np.linalg.inv(of_direction)
     common = H[:, :_UNKNOWNS, :_UNKNOWNS] - gain @ H[:, _UNKNOWNS:, :_UNKNOWNS]
-    direction_g = np.einsum("pij,pj->pi", gain, g[:, _UNKNOWNS:])
+    direction_g = (gain @ g[:, _UNKNOWNS:, None])[..., 0]
     return common.sum(axis=0), (g[:, :_UNKNOWNS] - direction_g).sum(axis=0)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.algorithms.recording_check.correction import correct
-from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose, first_cause
+from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose_signals, first_cause
 from maplab_py.algorithms.recording_check.findings import Verdict
 from maplab_py.algorithms.recording_check.inertial_checks import (
     accel_unit,
@@ -66,6 +66,11 @@ class MendedRecording:
         """Return the parts between restarts of the clock."""
         return self.plain.parts()
 
+    def mend(self, accel_gyro: F64) -> F64:
+        """Return samples (S, 6) in the units and axes of the calibration."""
+        accel, gyro = accel_gyro[:, :3] @ self.accel.T, accel_gyro[:, 3:] @ self.gyro.T
+        return np.concatenate([accel, gyro], axis=1)
+
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield the items of the recording, mended; see `Recording`."""
         old = [camera.time_offset_ns for camera in self.plain.device.cameras]
@@ -76,9 +81,7 @@ class MendedRecording:
         imu = self.device.imu
         for item in self.plain.items(start_ns, end_ns):
             if isinstance(item, ImuBatch) and imu is not None:
-                accel, gyro = item.accel_gyro[:, :3], item.accel_gyro[:, 3:]
-                values = np.concatenate([accel @ self.accel.T, gyro @ self.gyro.T], axis=1)
-                yield ImuBatch.of(imu, item.times_ns, values)
+                yield ImuBatch.of(imu, item.times_ns, self.mend(item.accel_gyro))
             elif isinstance(item, CameraImage):
                 yield dataclasses.replace(item, time_ns=item.time_ns + shift_ns[item.camera])
             elif isinstance(item, TrackedFrameSet):
@@ -87,19 +90,18 @@ class MendedRecording:
                 yield item
 
 
-def mended(recording: Recording, stream: StreamOptions) -> MendedRecording | None:
-    """Return a recording with what its check finds wrong, and can put right; None if nothing.
-
-    Raises:
-        MapError: A table of it is damaged.
-    """
-    diagnosis = diagnose(recording, stream)
+def mended(
+    recording: Recording, diagnosis: Diagnosis, stream: StreamOptions
+) -> MendedRecording | None:
+    """Return a recording with what its diagnosis finds wrong, and can put right; None if nothing."""
     first = first_cause(diagnosis)
     if first is None or first.verdict is Verdict.HOPELESS or not diagnosis.cameras:
         return None
     read = _with_samples(recording, diagnosis)
     if read.words:
-        diagnosis = diagnose(read, stream)
+        imu = diagnosis.signals.imu
+        imu = dataclasses.replace(imu, accel_gyro=read.mend(imu.accel_gyro))
+        diagnosis = diagnose_signals(dataclasses.replace(diagnosis.signals, imu=imu), stream)
     corrected = correct(diagnosis)
     if corrected.device is diagnosis.signals.device:
         words = read.words

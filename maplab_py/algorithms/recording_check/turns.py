@@ -109,19 +109,19 @@ class ImageTurns:
 
 def epipolar(rays: RayPairs, first: F64, second: F64, R_1_2: F64, weight: F64) -> Epipolar:
     """Return residuals of rays (P, K, 3) under turns (P, 3, 3), and their derivatives."""
-    turned = np.einsum("pij,pkj->pki", R_1_2, second)
+    turned = second @ R_1_2.swapaxes(1, 2)
     normal = np.cross(first, turned)
     t = _directions(first, normal, weight)
     across = np.cross(t[:, None], first)
     sine = np.maximum(np.linalg.norm(across, axis=2), _LEAST_SINE)
     scale = rays.focal_px * rays.is_point / sine
     # t . (a x R b) = b . R^T (t x a): by b, and by a right perturbation of R
-    back = np.einsum("pji,pkj->pki", R_1_2, across)
+    back = across @ R_1_2
     basis = _bases(t)
     return Epipolar(
-        np.einsum("pki,pi->pk", normal, t) * scale,
+        (normal @ t[..., None])[..., 0] * scale,
         np.cross(second, back) * scale[..., None],
-        np.einsum("pki,pia->pka", normal, basis) * scale[..., None],
+        normal @ basis * scale[..., None],
         np.cross(turned, t[:, None]) * scale[..., None],
         back * scale[..., None],
         t,
@@ -135,20 +135,20 @@ def image_turns(rays: RayPairs) -> ImageTurns:
     R = np.broadcast_to(np.eye(3), (len(rays), 3, 3))
     for _ in range(_KABSCH_ROUNDS):
         R = kabsch(first, second, weight)
-        off = np.linalg.norm(first - np.einsum("pij,pkj->pki", R, second), axis=2)
+        off = np.linalg.norm(first - second @ R.swapaxes(1, 2), axis=2)
         weight = robust_weights(off * rays.focal_px, rays.is_point, by_row=True)
     weight = rays.is_point.astype(np.float64)
     for _ in range(_ROUNDS):
         at = epipolar(rays, first, second, R, weight)
         weight = robust_weights(at.residual_px, rays.is_point, by_row=True)
         J = np.concatenate([at.by_turn, at.by_direction], axis=2)
-        H = np.einsum("pk,pki,pkj->pij", weight, J, J)
-        g = np.einsum("pk,pki,pk->pi", weight, J, at.residual_px)
+        JtW = (weight[..., None] * J).swapaxes(1, 2)
+        H, g = JtW @ J, JtW @ at.residual_px[..., None]
         size = np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-9
-        step = -np.linalg.solve(H + _DAMPING * size * np.eye(5), g[..., None])[:, :3, 0]
+        step = -np.linalg.solve(H + _DAMPING * size * np.eye(5), g)[:, :3, 0]
         R = R @ so3.to_matrix(so3.exp(np.clip(step, -0.05, 0.05)))
     at = epipolar(rays, first, second, R, weight)
-    turned = np.einsum("pij,pkj->pki", R, second)
+    turned = second @ R.swapaxes(1, 2)
     normal, flow = np.cross(first, turned), np.cross(first, at.t[:, None])
     # depth of the second camera's points has the sign of -(first x t) . (first x turned)
     ahead = -np.sign(np.einsum("pki,pki->pk", flow, normal)) * (weight > 0.3)
@@ -165,7 +165,7 @@ def image_turns(rays: RayPairs) -> ImageTurns:
 
 def kabsch(first: F64, second: F64, weight: F64) -> F64:
     """Return the rotations (..., 3, 3) that take second vectors (..., K, 3) to first ones."""
-    M = np.einsum("...k,...ki,...kj->...ij", weight, first, second)
+    M = (weight[..., None] * first).swapaxes(-2, -1) @ second
     U, _, Vt = np.linalg.svd(M)
     sign = np.linalg.det(U @ Vt)
     U = U.copy()
@@ -190,7 +190,7 @@ def _directions(first: F64, normal: F64, weight: F64) -> F64:
     t = np.zeros((len(first), 3))
     scale = weight
     for _ in range(2):
-        scatter = np.einsum("pk,pki,pkj->pij", scale, normal, normal)
+        scatter = (scale[..., None] * normal).swapaxes(1, 2) @ normal
         t = np.linalg.eigh(scatter)[1][..., 0]
         sine = np.linalg.norm(np.cross(t[:, None], first), axis=2)
         scale = weight / np.maximum(sine, _LEAST_SINE) ** 2

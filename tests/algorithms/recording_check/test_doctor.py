@@ -138,10 +138,11 @@ def test_the_first_seconds_are_refused_noted_or_passed():
 
 
 def test_a_refused_start_is_explained_by_its_cause():
-    stream = StreamOptions()
-    assert explain_refusal(mission(), stream, "move more") == "move more"
-    reason = explain_refusal(faults.with_imu(mission(), EYE, np.degrees(EYE)), stream, "move more")
-    assert "the odometry has not started: unit of the gyroscope" in reason
+    assert explain_refusal(diagnose(mission()), "walk", "move more") == "move more"
+    assert explain_refusal(None, "walk", "move more") == "move more"
+    wrong = diagnose(faults.with_imu(mission(), EYE, np.degrees(EYE)))
+    reason = explain_refusal(wrong, "walk", "move more")
+    assert "walk: the odometry has not started: unit of the gyroscope" in reason
 
 
 def test_a_map_tells_what_contradicts_its_calibration():

@@ -37,7 +37,7 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
     axes = faults.AXES["swap xy"]
     wrong = faults.with_imu(mission(), EYE / 9.81, np.degrees(axes))
     wrong = faults.with_rig(faults.with_clock(wrong, 0.02), turn_deg=(0.0, 6.0, 0.0))
-    read = mended(wrong, STREAM)
+    read = mended(wrong, diagnose(wrong), STREAM)
     assert read is not None
     assert first_cause(diagnose(read)) is None
     np.testing.assert_allclose(read.accel, 9.81 * EYE)
@@ -49,8 +49,8 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
 
 
 def test_a_sound_recording_and_a_hopeless_one_stay() -> None:
-    assert mended(mission(), STREAM) is None
-    assert mended(faults.with_clock(mission(), 3600.0), STREAM) is None
+    for recording in (mission(), faults.with_clock(mission(), 3600.0)):
+        assert mended(recording, diagnose(recording), STREAM) is None
 
 
 def test_a_run_that_is_lost_is_mended_or_noted() -> None:
