@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from maplab_py.errors import Cancelled
@@ -31,6 +31,8 @@ _THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
 )
 SECONDS_BETWEEN_LOOKS = 0.1
+_SECONDS_TO_END = 10.0
+"""Time that a child gets to end after its connection has broken."""
 
 
 def start(
@@ -130,16 +132,35 @@ class Service:
             Cancelled: The request was cancelled.
         """
         try:
-            _send(self._connection, request)
-            while not _is_readable(self._connection, SECONDS_BETWEEN_LOOKS):
+            with self._connected():
+                _send(self._connection, request)
+            while not self._has_answered():
                 if is_cancelled():
                     raise Cancelled
-            return _receive(self._connection)
-        except (EOFError, OSError, ValueError) as error:  # or another thread has called `end`
-            raise ServiceEnded(self._process.wait()) from error
+            with self._connected():
+                return _receive(self._connection)
+        except ServiceEnded:
+            raise
         except BaseException:
             self.end()
             raise
+
+    def _has_answered(self) -> bool:
+        with self._connected():
+            return _is_readable(self._connection, SECONDS_BETWEEN_LOOKS)
+
+    @contextlib.contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Raise ServiceEnded where the connection breaks; a process that goes on without it is killed."""
+        try:
+            yield
+        except (EOFError, OSError, ValueError) as error:  # or another thread has called `end`
+            try:
+                status = self._process.wait(_SECONDS_TO_END)
+            except subprocess.TimeoutExpired:
+                self.end()
+                status = self._process.wait()
+            raise ServiceEnded(status) from error
 
     def end(self) -> None:
         """Kill it, and wait for its end."""

@@ -1,5 +1,6 @@
-"""A service that returns what it is asked, ends with a status, or takes its time."""
+"""A service that returns what it is asked, ends with a status, takes its time, or hangs up."""
 
+import os
 import sys
 import time
 from typing import Any
@@ -12,6 +13,9 @@ def answer(request: Any) -> Any:
         sys.exit(request)
     if isinstance(request, float):
         time.sleep(request)
+    if request == "hang up":
+        os.close(int(sys.argv[1]))
+        time.sleep(60.0)
     return request
 
 
