@@ -8,7 +8,7 @@ from maplab_py.interop.recordings.bag_writing import BagFormat
 
 pytest.importorskip("rosbags")
 
-from tests.benchmarks.bags import measure
+from benchmarks.bags import measure
 
 
 @pytest.mark.parametrize("kind", list(BagFormat))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.dense import measure
 from maplab_py.simulation.scenario_file import load_scenario
-from tests.benchmarks.dense import measure
 from tests.support.stereo_room import StereoRoom
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks import kpi
-from tests.benchmarks.kpi import (
+from benchmarks import kpi
+from benchmarks.kpi import (
     PAGE,
     Change,
     regressions,

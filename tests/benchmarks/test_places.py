@@ -7,16 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
+from benchmarks.places.alike import ONE, measure, recorded, with_known
+from benchmarks.places.ambiguity import aliased_rooms, clarity, flight, share
+from benchmarks.places.euroc import compare
+from benchmarks.places.tango import pairs_of_loop
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from tests.algorithms.loop_closure.against_truth import is_right, joined
-from tests.benchmarks.places.alike import ONE, measure, recorded, with_known
-from tests.benchmarks.places.ambiguity import aliased_rooms, clarity, flight, share
-from tests.benchmarks.places.euroc import compare
-from tests.benchmarks.places.tango import pairs_of_loop
 
 pytestmark = pytest.mark.slow
 

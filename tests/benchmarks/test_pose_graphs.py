@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.pose_graphs import compare_graph
+from benchmarks.pose_graphs import compare_graph
 from tests.support.data import shared_data
 
 

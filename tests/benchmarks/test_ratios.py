@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.comparison import PEER, compare, scaling_exponent
+from benchmarks.comparison import PEER, compare, scaling_exponent
 
 PEER_MODULE = {"ceres": "pycolmap", "gtsam": "gtsam"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.rendering import CROWDED, measure
+from benchmarks.rendering import CROWDED, measure
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from benchmarks.places.aliased import strangers
 from maplab_py.simulation.evaluation import Sightings
-from tests.benchmarks.places.aliased import strangers
 
 POINT_G = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [9.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
 

@@ -1,6 +1,6 @@
 """Ctrl-C at several moments of commands of every kind: the prompt is back, nothing has changed.
 
-All commands: `python -m tests.benchmarks.interruptions`.
+All commands: `python -m benchmarks.interruptions`.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.server.kills import measure_kills
+from benchmarks.server.kills import measure_kills
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.server.euroc import measure_euroc
+from benchmarks.server.euroc import measure_euroc
 
 pytestmark = pytest.mark.slow
 

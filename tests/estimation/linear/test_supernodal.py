@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.solution import effort
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.supernodal import SCRATCH_SIZE
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.linear.symbolic import analyse
-from tests.benchmarks.solution import effort
 from tests.estimation.linear.systems import STRUCTURES, system
 
 D = 3

@@ -2,7 +2,7 @@
 
 Ceres (through pycolmap) has the visual problem, GTSAM the visual-inertial one; both are run until
 no step lowers the cost noticeably. GTSAM preintegrates by slightly other rules (see
-`tests.benchmarks.gtsam_solver`), so its costs are compared both ways: each solver's optimum must be
+`benchmarks.gtsam_solver`), so its costs are compared both ways: each solver's optimum must be
 as good in the other's eyes as its own.
 """
 
@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks import maplab_solver
+from benchmarks.problems import make_inertial, make_visual
+from benchmarks.solution import Solution, StoppingRule
 from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.geometry import se3
-from tests.benchmarks import maplab_solver
-from tests.benchmarks.problems import make_inertial, make_visual
-from tests.benchmarks.solution import Solution, StoppingRule
 
 TIGHT = StoppingRule(function_tolerance=1e-12)
 NO_PEER = "the extra [bench] is not installed"
@@ -33,7 +33,7 @@ def pose_errors(one: Solution, two: Solution) -> tuple[float, float]:
 
 def test_visual_optimum_is_that_of_ceres() -> None:
     pytest.importorskip("pycolmap", "4.2", reason=NO_PEER)
-    from tests.benchmarks import ceres_solver
+    from benchmarks import ceres_solver
 
     problem = make_visual("tiny")
     ours, _ = maplab_solver.solve_visual(problem, TIGHT)
@@ -48,7 +48,7 @@ def test_visual_optimum_is_that_of_ceres() -> None:
 
 def test_inertial_optimum_is_that_of_gtsam() -> None:
     pytest.importorskip("gtsam", reason=NO_PEER)
-    from tests.benchmarks import gtsam_solver
+    from benchmarks import gtsam_solver
 
     problem = make_inertial("tiny")
     ours, _ = maplab_solver.solve_inertial(problem, TIGHT)
@@ -67,7 +67,7 @@ def test_inertial_optimum_is_that_of_gtsam() -> None:
 @pytest.mark.slow
 def test_costs_agree_on_a_larger_problem_too() -> None:
     pytest.importorskip("pycolmap", "4.2", reason=NO_PEER)
-    from tests.benchmarks import ceres_solver
+    from benchmarks import ceres_solver
 
     problem, rule = make_visual("small"), StoppingRule(function_tolerance=1e-9)
     ours, _ = maplab_solver.solve_visual(problem, rule)
@@ -81,7 +81,7 @@ def test_ceres_schedule_goes_the_way_of_ceres() -> None:
     Not to the last digit: Ceres scales by other tangents (camera from world), which damps otherwise.
     """
     pytest.importorskip("pycolmap", "4.2", reason=NO_PEER)
-    from tests.benchmarks import ceres_solver
+    from benchmarks import ceres_solver
 
     problem = make_visual("tiny")
     for iterations in (1, 2, 3):

@@ -1,1 +1,0 @@
-"""Missions of a city from raw maps to their joint optimum: `python -m tests.benchmarks.city`."""
