@@ -42,6 +42,33 @@ def test_command_pages_are_those_of_the_registry() -> None:
     assert stale == [], "run docs/scripts/generate_command_pages.py"
 
 
+def test_every_flag_of_a_command_has_an_entry_that_can_be_linked() -> None:
+    entry = re.compile(r"^\[`--(\w+)`\]\(#([\w-]+)\)\{#\2\}.*\n: ", re.MULTILINE)
+    headings = re.compile(r"^##+ (.*)$", re.MULTILINE)
+    sections: dict[str, set[str]] = {}  # flags by page and anchor of the heading
+    for path in (DOCS / "commands").glob("*.md"):
+        text = path.read_text()
+        anchors = [anchor for _, anchor in entry.findall(text)]
+        assert len(anchors) == len(set(anchors)), path.name
+        sections |= {f"{path.name}#{anchor}": {name} for name, anchor in entry.findall(text)}
+        for title, body in zip(headings.findall(text), headings.split(text)[2::2], strict=True):
+            slug = re.sub(r"[^\w\s-]", "", title).strip().lower().replace(" ", "-")
+            sections[f"{path.name}#{slug}"] = {name for name, _ in entry.findall(body)}
+            links = re.findall(r"\]\(([\w.]*#[\w-]+)\)(?!\{)", body)
+            sections[f"{path.name}#{slug}>"] = {
+                link if link[0] != "#" else path.name + link for link in links
+            }
+    registry = load_registry()
+    for command in registry.commands:
+        start = f"{registry.owner(command)}.md#{command.name}"
+        told, pending = set(sections[start]), list(sections[start + ">"])
+        while pending:
+            link = pending.pop()
+            told |= sections[link]
+            pending += sections.get(link + ">", ())
+        assert set(command.flags) <= told, command.name
+
+
 def test_generated_pages_are_up_to_date() -> None:
     migration = script_module("generate_migration_page")
     for path, text in (
