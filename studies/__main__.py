@@ -4,12 +4,13 @@ python -m studies measure --scenario=ar_room --sets=15 --out=ar_room.jsonl
 python -m studies odometry --results=ar_room.jsonl --out=ar_room_vio.jsonl
 python -m studies predict --scenario=ar_room --sets=3 --out=ar_room_predicted.jsonl
 python -m studies consistency --sets=50 --swaps=0.03 --out=swaps.jsonl
-python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=docs
+python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=results
 python -m studies picture --out=docs/images/segment_information.svg
 
 The first four studies append one line per data set and method to a file; a study that was interrupted
 continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
-differ. `page` writes self_calibration_results.md. `picture` draws a session, coloured by information.
+differ. `page` writes self_calibration_results.md and images/ into a folder; `picture` draws a session,
+coloured by information.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     page.add_argument("--results", default="", help="files, separated by commas")
     page.add_argument("--consistency", default="", help="files, separated by commas")
     page.add_argument("--notes", type=Path, help="text for the end of the page")
-    page.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the documentation")
+    page.add_argument("--docs", type=Path, default=Path("results"), help="folder of the page")
     return parser
 
 

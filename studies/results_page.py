@@ -1,4 +1,4 @@
-"""The page docs/self_calibration_results.md and its pictures, from measured results."""
+"""A page of results, self_calibration_results.md, and its pictures, from measured results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_page(
         consistency: Files of `accuracy.consistency`; the label is the part of the name after the
             first _.
         notes: Text for the end of the page.
-        docs: Folder of the documentation.
+        docs: Folder of the page; the pictures lie in its folder images.
     """
     lines = [_INTRODUCTION, *(_consistency(consistency) if consistency else [])]
     for path in results:
