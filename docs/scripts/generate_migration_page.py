@@ -21,7 +21,6 @@ COMMANDS = Path(__file__).with_name("maplab_commands.tsv")
 FLAG_NAMES = Path(__file__).with_name("maplab_flag_names.tsv")
 _HEAD = Path(__file__).with_name("migration_head.txt")
 _FLAGS_HEAD = Path(__file__).with_name("migration_flags_head.txt")
-_SHOWN_COMMANDS = 3
 
 
 def page(registry: Registry) -> str:
@@ -30,11 +29,18 @@ def page(registry: Registry) -> str:
     Raises:
         ValueError: A command of maplab is neither in the registry nor explained.
     """
-    rows = []
+    same, others = [], []
     for names, note in command_table():
-        shown = ", ".join(f"`{each}`" for each in names)
-        rows.append(f"| {shown} | {_here(names, note, registry)} | {note} |")
-    return _HEAD.read_text(encoding="utf-8") + "\n".join(rows) + "\n"
+        here = _here(names, note, registry)
+        if here.startswith(f"[`{names[0]}`]") and here.endswith(")") and not note:
+            same.append(here)
+            continue
+        aliases = "".join(f", `{alias}`" for alias in names[1:])
+        is_same = here.startswith(f"[`{names[0]}`]")
+        entry = here.replace(")", f"){aliases}", 1) if is_same else f"`{names[0]}`{aliases}: {here}"
+        others.append(f"- {entry}: {note}".rstrip(": "))
+    head = _HEAD.read_text(encoding="utf-8")
+    return f"{head}{', '.join(same)}.\n\nOthers differ:\n\n" + "\n".join(others) + "\n"
 
 
 def command_table() -> list[tuple[list[str], str]]:
@@ -59,7 +65,7 @@ def _here(names: list[str], note: str, registry: Registry) -> str:
 
 
 def flags_page(registry: Registry) -> str:
-    """Return the text of the page of flags: one table per module, flags of one fate in one row.
+    """Return the text of the page of flags: one list per module, flags of one fate in one entry.
 
     Raises:
         ValueError: A flag of maplab is neither in the registry nor explained, or is both, or a new
@@ -72,9 +78,10 @@ def flags_page(registry: Registry) -> str:
         fates.setdefault(_fate(name, elsewhere, registry), []).append(name)
     parts = [_FLAGS_HEAD.read_text(encoding="utf-8")]
     for module, fates in modules.items():
-        parts.append(f"\n## {module}\n\n| maplab | here | |\n|---|---|---|\n")
+        parts.append(f"\n## {module}\n\n")
         for (fate, text), names in fates.items():
-            parts.append(f"| {', '.join(f'`{name}`' for name in names)} | {fate} | {text} |\n")
+            note = f"{fate}; {text}" if text else fate
+            parts.append(f"- {', '.join(f'`{name}`' for name in names)}: {note}\n")
     return "".join(parts)
 
 
@@ -105,15 +112,7 @@ def _fate(name: str, elsewhere: dict[str, tuple[str, str]], registry: Registry) 
         raise ValueError(f"{TABLE}: flag '{name}' {reason}")
     if name in elsewhere:
         return elsewhere[name]
-    if name in COMMON_FLAGS:
-        return "same name", "every command"
-    commands.sort(key=lambda command: command.name)
-    links = [
-        f"[`{command.name}`](commands/{registry.owner(command)}.md#{command.name})"
-        for command in commands[:_SHOWN_COMMANDS]
-    ]
-    more = len(commands) - len(links)
-    return "same name", ", ".join(links) + (f" and {more} more" if more else "")
+    return "same name", ""
 
 
 def main() -> None:

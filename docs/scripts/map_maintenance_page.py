@@ -146,13 +146,6 @@ def findings(points: list[Point]) -> list[str]:
             f"{_points(whole, thin)} points of recall."
         )
         lines += _at_90_percent(points, whole) + _smallest(points, whole)
-    for keyframed, name in ((False, "the map with all keyframes"), (True, "the keyframed map")):
-        before, after = (_find(points, keyframed, share, METHODS[0]) for share in (0.0, 0.9))
-        if before and after:
-            lines.append(
-                f"- Pruning 90 % of {name} costs {_points(before, after)} points of recall."
-            )
-        lines += _against(points, keyframed, name)
     queries = max(point.queries for point in points)
     wrong = sum(point.wrong for point in points)
     answers = sum(point.queries for point in points)
@@ -189,28 +182,6 @@ def _smallest(points: list[Point], whole: Point) -> list[str]:
         f"smaller, ours {_ratio(whole, best):.0f} times, and it keeps "
         f"{100 * best.recall / whole.recall:.0f} % of the recall (Schneider 2019: 13 times, 85 %)."
     ]
-
-
-def _against(points: list[Point], keyframed: bool, name: str) -> list[str]:
-    """Compare the programme with the simple choices."""
-    lines = []
-    for method in METHODS[1:]:
-        pairs = [
-            (_find(points, keyframed, share, METHODS[0]), _find(points, keyframed, share, method))
-            for share in FRACTIONS[1:]
-        ]
-        ahead = [
-            f"{100 * (ours.recall - theirs.recall):+.1f} at {100 * ours.pruned:.0f} %"
-            for ours, theirs in pairs
-            if ours and theirs
-        ]
-        if ahead:
-            lines.append(
-                f"- In {name} the programme's choice against {NAMES[method]}, in points: "
-                + ", ".join(ahead)
-                + "."
-            )
-    return lines
 
 
 def _ratio(whole: Point, small: Point, *, maplab: bool = False) -> float:

@@ -60,9 +60,7 @@ def test_every_flag_has_one_place_on_the_page(migration: ModuleType, registry: R
     listed = []
     for section in sections:
         module = section.partition("\n")[0]
-        cells = re.findall(
-            r"^\| (`[^|]*) \| (?:same name|renamed|dropped) \| .+ \|$", section, re.M
-        )
+        cells = re.findall(r"^- (`[^:]*): (?:same name|renamed; .+|dropped; .+)$", section, re.M)
         listed += [(module, name) for cell in cells for name in re.findall(r"`(\w+)`", cell)]
     assert sorted(listed) == sorted(migration.flag_names())
 
