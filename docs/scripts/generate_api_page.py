@@ -44,13 +44,13 @@ def page() -> str:
     """Return the text of the page."""
     parts = [
         _HEAD,
-        "## maplab_py\n\n" + _table([("`open_map(folder, **flags)`", open_map)]),
-        "## Session\n\n" + _table(_members(Session)),
-        "## VIMap\n\n" + _table(_members(VIMap)),
+        "## maplab_py\n\n" + _list([("`open_map(folder, **flags)`", open_map)]),
+        "## Session\n\n" + _list(_members(Session)),
+        "## VIMap\n\n" + _list(_members(VIMap)),
         "## Tables of a map\n\nEach is an attribute of `VIMap`; a column has one row per entity.\n\n"
         + _tables_of_a_map(),
         "## maplab_py.plugin\n\n"
-        + _table([(f"`{name}`", getattr(maplab_py.plugin, name)) for name in _exported()]),
+        + _list([(f"`{name}`", getattr(maplab_py.plugin, name)) for name in _exported()]),
     ]
     return "\n".join(parts)
 
@@ -92,10 +92,8 @@ def _tables_of_a_map() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _table(rows: list[tuple[str, Any]]) -> str:
-    lines = ["| name | |", "|---|---|"]
-    lines += [f"| {name} | {_summary(value)} |" for name, value in rows]
-    return "\n".join(lines) + "\n"
+def _list(rows: list[tuple[str, Any]]) -> str:
+    return "".join(f"- {name}: {_summary(value)}\n" for name, value in rows)
 
 
 def _summary(value: Any) -> str:

@@ -186,8 +186,9 @@ class SharedFlags:
             if self._pages[flag] == page
         ]
         groups = [group for group in self._groups if self._pages[group] == page]
-        for group in sorted(groups, key=_title):
-            lines.append(f"### {_title(group)}\n")
+        for group in sorted(groups, key=self._title):
+            lines.append(f"### {self._title(group)}\n")
+            lines.append(_purpose(group) + ".\n")
             inner: list[type] = []
             for flag, nested in self._flags_of(group):
                 if nested is None:
@@ -222,8 +223,16 @@ class SharedFlags:
         return "" if self._pages[each] == page else self._pages[each]
 
     def _link(self, group: type, page: str) -> str:
-        slug = re.sub(r"[^\w\s-]", "", _title(group)).strip().lower().replace(" ", "-")
-        return f"[{_title(group)}]({self._target(group, page)}#{slug})"
+        title = self._title(group)
+        slug = re.sub(r"[^\w\s-]", "", title).strip().lower().replace(" ", "-")
+        return f"[{title.removesuffix(' flags')}]({self._target(group, page)}#{slug})"
+
+    def _title(self, group: type) -> str:
+        """Return a title from the group's name, or its purpose where two groups have one name."""
+        if sum(other.__name__ == group.__name__ for other in self._groups) > 1:
+            return _purpose(group)
+        words = re.findall(r"[A-Z]+(?![a-z])|[A-Z][a-z]+", group.__name__.removesuffix("Options"))
+        return " ".join([words[0], *(w if w.isupper() else w.lower() for w in words[1:]), "flags"])
 
 
 def flag_entry(flag: Flag, anchor: str) -> str:
@@ -264,7 +273,7 @@ def _alike(flag: Flag) -> Flag:
     return replace(flag, documentation=flag.help, path=())
 
 
-def _title(group: type) -> str:
+def _purpose(group: type) -> str:
     return re.split(r"[.;]\s|\.$", (inspect.getdoc(group) or "").split("\n\n")[0])[0]
 
 

@@ -168,7 +168,7 @@ def test_dense_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_scenario_of_the_simulation_page_is_one() -> None:
-    ((_, text),) = blocks(DOCS / "simulation.md", "yaml")
+    (_, text), *_ = blocks(DOCS / "simulation.md", "yaml")
     scenario = parse_scenario(text, "simulation.md")
     assert len(scenario.cameras) == 2
     assert len(scenario.sessions) == 2
