@@ -9,7 +9,7 @@ import time
 
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from tests.algorithms.keyframing.test_merged_edges import largest_difference, ten_minutes
+from tests.algorithms.keyframing.test_keyframing import largest_difference, ten_minutes
 from tests.support.machine import slowness
 
 REPEATS = 5

@@ -1,10 +1,11 @@
-"""EuRoC's eight submaps through the server's merging, held to the accuracy that the project promises."""
+"""The server with real processes and maps: killed again and again, and as accurate as promised."""
 
 from __future__ import annotations
 
 import pytest
 
 from benchmarks.server.euroc import measure_euroc
+from benchmarks.server.kills import measure_kills
 
 pytestmark = pytest.mark.slow
 
@@ -17,3 +18,10 @@ def test_euroc_submaps_of_one_robot_and_of_two(robots: int) -> None:
     assert figures.incremental_C_m <= 0.026
     assert figures.final_O_m <= 0.042
     assert figures.final_C_m <= 0.026
+
+
+def test_every_submap_is_in_the_map_once_after_kills() -> None:
+    figures = measure_kills(kills=5)
+    assert figures.submaps == 40
+    assert figures.missing_vertices == figures.repeated_vertices == figures.rejected == 0
+    assert figures.ratio <= 1.1

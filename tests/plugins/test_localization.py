@@ -1,4 +1,4 @@
-"""From simulated sessions to a summary map and back to poses, through the session."""
+"""Localisation in summary maps, of sessions and of rovioli, through the console."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
-from maplab_py.errors import UserError
+from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.frontend.reports import MappingReport
+from maplab_py.interop.trajectories import Trajectory, write_euroc
+from maplab_py.simulation.scenario import SessionOptions
+from maplab_py.storage.native import save_map
+from maplab_py.storage.summary_map import SummaryMap, write_summary_map
+from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.viewer import Viewer
+from tests.frontend.localization.places import Place, place_of
 from tests.simulation.small import simulated
 
 LENIENT = {"elq_min_observers": 3, "elq_min_observation_angle_deg": 1.0}
@@ -99,3 +109,176 @@ def test_the_workflow_makes_one_localisation_map_of_two_raw_sessions(tmp_path: P
     assert answer.success_share > 0.5
     assert answer.wrong <= 0.02 * answer.queries
     assert np.isfinite(answer.position_error_m.median)
+
+
+def walk() -> Place:
+    """A map and a session of 12 s in it; a single camera may take 4 s to start."""
+    return place_of(SessionOptions(duration_s=12.0, turns=0.7, start_turn=0.2, height_m=1.7))
+
+
+def walk_summary() -> SummaryMap:
+    return make_summary_map(walk().vi_map, SummaryMapOptions())
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the map, its summary map, the recording, and the truth of both in G."""
+    folder, where = tmp_path_factory.mktemp("localisation"), walk()
+    save_map(where.vi_map, folder / "map")
+    save_map(where.query, folder / "query")
+    write_summary_map(walk_summary(), folder / "summary")
+    write_euroc(Trajectory(where.times_ns, where.T_G_I), folder / "truth.csv")
+    write_euroc(
+        Trajectory(where.vi_map.vertices.timestamp_ns, where.vi_map.T_G_I), folder / "map_truth.csv"
+    )
+    return folder
+
+
+def localized(session: Session, folders: Path, **flags: object) -> MappingReport:
+    report = session.run(
+        "rovioli", datasource_folder=folders / "query", rovioli_run_map_builder=False, **flags
+    )
+    assert isinstance(report, MappingReport)
+    return report
+
+
+def test_poses_in_the_map_are_written_and_evaluated(folders: Path, tmp_path: Path) -> None:
+    file = tmp_path / "vil.csv"
+    with Session() as session:
+        report = localized(
+            session, folders, vio_localization_map_folder=folders / "summary",
+            export_localized_poses_to_csv=file,
+        )  # fmt: skip
+        said = report.localization
+        assert said is not None
+        assert said.mode == "vil"
+        assert said.starts == 1
+        assert said.csv_file == file
+        assert 0.5 < said.localized_share <= 1.0
+        assert any(stage.stage == "localise" for stage in report.frame_times)
+        assert len(file.read_text().splitlines()) == 1 + report.estimated_frames
+        evaluation = session.run(
+            "evaluate_localization", localization_csv=str(file), ground_truth=folders / "truth.csv"
+        )
+        errors = evaluation.files[0]
+        assert evaluation.failure == ""
+        assert errors.median_m < 0.05
+        assert errors.localized_share > 0.8
+        assert 0.0 < errors.first_localized_s < 5.0
+        aligned = session.run(
+            "evaluate_localization", localization_csv=f"{file}, {file}",
+            ground_truth=folders / "truth.csv", map_folder=folders / "map",
+            map_ground_truth=folders / "map_truth.csv",
+        )  # fmt: skip
+        assert len(aligned.files) == 2
+        assert aligned.files[0].median_m == pytest.approx(errors.median_m, abs=1e-3)
+        with pytest.raises(UserError, match=r"vil.csv exists already"):
+            localized(
+                session, folders, vio_localization_map_folder=folders / "summary",
+                export_localized_poses_to_csv=file,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["swl", "pose", "odo"])
+def test_baselines_run_from_the_console(folders: Path, mode: str) -> None:
+    with Session() as session:
+        report = localized(
+            session, folders, vio_localization_map_folder=folders / "map", localization_mode=mode
+        )
+    assert report.localization is not None
+    assert report.localization.mode == mode
+    assert report.localization.localized_share > 0.5
+
+
+def test_without_a_map_nothing_is_said_of_localisation(folders: Path) -> None:
+    with Session() as session:
+        assert localized(session, folders).localization is None
+
+
+def test_wrong_input_is_told_in_one_line(folders: Path, tmp_path: Path) -> None:
+    with Session() as session:
+        for flags, error, message in (
+            ({"vio_localization_map_folder": tmp_path}, UserError, "neither a map folder nor"),
+            ({"export_localized_poses_to_csv": tmp_path / "x.csv"}, FlagError, "needs --vio_loc"),
+            (
+                {
+                    "vio_localization_map_folder": folders / "summary",
+                    "vil_map_tilt_sigma_deg": 0.0,
+                },
+                FlagError,
+                "vil_map_tilt_sigma_deg=0: must be above 0",
+            ),
+        ):
+            with pytest.raises(error, match=message) as told:
+                localized(session, folders, **flags)
+            assert "\n" not in str(told.value)
+        damaged = tmp_path / "damaged" / "localization_summary_map"
+        damaged.parent.mkdir()
+        content = (folders / "summary" / "localization_summary_map").read_bytes()
+        damaged.write_bytes(content[: len(content) // 2])
+        with pytest.raises(MapError, match="localization_summary_map"):
+            localized(session, folders, vio_localization_map_folder=damaged.parent)
+
+
+def test_evaluation_tells_what_is_missing(folders: Path, tmp_path: Path) -> None:
+    late = Trajectory(walk().times_ns + 10**12, walk().T_G_I)
+    write_euroc(late, tmp_path / "late.csv")
+    with Session() as session:
+        with pytest.raises(UserError, match="--localization_csv=FILE"):
+            session.run("evaluate_localization", ground_truth=folders / "truth.csv")
+        with pytest.raises(Exception, match="no frame lies in the time span"):
+            session.run(
+                "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+                ground_truth=tmp_path / "late.csv",
+            )  # fmt: skip
+        with pytest.raises(Exception, match="fewer than 3 vertices"):
+            session.run(
+                "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+                ground_truth=folders / "truth.csv", map_folder=folders / "map",
+            )  # fmt: skip
+
+
+def test_a_perfect_trajectory_has_no_errors(folders: Path) -> None:
+    with Session() as session:
+        report = session.run(
+            "evaluate_localization", localization_csv=str(folders / "truth.csv"),
+            ground_truth=folders / "truth.csv",
+        )  # fmt: skip
+    errors = report.files[0]
+    assert errors.localized_share == 1.0
+    assert errors.largest_m == pytest.approx(0.0, abs=1e-12)
+    assert np.isclose(errors.first_localized_s, 0.0)
+
+
+def test_the_viewer_shows_the_map_both_paths_and_the_matches(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Subject] = []
+    monkeypatch.setattr(Viewer, "pages", property(lambda _: 1))
+    monkeypatch.setattr(Viewer, "follow", lambda _, subject: shown.append(subject))
+    with Session() as session:
+        session.run("set", "--viewer_port=0")
+        session.run(
+            "rovioli", datasource_folder=folders / "query", map_publish_interval_s=0.0,
+            vio_localization_map_folder=folders / "summary", rovioli_visualize_map=True,
+        )  # fmt: skip
+    assert shown[0].localized is None  # not localised yet
+    subject = shown[-1]
+    run = subject.localized
+    assert run is not None
+    where = walk()
+    np.testing.assert_array_equal(run.p_G, walk_summary().p_G)
+    rows = np.searchsorted(where.times_ns, subject.vi_map.vertices.timestamp_ns)
+    error_m = np.linalg.norm(subject.vi_map.T_G_I[:, 4:] - where.T_G_I[rows, 4:], axis=1)
+    assert np.median(error_m) < 0.1  # the map of the run is drawn in G
+    nearest = np.linalg.norm(run.p_G_I[:, None] - where.T_G_I[:, 4:], axis=2).min(axis=1)
+    assert np.nanmax(nearest) < 0.3
+    assert len(run.rays_G) >= 5
+    scene = build_scene(subject)
+    drawn = {layer.name: layer.drawn for layer in scene.layers}
+    assert drawn["map_landmarks"] == len(run.p_G)
+    assert drawn["localized_path"] == len(run.p_G_I) - 1
+    assert drawn["map_matches"] == len(run.rays_G)
+    assert drawn["trajectories"] > 0
+    outline = scene.extent.outline
+    assert np.all(outline.max(axis=0) >= np.percentile(run.p_G, 90.0, axis=0))

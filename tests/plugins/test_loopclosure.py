@@ -1,16 +1,30 @@
-"""The loop closure and relaxation commands, through the session."""
+"""The loop closure and relaxation commands through the session, of images and of clouds."""
 
 from __future__ import annotations
 
 import io
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.cloud_registration import registration
+from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
+from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure.explanation import (
+    ClosureExplanation,
+    MissionExplanation,
+    PairExplanation,
+)
 from maplab_py.console.commands.registry import load_registry
+from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
+from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.vimap.ids import to_hex
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 DRIFT = (0.2, -0.1, 0.05, 0.01)
@@ -119,3 +133,128 @@ def test_a_projection_for_other_descriptors_is_told(tmp_path: Path) -> None:
     report = session.run("lc", lc_projection_matrix_filename=str(tmp_path / "short.npz"))
     assert report.accepted > 0
     assert "learned a projection from the map" in report.notes[0]
+
+
+SCENARIO = """
+name: lidar
+world: {landmarks_per_room: 800}
+measurement: {max_keypoints: 60}
+drift: {yaw_walk_deg: 0.5, position_walk: 0.03}
+lidar: {rate_hz: 0.5, columns: 600}
+sessions: [{duration_s: 22.0, turns: 1.7}]
+"""
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lidar")
+    (folder / "lidar.yaml").write_text(SCENARIO)
+    with Session(load_registry()) as session:
+        session.run("simulate", scenario=str(folder / "lidar.yaml"), map_folder=folder / "maps")
+    return folder / "maps"
+
+
+@pytest.fixture
+def session(simulated: Path) -> Iterator[Session]:
+    with Session(load_registry()) as session:
+        session.run("load", map_folder=simulated / "session_1")
+        yield session
+
+
+def test_clouds_straighten_a_map(session: Session, simulated: Path, tmp_path: Path) -> None:
+    before: Any = session.run("evaluate_map", truth=simulated / "truth.npz")
+    assert session.run("check_map_consistency").failure == ""
+    report: Any = session.run("lc_lidar")
+    assert report.clouds == 11
+    assert report.edges_added == report.accepted > 3
+    listed: Any = session.run("lc_report")
+    assert listed.accepted == report.accepted
+    closure = listed.closures[0].id
+    assert session.run("why", subject=closure).failure == ""
+    session.run("optvi", ba_include_loop_closure_edges=True, ba_num_iterations=2)
+    session.run("undo")
+    session.run("relax")
+    after: Any = session.run("evaluate_map", truth=simulated / "truth.npz")
+    assert after.ate_m < 0.8 * before.ate_m
+    assert after.false_loop_edges == 0
+    session.run("save", map_folder=tmp_path / "map")
+    session.run("load", map_folder=tmp_path / "map")
+    assert session.run("lc_report").as_dict()["accepted"] >= 1
+    removed: Any = session.run("remove_loopclosure", closures=closure)
+    assert removed.edges_removed == 1
+
+
+def test_undo_takes_the_edges_away(session: Session) -> None:
+    before = session.vi_map
+    session.run("register_point_clouds", lidar_lc_every_nth=2)
+    session.run("undo")
+    assert session.vi_map is before
+
+
+def test_wrong_values_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FlagError, match="lidar_lc_voxel_size_m"):
+        session.run("lc_lidar", lidar_lc_voxel_size_m=0.0)
+    with pytest.raises(FlagError, match="exclude each other"):
+        session.run("lc_lidar", lidar_lc_global=True, lidar_lc_from_closures=True)
+    with pytest.raises(MapError, match="--lidar_lc_voxel_size_m"):
+        session.run("lc_lidar", lidar_lc_voxel_size_m=5.0)
+    registration.small_gicp.cache_clear()
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    with pytest.raises(UserError, match=r"maplab-py\[lidar\]"):
+        session.run("lc_lidar")
+    registration.small_gicp.cache_clear()
+    session.run("remove_resources", resource_type="21")
+    with pytest.raises(UserError, match="import_point_clouds"):
+        session.run("lc_lidar")
+
+
+WALKS = [Walk(room=1), Walk(room=1, mission=1, start_s=60.0, drift=(0.2, -0.1, 0.05, 0.01))]
+
+
+@pytest.fixture(scope="module")
+def closed_rooms() -> Session:
+    closed_rooms = Session(load_registry())
+    closed_rooms.maps.add("rooms", make_map(WALKS)[0])
+    first, second = (to_hex(words) for words in closed_rooms.vi_map.missions.id)
+    closed_rooms.run("rename_mission", "monday", map_mission=first)
+    closed_rooms.run("rename_mission", "tuesday", map_mission=second)
+    closed_rooms.run("lc", lc_min_inlier_count=1000)
+    return closed_rooms
+
+
+def test_the_argument_is_resolved(closed_rooms: Session) -> None:
+    closure = to_hex(read_record(closed_rooms.vi_map).closures.id[0])[:8]
+    landmark = to_hex(closed_rooms.vi_map.landmarks.id[3])
+    assert isinstance(closed_rooms.run("why", closure), ClosureExplanation)
+    assert isinstance(closed_rooms.run("why", "monday"), MissionExplanation)
+    assert isinstance(closed_rooms.run("why", "tue"), MissionExplanation)
+    assert isinstance(closed_rooms.run("why", "monday", "tuesday"), PairExplanation)
+    assert isinstance(closed_rooms.run("why", landmark), LandmarkExplanation)
+
+
+def test_flags_show_what_they_would_decide(closed_rooms: Session) -> None:
+    closure = to_hex(read_record(closed_rooms.vi_map).closures.id[0])[:8]
+    strict = closed_rooms.run("why", closure, lc_min_inlier_count=1000)
+    assert [line["flag"] for line in strict.as_dict()["gates"] if line["result"] == "failed"] == [
+        "--lc_min_inlier_count"
+    ]
+    usual = closed_rooms.run("why", closure)
+    assert "would pass" in usual.as_dict()["summary"]
+
+
+def test_wrong_arguments(closed_rooms: Session) -> None:
+    with pytest.raises(UserError, match="no closure, mission or landmark begins with 'xyz'"):
+        closed_rooms.run("why", "xyz")
+    with pytest.raises(UserError, match="two different missions"):
+        closed_rooms.run("why", "monday", "monday")
+    with pytest.raises(UserError, match="no mission begins with 'sunday'"):
+        closed_rooms.run("why", "monday", "sunday")
+    with pytest.raises(UserError, match="no closure, mission or landmark"):
+        closed_rooms.run("why", "")
+
+
+def test_missions_and_closures_are_completed(closed_rooms: Session) -> None:
+    candidates = complete("why ", closed_rooms)
+    assert {"monday", "tuesday"} <= {candidate.text for candidate in candidates}
+    assert any("too few inliers" in candidate.help for candidate in candidates)
+    assert [c.text for c in complete("why monday tu", closed_rooms)] == ["tuesday"]

@@ -1,12 +1,21 @@
-"""The grid, its coordinates and the scale bar."""
+"""Grid, scale bar, labels of ends, colours of missions."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
 
+from maplab_py.storage.mission_names import named
+from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.drawing import PATH_ENDS, make_drawing, with_end_labels
 from maplab_py.viewer.ground import cell_size_m, make_ground
-from maplab_py.viewer.scene import Extent
+from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.scene import Extent, Points, Scene
+from maplab_py.vimap.merge import merge_maps
+from tests.simulation.small import simulated
+from tests.vimap.builders import walk_map
 
 
 def _extent(low: np.ndarray, high: np.ndarray) -> Extent:
@@ -55,3 +64,68 @@ def test_coordinates_at_a_corner_share_a_label() -> None:
 def test_a_map_without_height_has_no_upright_label() -> None:
     ground = make_ground(_extent(np.zeros(3), np.array([1.0, 0.0, 0.0])), np.zeros(3))
     assert not any(label.startswith("z") for label in ground.labels)
+
+
+def _scene(ends: dict[str, list[list[float]]]) -> Scene:
+    """Return a scene of 10 m radius with paths that start and end at given places."""
+    scene = build_scene(Subject(walk_map()))
+    layer = scene.layer(PATH_ENDS)
+    (dots,) = layer.parts.values()
+    assert isinstance(dots, Points)
+    parts = {
+        name: dataclasses.replace(
+            dots, p=np.array(p, dtype=np.float32), labels=(f"start {name}", f"end {name}")
+        )
+        for name, p in ends.items()
+    }
+    layers = (dataclasses.replace(layer, parts=parts),)
+    extent = dataclasses.replace(scene.extent, radius_m=10.0)
+    return dataclasses.replace(scene, layers=layers, extent=extent)
+
+
+def _labels(scene: Scene) -> dict[str, tuple[str, ...]]:
+    parts = scene.layer(PATH_ENDS).parts
+    return {name: part.labels for name, part in parts.items() if isinstance(part, Points)}
+
+
+SCENE = _scene(
+    {"a": [[0, 0, 0], [9, 0, 0]], "b": [[0.5, 0, 0], [0, 9, 0]], "c": [[9, 1, 0], [0, 0, 1]]}
+)
+
+
+def test_ends_close_together_are_lines_of_one_label() -> None:
+    assert _labels(with_end_labels(SCENE, {"a", "b", "c"})) == {
+        "a": ("start a\nstart b\nend c", "end a\nstart c"),
+        "b": ("", "end b"),
+        "c": (),
+    }
+
+
+def test_hidden_missions_have_no_label() -> None:
+    labels = _labels(with_end_labels(SCENE, {"b", "c"}))
+    assert labels["b"] == ("start b\nend c", "end b")
+    assert labels["c"] == ("start c", "")
+
+
+def test_ends_without_labels_stay_without() -> None:
+    many = build_scene(Subject(walk_map()))
+    dots = {
+        key: dataclasses.replace(part, labels=())
+        for key, part in many.layer(PATH_ENDS).parts.items()
+    }  # type: ignore[call-arg]
+    bare = dataclasses.replace(
+        many, layers=(dataclasses.replace(many.layer(PATH_ENDS), parts=dots),)
+    )
+    assert set(_labels(with_end_labels(bare, set(dots))).values()) == {()}
+
+
+def test_missions_of_one_robot_have_one_colour_if_that_is_wanted() -> None:
+    first, second = simulated().maps
+    three, _ = merge_maps(merge_maps(first, second)[0], first, assign_new_ids=True)
+    three = named(three, ["ant", "bee", "ant"])
+    colours = make_drawing(three, VisualizationOptions()).mission_colours
+    assert len(np.unique(colours, axis=0)) == 3
+    by_name = make_drawing(three, VisualizationOptions(color_missions_by_name=True))
+    assert np.array_equal(by_name.mission_colours, colours[[0, 1, 0]])
+    unnamed = make_drawing(named(three, ["", "", ""]), by_name.options)
+    assert np.array_equal(unnamed.mission_colours, colours)

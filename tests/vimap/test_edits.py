@@ -1,3 +1,9 @@
+"""Edits of maps, parts of them, and what they hold."""
+
+from __future__ import annotations
+
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,8 +13,17 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap, edits
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.edge_joining import composed_covariance
+from maplab_py.vimap.edits import merge_landmarks, with_p_G
+from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
+from maplab_py.vimap.keypoint_removal import remove_keypoints
+from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.submaps import append_submaps
+from maplab_py.vimap.table import object_column
 from maplab_py.vimap.vertex_removal import remove_vertices_counted
+from tests.algorithms.loop_closure.rooms import Walk, make_map
+from tests.simulation.small import simulated
 from tests.vimap.builders import SAMPLES, walk_map
 
 
@@ -152,3 +167,156 @@ def test_any_sequence_of_edits_stays_consistent(operations):
             m = edits.remove_observations(m, rng.random(len(m.keypoints)) < 0.2)
         rules = [v.rule for v in check_consistency(m).errors if "twice in a frame" not in v.rule]
         assert rules == []
+
+
+@pytest.fixture(scope="module")
+def both() -> VIMap:
+    first, second = simulated().maps
+    return merge_maps(first, second)[0]
+
+
+def test_an_excerpt_is_a_consistent_map_of_its_vertices_and_what_they_observe(both: VIMap) -> None:
+    rows = np.arange(5, 20)
+    part = excerpt(both, rows)
+    assert check_consistency(part.vi_map).errors == ()
+    assert np.array_equal(part.vi_map.vertices.id, both.vertices.id[rows])
+    assert len(part.vi_map.imu_edges) == len(rows) - 1
+    assert np.array_equal(part.vi_map.landmarks.id, both.landmarks.id[part.landmarks])
+    np.testing.assert_allclose(part.vi_map.p_G, both.p_G[part.landmarks], atol=1e-9)
+    assert np.array_equal(part.vi_map.keypoints.uv_px, both.keypoints.uv_px[part.keypoints])
+    keypoints = both.observations[np.isin(both.keypoint_vertex[both.observations], rows)]
+    assert np.array_equal(np.unique(both.keypoints.landmark[keypoints]), part.landmarks)
+
+
+def test_landmarks_can_be_limited_to_those_of_some_vertices(both: VIMap) -> None:
+    part = excerpt(both, np.arange(10), observed_by=np.arange(3))
+    assert np.array_equal(part.landmarks, excerpt(both, np.arange(3)).landmarks)
+    assert len(part.vertices) == 10
+
+
+def test_an_unchanged_excerpt_changes_nothing(both: VIMap) -> None:
+    part = excerpt(both, np.arange(3, len(both.vertices), 2))
+    back = part.written_back(part.vi_map)
+    assert back.keypoints is both.keypoints
+    np.testing.assert_allclose(back.p_G, both.p_G, atol=1e-9)
+    for name in ("T_M_I", "v_M", "gyro_bias"):
+        assert np.array_equal(getattr(back.vertices, name), getattr(both.vertices, name))
+
+
+def test_states_of_the_part_come_back_and_others_stay(both: VIMap) -> None:
+    rows = np.arange(4, 9)
+    part = excerpt(both, rows)
+    v = part.vi_map.vertices
+    T_M_I = v.T_M_I + np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
+    moved = part.vi_map.replace(vertices=v.replace(T_M_I=T_M_I, v_M=v.v_M + 1.0))
+    moved = with_p_G(moved, np.array([0]), np.array([[1.0, 2.0, 3.0]]))
+    back = part.written_back(moved)
+    np.testing.assert_allclose(back.T_G_I[rows], moved.T_G_I, atol=1e-12)
+    np.testing.assert_allclose(back.vertices.v_M[rows], both.vertices.v_M[rows] + 1.0)
+    np.testing.assert_allclose(back.p_G[part.landmarks], moved.p_G, atol=1e-9)
+    others = np.setdiff1d(np.arange(len(both.vertices)), rows)
+    assert np.array_equal(back.vertices.T_M_I[others], both.vertices.T_M_I[others])
+
+
+def test_landmarks_merged_in_the_part_are_merged_everywhere(both: VIMap) -> None:
+    rows = np.arange(10)
+    part = excerpt(both, rows)
+    source, target = 3, 8
+    merged = merge_landmarks(part.vi_map, [source], [target])
+    back = part.written_back(merged)
+    assert check_consistency(back).errors == ()
+    assert len(back.landmarks) == len(both.landmarks) - 1
+    assert (back.landmark_index.rows(both.landmarks.id[part.landmarks[[source]]]) < 0).all()
+    whole = merge_landmarks(both, part.landmarks[[source]], part.landmarks[[target]])
+    assert np.array_equal(back.landmarks.id, whole.landmarks.id)
+    assert np.array_equal(back.keypoints.landmark, whole.keypoints.landmark)
+
+
+def test_base_frames_of_the_part_come_back(both: VIMap) -> None:
+    part = excerpt(both, both.vertices.mission == 1)
+    frames = part.vi_map.baseframes
+    T_G_M = frames.T_G_M + np.array([0.0, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
+    known = np.ones(len(frames), dtype=np.bool_)
+    back = part.written_back(
+        part.vi_map.replace(baseframes=frames.replace(T_G_M=T_G_M, is_known=known))
+    )
+    assert bool(back.baseframes.is_known[back.missions.baseframe[1]])
+    np.testing.assert_allclose(back.T_G_M[1] - both.T_G_M[1], [0, 0, 0, 0, 5, 0, 0])
+    assert np.array_equal(back.T_G_M[0], both.T_G_M[0])
+
+
+def test_an_edit_that_removes_vertices_is_refused(both: VIMap) -> None:
+    part = excerpt(both, np.arange(8))
+    with pytest.raises(ValueError, match="number of vertices"):
+        part.written_back(excerpt(both, np.arange(7)).vi_map)
+
+
+def test_submaps_cut_by_time_join_to_the_map_again() -> None:
+    session = simulated().maps[0]
+    submaps = cut_by_time(session, 2.0)
+    assert len(submaps) == 3
+    for a, b in itertools.pairwise(submaps):
+        assert np.array_equal(a.vertices.id[-1], b.vertices.id[0])
+    joined, report = append_submaps(submaps)
+    assert report.vertices_shared == 2
+    assert np.array_equal(joined.vertices.id, session.vertices.id)
+    np.testing.assert_allclose(joined.vertices.T_M_I, session.vertices.T_M_I, atol=1e-9)
+    assert len(joined.imu_samples) == len(session.imu_samples)
+    observed = np.count_nonzero(np.diff(session.observation_start))
+    assert len(joined.landmarks) == observed
+    assert len(joined.observations) == len(session.observations)
+
+
+def test_a_short_session_is_one_submap() -> None:
+    session = simulated().maps[1]
+    assert len(cut_by_time(session, 100.0)) == 1
+
+
+def test_each_mission_becomes_a_map(both: VIMap) -> None:
+    parts = mission_maps(both)
+    assert [len(part.missions) for part in parts] == [1, 1]
+    assert sum(len(part.vertices) for part in parts) == len(both.vertices)
+
+
+EDGES = "vertex without an edge to the next of its mission"
+
+
+def two_types():  # type: ignore[no-untyped-def]
+    """Return a map whose frames have a Binary and a SIFT block each."""
+    vi_map, _ = make_map([Walk(room=1, vertices=5)])
+    rng = np.random.default_rng(0)
+    descriptor = rng.integers(1, 200, (len(vi_map.keypoints), 128), dtype=np.uint8)
+    blocks = [
+        (DescriptorBlock(count // 3, 48), DescriptorBlock(count - count // 3, 128, 0, 3))
+        for count in vi_map.frames.keypoint_count.tolist()
+    ]
+    return vi_map.replace(
+        frames=vi_map.frames.replace(descriptor_blocks=object_column(blocks)),
+        keypoints=vi_map.keypoints.replace(descriptor=descriptor),
+    )
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
+def test_the_kept_keypoints_keep_what_they_have(seed: int, share: float) -> None:
+    vi_map = two_types()
+    removed = np.random.default_rng(seed).random(len(vi_map.keypoints)) < share
+    result = remove_keypoints(vi_map, removed)
+    errors = check_consistency(result).errors
+    assert {error.rule for error in errors} <= {EDGES}  # which the map of rooms has none of
+    np.testing.assert_array_equal(result.feature_type, vi_map.feature_type[~removed])
+    np.testing.assert_array_equal(result.keypoint_frame, vi_map.keypoint_frame[~removed])
+    np.testing.assert_array_equal(
+        result.keypoints.descriptor, vi_map.keypoints.descriptor[~removed]
+    )
+    left = vi_map.keypoints.landmark[~removed]
+    observed = np.unique(left[left >= 0])
+    np.testing.assert_array_equal(result.landmarks.id, vi_map.landmarks.id[observed])
+
+
+def test_nothing_removed_is_the_same_map() -> None:
+    vi_map = two_types()
+    assert remove_keypoints(vi_map, np.zeros(len(vi_map.keypoints), dtype=np.bool_)) is vi_map
+    none = remove_keypoints(vi_map, np.ones(len(vi_map.keypoints), dtype=np.bool_))
+    assert len(none.keypoints) == len(none.landmarks) == 0
+    assert set(none.frames.descriptor_blocks.tolist()) == {()}

@@ -1,10 +1,16 @@
+"""Queries, rows by id, and maps that are the same."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.vimap import VIMap
+from maplab_py.vimap import ids as ids_module
+from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import IdIndex, random_ids, to_hex
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.queries import coobservation_counts, find_mission, observer_counts
 from maplab_py.vimap.statistics import coobservability, map_statistics
@@ -87,3 +93,49 @@ def test_double_ids_and_gaps_are_found():
     cut = cut.replace(imu_edges=m.imu_edges.take(keep), imu_samples=m.imu_samples.take(samples))
     (violation,) = check_consistency(cut).errors
     assert violation.where == (to_hex(m.vertices.id[6]),)
+
+
+@pytest.mark.parametrize("collide", [False, True])
+def test_rows_of_ids(collide: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if collide:
+        monkeypatch.setattr(ids_module, "_mixed", lambda ids: ids[:, 0] % np.uint64(7))
+    rng = np.random.default_rng(2)
+    column, others = random_ids(200, rng), random_ids(50, rng)
+    wanted = rng.integers(0, 200, 300)
+    index = IdIndex(column)
+    np.testing.assert_array_equal(index.rows(column[wanted]), wanted)
+    assert (index.rows(others) == -1).all()
+    assert index.rows(others[:0]).shape == (0,)
+    assert (IdIndex(column[:0]).rows(others) == -1).all()
+
+
+def test_ids_that_differ_in_one_word_only() -> None:
+    column = np.array([[1, 2], [1, 3], [2, 2], [0, 0], [2, 1]], dtype=np.uint64)
+    np.testing.assert_array_equal(IdIndex(column).rows(column[::-1]), [4, 3, 2, 1, 0])
+
+
+def test_equal_content_is_the_same_whichever_array_holds_it() -> None:
+    a = walk_map(seed=1)
+    assert is_same(a, walk_map(seed=1))
+    v_M = a.vertices.v_M.copy()
+    assert is_same(a, a.replace(vertices=a.vertices.replace(v_M=v_M)))
+    v_M[0, 0] = np.nan
+    odd = a.replace(vertices=a.vertices.replace(v_M=v_M))
+    assert is_same(odd, odd.replace(vertices=odd.vertices.replace(v_M=v_M.copy())))
+
+
+def test_any_change_makes_another_map() -> None:
+    a = walk_map(seed=1)
+    quality = a.landmarks.quality.copy()
+    quality[-1] += 1
+    unknown = a.missions.unknown.copy()
+    unknown[0] = b"x"
+    metadata = type(a.metadata)(description="another")
+    for changed in (
+        a.replace(landmarks=a.landmarks.replace(quality=quality)),
+        a.replace(landmarks=a.landmarks.take(np.arange(3))),
+        a.replace(missions=a.missions.replace(unknown=unknown)),
+        a.replace(metadata=metadata),
+        a.replace(sensors=type(a.sensors)()),
+    ):
+        assert not is_same(a, changed)

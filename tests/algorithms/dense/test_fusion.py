@@ -1,21 +1,34 @@
-"""Fusion of true depth against the true surfaces; updates, several missions, bad input."""
+"""Fusion of true depth against the true surfaces, and grids of planes and spheres against closed form."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
 from maplab_py.algorithms.dense.field import create_fields
-from maplab_py.algorithms.dense.fusion import fuse_depth, load_grids, update_grids
+from maplab_py.algorithms.dense.fusion import (
+    FusedDepth,
+    StoredGrid,
+    decode_grid,
+    encode_grid,
+    fuse_depth,
+    load_grids,
+    update_grids,
+)
+from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid
 from maplab_py.algorithms.dense.meshing import map_mesh
 from maplab_py.algorithms.dense.options import FusionOptions
-from maplab_py.array_types import F64
+from maplab_py.algorithms.dense.pinhole import Pinhole
+from maplab_py.array_types import F32, F64
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.interop.resources.depth_maps import import_depth_maps
+from maplab_py.memory import NotEnoughMemory, memory_limited
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.merge import merge_maps
@@ -187,3 +200,204 @@ def test_depth_maps_of_another_size_are_refused(room: StereoRoom) -> None:
     for function in (fuse_depth, create_fields):
         with pytest.raises(MapError, match="32 x 24 pixels, the images of its camera 376 x 240"):
             function(vi_map, Path())
+
+
+PINHOLE = Pinhole(100.0, (79.5, 59.5), 160, 120)
+SETTINGS = GridSettings(0.05, 0.15, 0.1, 6.0, 2, 1e4)
+RADIUS_M = 0.6
+
+
+def looking_at_origin(direction: F64, distance_m: float) -> F64:
+    """Return the pose (4, 4) of a camera that looks from a direction at the origin."""
+    z = -direction / np.linalg.norm(direction)
+    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    x = np.cross(up, z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T[:3, 3] = -z * distance_m
+    return T
+
+
+def depth_of_sphere(T_G_C: F64) -> F32:
+    """Return the depths (H, W) of a sphere about the origin; 0 beside it."""
+    rays = PINHOLE.rays()
+    centre = -T_G_C[:3, :3].T @ T_G_C[:3, 3]
+    # |t ray - centre| = radius
+    a, b = np.sum(rays**2, axis=-1), rays @ centre
+    under_root = b**2 - a * (centre @ centre - RADIUS_M**2)
+    t = (b - np.sqrt(np.maximum(under_root, 0.0))) / a
+    return np.where(under_root > 0.0, t, 0.0).astype(np.float32)
+
+
+def directions() -> F64:
+    """Return directions (26, 3) all around."""
+    steps = np.array([[a, b, c] for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)])
+    return steps[np.any(steps != 0, axis=1)].astype(np.float64)
+
+
+def sphere_grid() -> TsdfGrid:
+    grid = TsdfGrid(SETTINGS)
+    poses = [looking_at_origin(direction, 2.0) for direction in directions()]
+    for T_G_C in poses:
+        grid.allocate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
+    for T_G_C in poses:
+        grid.integrate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
+    return grid
+
+
+def edge_counts(mesh: Mesh) -> np.ndarray:
+    """Return by how many triangles each edge is used in one direction minus the other, and in all."""
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    _, directed = np.unique(edges, axis=0, return_counts=True)
+    assert (directed == 1).all(), "two triangles run along an edge in the same direction"
+    return counts
+
+
+def test_a_sphere_is_watertight_and_looks_outwards() -> None:
+    mesh = sphere_grid().mesh(0.1)
+    radii = np.linalg.norm(mesh.p, axis=1)
+    # distances along the optical axis are too long where a ray grazes the sphere
+    assert np.abs(radii - RADIUS_M).max() < 0.2 * SETTINGS.voxel_size_m
+    assert np.abs(radii - RADIUS_M).mean() < 0.1 * SETTINGS.voxel_size_m
+    assert (edge_counts(mesh) == 2).all()
+    corners = mesh.p[mesh.faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+    volume = np.einsum("fi,fi->", areas, corners.mean(axis=1)) / 3.0
+    assert volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS_M**3, rel=0.02)
+    edges = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    euler = len(mesh.p) - len(edges) + len(mesh.faces)
+    assert euler == 2
+
+
+def test_a_plane_is_where_it_is() -> None:
+    grid = TsdfGrid(SETTINGS)
+    normal, offset = np.array([0.1, -0.2, 1.0]), 2.0
+    depth = (offset / (PINHOLE.rays() @ normal)).astype(np.float32)
+    grid.allocate(depth, PINHOLE, np.eye(4))
+    grid.integrate(depth, PINHOLE, np.eye(4))
+    mesh = grid.mesh(0.1)
+    distance = (mesh.p @ normal - offset) / np.linalg.norm(normal)
+    assert len(mesh.p) > 1000
+    # distances along the optical axis are flatter than the normal; the zero crossing is the same
+    assert np.abs(distance).max() < 0.1 * SETTINGS.voxel_size_m
+    corners = mesh.p[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals @ normal < 0.0).all(), "the free side of the plane is the camera's"
+
+
+def test_no_triangle_touches_an_unobserved_cell() -> None:
+    grid = sphere_grid()
+    min_weight = 0.5
+    observed = {}
+    for block, coordinate in enumerate(grid.coordinates):
+        for voxel in np.argwhere(grid.weight[block] >= min_weight):
+            observed[tuple(8 * coordinate + voxel)] = True
+    mesh = grid.mesh(min_weight)
+    cells = np.floor(mesh.p / SETTINGS.voxel_size_m - 0.5).astype(int)
+    offsets = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
+    assert all(tuple(cell + offset) in observed for cell in cells for offset in offsets)
+
+
+def test_the_rim_of_the_band_is_no_surface() -> None:
+    grid = TsdfGrid(SETTINGS)
+    depth = np.zeros((120, 160), dtype=np.float32)
+    depth[40:80, 60:100] = 2.0  # a patch that hangs in unknown space
+    grid.allocate(depth, PINHOLE, np.eye(4))
+    grid.integrate(depth, PINHOLE, np.eye(4))
+    mesh = grid.mesh(0.1)
+    np.testing.assert_allclose(mesh.p[:, 2], 2.0, atol=1e-3)
+
+
+def test_one_thread_and_more_give_the_same_bytes() -> None:
+    before = numba.get_num_threads()
+    contents = []
+    for threads in (1, before):
+        numba.set_num_threads(threads)
+        grid = sphere_grid()
+        contents.append(
+            (grid.distance.tobytes(), grid.weight.tobytes(), grid.mesh(0.1).p.tobytes())
+        )
+    numba.set_num_threads(before)
+    assert contents[0] == contents[1]
+
+
+def test_a_depth_map_that_is_taken_out_leaves_no_trace() -> None:
+    grid = sphere_grid()
+    wrong = looking_at_origin(np.array([1.0, 0.2, 0.1]), 1.7)
+    depth = depth_of_sphere(looking_at_origin(np.array([1.0, 0.2, 0.1]), 2.0))
+    expected = {tuple(c): d for c, d in zip(grid.coordinates, grid.weight.copy(), strict=True)}
+    distances = {tuple(c): d for c, d in zip(grid.coordinates, grid.distance.copy(), strict=True)}
+    grid.allocate(depth, PINHOLE, wrong)
+    grid.integrate(depth, PINHOLE, wrong)
+    assert not np.allclose(grid.weight[: len(expected)], np.stack(list(expected.values())))
+    grid.remove(depth, PINHOLE, wrong)
+    for block, coordinate in enumerate(map(tuple, grid.coordinates)):
+        weight = expected.get(coordinate, np.zeros((8, 8, 8)))
+        np.testing.assert_allclose(grid.weight[block], weight, atol=1e-5)
+        if coordinate in distances:
+            seen = weight > 0.01
+            difference = (grid.distance[block] - distances[coordinate])[seen]
+            np.testing.assert_allclose(difference, 0.0, atol=1e-4)
+
+
+def stored_sphere() -> StoredGrid:
+    fused = FusedDepth(np.array([[1, 2], [3, 4]], dtype=np.uint64), np.ones((2, 7)))
+    return StoredGrid(sphere_grid(), fused)
+
+
+def test_a_grid_file_holds_everything() -> None:
+    stored = stored_sphere()
+    data = encode_grid(stored)
+    loaded = decode_grid(data, "grid")
+    assert loaded.grid.settings == SETTINGS
+    np.testing.assert_array_equal(loaded.fused.resource_id, stored.fused.resource_id)
+    assert encode_grid(loaded) == data
+    mesh, again = stored.grid.sorted().mesh(0.1), loaded.grid.mesh(0.1)
+    assert mesh.p.tobytes() == again.p.tobytes()
+    assert mesh.faces.tobytes() == again.faces.tobytes()
+    depth = depth_of_sphere(looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0))
+    loaded.grid.allocate(depth, PINHOLE, looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: b"", "no grid of maplab-py"),
+        (lambda data: b"voxblox" + data, "no grid of maplab-py"),
+        (lambda data: data[:-1], "damaged or ends early"),
+        (lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:], "damaged or ends early"),
+        (lambda data: data.replace(b'"blocks"', b'"bricks"'), "header of the grid is damaged"),
+        (lambda data: data[:30], "header of the grid is damaged"),
+    ],
+)
+def test_damaged_files_are_refused(damage: object, message: str) -> None:
+    data = damage(encode_grid(stored_sphere()))  # type: ignore[operator]
+    with pytest.raises(MapError, match=message) as error:
+        decode_grid(data, "grid 7")
+    assert str(error.value).startswith("grid 7: ")
+
+
+def test_memory_is_bounded() -> None:
+    grid = TsdfGrid(dataclasses.replace(SETTINGS, voxel_size_m=0.002, truncation_m=0.006))
+    T_G_C = looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0)
+    with (
+        memory_limited(0.006, "--dense_max_memory_gb"),
+        pytest.raises(NotEnoughMemory, match="--dense_max_memory_gb"),
+    ):
+        grid.allocate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
+
+
+def test_places_beyond_the_grid_are_refused() -> None:
+    grid = TsdfGrid(SETTINGS)
+    T_G_C = np.eye(4)
+    T_G_C[0, 3] = 1e6
+    with pytest.raises(MapError, match="larger voxels"):
+        grid.allocate(np.ones((120, 160), dtype=np.float32), PINHOLE, T_G_C)
+
+
+def test_an_empty_grid_has_no_surface() -> None:
+    mesh = TsdfGrid(SETTINGS).mesh(1.0)
+    assert mesh.p.shape == (0, 3)
+    assert mesh.faces.shape == (0, 3)

@@ -17,7 +17,7 @@ from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_traje
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.trajectories import Trajectory
-from tests.algorithms.evaluation.test_trajectory_evaluation import make_map, make_truth, moved
+from tests.algorithms.evaluation.test_evaluation import make_map, make_truth, moved
 
 OPTIONS = TrajectoryEvaluationOptions()
 ROWS = np.arange(0, 4000, 40)

@@ -1,20 +1,31 @@
-"""Gates and consensus on closures that are made by hand: each refuses for its own reason."""
+"""Gates and consensus on closures made by hand, places that look alike, edges of what is accepted."""
 
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.loop_closure.closure_table import (
+    VERDICTS,
+    Closures,
+    GateValues,
+    closure_edges,
+)
 from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus
-from maplab_py.algorithms.loop_closure.gates import judge, measure
+from maplab_py.algorithms.loop_closure.gates import judge, measure, rival_shares
+from maplab_py.algorithms.loop_closure.merging import Votes, count_pairs
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
+from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap
 from maplab_py.vimap.ids import random_ids
 from maplab_py.vision.absolute_pose import PoseSolutions
+from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 COUNT = 40
 PLACE = 100
@@ -137,3 +148,146 @@ def test_a_closure_alone_needs_many_inliers_and_nobody_against_it() -> None:
     )
     assert contradicted.tolist() == [False] * 4
     assert supported.tolist() == [False, True, True, True]
+
+
+def queries(p, way, inliers, *, far_own=None, mission=None):
+    count = len(p)
+    T = se3.identity(count)
+    T[:, 4:] = p
+    query = np.array([7, 7, 8][:count])
+    mission = np.zeros(count, dtype=np.int64) if mission is None else np.asarray(mission)
+    way = np.asarray(way, dtype=float)
+    judgement = SimpleNamespace(
+        vi_map=SimpleNamespace(missions=range(2)),
+        query=query,
+        T_M_I=T,
+        missions=(mission, mission),
+        way_m=(way, way),
+        values=SimpleNamespace(inliers=np.asarray(inliers)),
+        is_far=np.zeros(count, dtype=bool) if far_own is None else np.asarray(far_own),
+        options=LoopClosureOptions(max_drift_ratio=0.1),
+    )
+    shares = rival_shares(judgement, np.ones(count, dtype=bool))
+    return np.unique(query[shares >= 0.5]).tolist()
+
+
+def test_two_far_places_of_one_mission_are_ambiguous():
+    assert queries([[0, 0, 0], [9, 0, 0], [9, 0, 0]], [0, 20, 20], [50, 40, 40]) == [7]
+
+
+def test_a_much_weaker_second_place_does_not_count():
+    assert queries([[0, 0, 0], [9, 0, 0], [9, 0, 0]], [0, 20, 20], [50, 20, 40]) == []
+
+
+def test_two_ends_of_a_drifting_loop_are_one_place():
+    assert queries([[0, 0, 0], [1, 0, 0], [1, 0, 0]], [0, 60, 60], [50, 50, 50]) == []
+
+
+def test_places_of_two_missions_say_nothing_about_each_other():
+    assert queries([[0, 0, 0], [9, 0, 0]], [0, 20], [50, 50], mission=[0, 1]) == []
+
+
+def test_a_far_place_of_the_own_mission_is_ambiguous():
+    assert queries([[0, 0, 0]], [0], [30], far_own=[True]) == [7]
+    assert queries([[0, 0, 0]], [0], [15], far_own=[True]) == []
+
+
+# mission 0 was in a room, mission 1 in its twin, mission 2 in both, which are 9 m apart
+TWINS = [
+    Walk(room=1),
+    Walk(room=1, mission=1, room_at=(0.0, 9.0, 0.0)),
+    Walk(room=1, mission=2),
+    Walk(room=1, mission=2, start_s=40.0, room_at=(0.0, 9.0, 0.0)),
+]
+
+
+def test_missions_in_rooms_that_look_alike_stay_unknown_with_the_reason():
+    vi_map, _ = make_map(TWINS)
+    for known in range(3):
+        is_known = np.arange(3) == known
+        one = vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=is_known))
+        anchored, report = anchor_missions(one)
+        assert anchored.baseframes.is_known.tolist() == is_known.tolist()
+        assert report.anchored == ()
+        assert "look" in report.failure
+
+
+def test_known_base_frames_tell_twins_apart():
+    vi_map, truth = make_map(TWINS)
+    merged, report = close_loops(vi_map)
+    assert report.landmarks_merged > 100
+    # landmarks of the two rooms stay apart: no landmark is seen from both
+    side = truth[merged.keypoint_vertex[merged.observations], 5] > 4.5
+    landmark = merged.keypoints.landmark[merged.observations]
+    for row in np.unique(landmark):
+        assert len(np.unique(side[landmark == row])) == 1
+
+
+OPTIONS = LoopClosureOptions()
+FLOOR = np.diag(np.array([0.01, 0.01, 0.01, 0.002, 0.002, 0.002]) ** 2)
+
+
+@cache
+def accepted() -> Closures:
+    walks = [Walk(room=1, vertices=6), Walk(room=1, vertices=6, start_s=60.0)]
+    closures = search_loops(make_map(walks)[0])[0].closures
+    return closures.take(np.flatnonzero(closures.accepted))
+
+
+def with_covariance(covariance: np.ndarray) -> Closures:
+    count = len(accepted())
+    return dataclasses.replace(accepted(), covariance=np.tile(covariance, (count, 1, 1)))
+
+
+def test_no_edge_is_more_certain_than_points_of_a_map_are() -> None:
+    edges = closure_edges(with_covariance(1e-12 * np.eye(6)), OPTIONS)
+    np.testing.assert_allclose(edges.covariance, np.tile(FLOOR, (len(edges), 1, 1)), atol=1e-9)
+
+
+def test_a_closure_that_was_found_twice_gives_one_edge() -> None:
+    rows = np.arange(len(accepted()))
+    once = closure_edges(accepted(), OPTIONS)
+    twice = closure_edges(accepted().take(np.concatenate([rows, rows[:3]])), OPTIONS)
+    np.testing.assert_array_equal(twice.id, once.id)
+    assert len(np.unique(once.id, axis=0)) == len(once)
+
+
+def test_covariances_are_those_of_the_relative_pose() -> None:
+    # T_A_B = T_M_A^-1 T_M_B, derived by differences of T_M_A
+    spread = np.random.default_rng(4).normal(size=(6, 6))
+    covariance = 1e-2 * spread @ spread.T
+    closures = with_covariance(covariance)
+    edges = closure_edges(closures, OPTIONS)
+    rows = np.array([closures.id.tolist().index(one) for one in edges.id.tolist()])
+    T_M_A, T_A_B = closures.T_M_I[rows], closures.T_A_B[rows]
+    T_M_B = se3.compose(T_M_A, T_A_B)
+    step = 1e-6
+    J = np.empty((len(edges), 6, 6))
+    for axis in range(6):
+        delta = np.tile(step * np.eye(6)[axis], (len(edges), 1))
+        sides = [
+            se3.local(T_A_B, se3.relative(se3.retract(T_M_A, sign * delta), T_M_B))
+            for sign in (1.0, -1.0)
+        ]
+        J[:, :, axis] = (sides[0] - sides[1]) / (2.0 * step)
+    expected = J @ covariance @ np.swapaxes(J, 1, 2) + FLOOR
+    np.testing.assert_allclose(edges.covariance, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_keypoints_of_one_vertex_are_one_vote() -> None:
+    source, target = np.array([3, 3, 9, 9]), np.array([7, 7, 4, 4])
+    bits = np.array([10, 20, 1, 3], dtype=np.int32)
+    votes = Votes(source, target, np.array([5, 5, 5, 6]), bits, bits == 1)
+    pairs = count_pairs(votes, np.arange(20))
+    rows = zip(pairs.first.tolist(), pairs.second.tolist(), pairs.votes.tolist(), strict=True)
+    assert sorted(rows) == [(7, 3, 1), (9, 4, 2)]
+    assert pairs.bits[pairs.of_vote].tolist() == [15.0, 15.0, 2.0, 2.0]
+    assert pairs.is_doubtful[pairs.of_vote].tolist() == [False, False, True, True]
+
+
+def test_places_seen_too_recently_are_not_searched() -> None:
+    walks = [Walk(room=1, vertices=6), Walk(room=1, vertices=6, start_s=60.0)]
+    vi_map = make_map(walks)[0]
+    for seconds, is_found in ((50.0, True), (70.0, False)):
+        options = LoopClosureOptions(min_image_time_seconds=seconds)
+        assert search_loops(vi_map, options)[0].closures.accepted.any() == is_found

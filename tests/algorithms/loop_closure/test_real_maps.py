@@ -1,4 +1,4 @@
-"""Loop closure on recorded maps: what a brute-force search found there, and nothing else."""
+"""Loop closure on recorded maps and between simulated sessions: what is there, and nothing else."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures, search_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.submaps import append_submaps
+from tests.algorithms.loop_closure.against_truth import score, sessions
 from tests.support.data import shared_data
 
 pytestmark = pytest.mark.slow
@@ -76,3 +77,16 @@ def ground_truth_poses(vi_map: VIMap):
     time_ns = vi_map.vertices.timestamp_ns
     found, valid = interpolate_poses(table[:, 0].astype(np.int64), poses, time_ns)
     return time_ns * 1e-9, found, valid
+
+
+@pytest.mark.parametrize(
+    ("flips", "vanish", "precision", "recall"), [(0.05, 0.0, 0.995, 0.90), (0.15, 0.3, 0.99, 0.60)]
+)
+def test_closures_of_four_sessions(flips, vanish, precision, recall):
+    vi_map, truth = sessions(flips, vanish, seed=1, rate_hz=3.0, duration_s=40.0)
+    search, _ = search_loops(vi_map)
+    result = score(vi_map, truth, search.closures)
+    assert result.closable > 300
+    assert result.accepted > 300
+    assert result.precision >= precision
+    assert result.recall >= recall

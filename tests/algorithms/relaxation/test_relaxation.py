@@ -1,21 +1,25 @@
-"""Relaxation of simulated loops, with and without false closures."""
+"""Relaxation of simulated loops with and without false closures, alone and in groups."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numba
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import move_vertices, relax, relax_graph
+from maplab_py.algorithms.relaxation.robust import independent_errors, variance_factor, with_tail
 from maplab_py.errors import Cancelled
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SilentProgress
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate as simulate_scenario
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import random_ids, to_hex
 from maplab_py.vimap.tables import Landmarks, LoopClosureEdges
 from tests.algorithms.relaxation.loops import Loop, ate, simulate
 
@@ -206,3 +210,130 @@ def test_cancelling_leaves_by_the_exception():
     loop = simulate(3)
     with pytest.raises(Cancelled):
         relax(loop.vi_map, OPTIONS, loop_closures=loop.closures, progress=Impatient())
+
+
+def raised(T_A_B: np.ndarray, T_G_A: np.ndarray, height_m: float) -> np.ndarray:
+    """Return relative poses whose second pose lies higher in G."""
+    moved = T_A_B.copy()
+    moved[:, 4:] += so3.rotate(so3.inverse(T_G_A[:, :4]), [0.0, 0.0, height_m])
+    return moved
+
+
+def with_false_neighbours(loop: Loop, count: int, height_m: float, seed: int) -> Loop:
+    """Add closures of neighbouring vertices that all put the second lap too high."""
+    rng = np.random.default_rng(seed)
+    first = int(rng.integers(20, 260)) + np.arange(count) // 2
+    second = first + 300
+    T_A_B = se3.relative(loop.T_G_I[first], loop.T_G_I[second])
+    false = LoopClosureEdges.filled(
+        count,
+        id=random_ids(count, rng),
+        from_vertex=first,
+        to_vertex=second,
+        T_A_B=raised(T_A_B, loop.T_G_I[first], height_m),
+        covariance=loop.closures.covariance[:count],
+    )
+    closures = LoopClosureEdges.concatenate([loop.closures, false])
+    return dataclasses.replace(loop, closures=closures)
+
+
+@pytest.mark.parametrize(("seed", "height_m"), [(1, 0.5), (3, 0.6)])
+def test_false_neighbours_that_bend_the_trajectory_are_judged_without_them(seed, height_m):
+    # while they count, their errors are no larger than those of a tail of true closures
+    loop = with_false_neighbours(simulate(seed, false_share=0.0), 4, height_m, seed)
+    relaxed = relax_graph(loop.vi_map, OPTIONS, loop_closures=loop.closures)
+    assert relaxed.weight.tolist() == [1.0] * 80 + [0.0] * 4
+
+
+def test_a_confident_minority_does_not_outvote_the_majority():
+    # 30 closures put the second lap 5 m too high; the 50 true ones are five times less certain
+    loop = simulate(0, false_share=0.0)
+    rows = np.sort(np.random.default_rng(0).permutation(80)[:30])
+    others = np.setdiff1d(np.arange(80), rows)
+    T_A_B, covariance = loop.closures.T_A_B.copy(), loop.closures.covariance.copy()
+    T_A_B[rows] = raised(T_A_B[rows], loop.T_G_I[loop.closures.from_vertex[rows]], 5.0)
+    covariance[others] *= 25.0
+    closures = loop.closures.replace(T_A_B=T_A_B, covariance=covariance)
+    relaxed = relax_graph(loop.vi_map, OPTIONS, loop_closures=closures)
+    assert np.all(relaxed.weight[others] == 1.0)
+    assert np.all(relaxed.weight[rows] == 0.0)
+    assert ate(relaxed.vi_map.T_G_I, loop.T_G_I) < 0.2
+
+
+@pytest.fixture(scope="module")
+def adjustment():
+    """Return 40 linear measurements (N, 6) of 30 unknowns, their whitened rows, and noise."""
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(40, 6, 30))
+    return rows, rng.normal(size=(40, 6))
+
+
+def _solved(rows, measured, counts):
+    """Return errors and the uncertainty of the prediction, some measurements left out."""
+    A = rows[counts].reshape(-1, 30)
+    N = np.linalg.inv(A.T @ A)
+    x = N @ A.T @ measured[counts].reshape(-1)
+    return rows @ x - measured, rows @ N @ rows.transpose(0, 2, 1)
+
+
+def test_errors_are_those_against_all_others(adjustment):
+    rows, measured = adjustment
+    everything = np.ones(40, dtype=np.bool_)
+    with_all = independent_errors(*_solved(rows, measured, everything), everything)
+    for row in range(5):
+        others = everything.copy()
+        others[row] = False
+        without = independent_errors(*_solved(rows, measured, others), others)
+        assert with_all[row] == pytest.approx(without[row], rel=1e-9)
+
+
+def test_independent_errors_are_chi_squared(adjustment):
+    rows, _ = adjustment
+    counts = np.arange(40) % 3 > 0
+    rng = np.random.default_rng(5)
+    u = np.concatenate(
+        [
+            independent_errors(*_solved(rows, rng.normal(size=(40, 6)), counts), counts)
+            for _ in range(50)
+        ]
+    )
+    for share in (0.1, 0.5, 0.9, 0.99):
+        assert np.quantile(u, share) == pytest.approx(chi2(6).ppf(share), rel=0.1)
+
+
+def test_what_nothing_controls_has_no_error():
+    u = independent_errors(np.full((1, 6), 1e-9), np.eye(6)[None], np.array([True]))
+    assert u[0] < 1e-9
+
+
+def test_variance_factor_is_that_of_the_noise_and_stays_within_reason():
+    u = chi2(6).rvs(1000, random_state=1)
+    assert variance_factor(u) == pytest.approx(1.0, rel=0.1)
+    assert variance_factor(1e-3 * u) == pytest.approx(1e-3, rel=0.5)
+    assert variance_factor(np.append(u, np.full(200, 1e9))) < 1.4
+    assert variance_factor(1e3 * u) == 4.0
+    assert variance_factor(1e-3 * u[:5]) > 0.5  # so few show little
+    assert variance_factor(np.zeros(3)) > 0.0
+
+
+def test_a_tail_is_kept_and_what_lies_beyond_the_gap_is_not():
+    core = np.full(100, 5.0)
+    u = np.concatenate([core, [25.0, 40.0, 70.0], [400.0, 420.0, 9e4]])
+    assert with_tail(u, 20.0).tolist() == [True] * 103 + [False] * 3
+
+
+def test_without_a_gap_the_limit_decides():
+    core = np.full(20, 5.0)
+    u = np.concatenate([core, np.geomspace(25.0, 1e4, 30)])
+    np.testing.assert_array_equal(with_tail(u, 20.0), u <= 20.0)
+
+
+def test_nothing_far_away_is_a_tail():
+    u = np.concatenate([np.full(1000, 5.0), np.geomspace(21.0, 1e5, 40)])
+    assert u[with_tail(u, 20.0)].max() <= 2000.0
+
+
+def test_a_lone_error_is_judged_by_the_limit():
+    assert with_tail(np.array([19.0]), 20.0).tolist() == [True]
+    assert with_tail(np.array([21.0]), 20.0).tolist() == [False]
+    assert with_tail(np.zeros(0), 20.0).tolist() == []

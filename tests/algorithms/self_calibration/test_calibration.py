@@ -1,26 +1,35 @@
-"""The calibration against truth: exact without noise, honest about its errors with it."""
+"""The calibration against truth; what is refused or doubted, and motions that excite too little."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.self_calibration import checks
 from maplab_py.algorithms.self_calibration.calibration import calibrate
+from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
 from maplab_py.algorithms.self_calibration.comparison import compare
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
+from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import (
     extract_submap,
     split_into_segments,
 )
 from maplab_py.algorithms.self_calibration.uncertainty import Verdict
-from maplab_py.errors import EstimationError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.sensors import Distortion
+from maplab_py.simulation.scenario import MotionOptions, SessionOptions
+from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.simulate import simulate
+from maplab_py.simulation.truth import true_map
 from maplab_py.vimap.edits import with_new_ids
 from maplab_py.vimap.stacking import stack
-from tests.algorithms.self_calibration.scenes import EXACT, OPTIONS, scene_map, uncalibrated
+from tests.algorithms.self_calibration.scenes import EXACT, OPTIONS, device, scene_map, uncalibrated
 
 
 @pytest.mark.parametrize("distortion", [Distortion.FOV, Distortion.RADTAN])
@@ -136,3 +145,122 @@ def standing():
         keypoints=keypoints,
         imu_samples=imu.replace(accel_gyro=samples),
     )
+
+
+CAMERA = dataclasses.replace(
+    OPTIONS,
+    states="intrinsics,extrinsics_rotation,extrinsics_translation",
+    keep_unobservable_at_prior=True,
+)
+
+
+def test_a_camera_that_moves_too_far_is_kept_where_it_was() -> None:
+    start = uncalibrated(scene_map(noise=1.0))
+    free, _, believed = calibrate_with_checks(start, CAMERA, batch=True, max_camera_shift_m=1.0)
+    held, _, report = calibrate_with_checks(start, CAMERA, batch=True, max_camera_shift_m=1e-5)
+    before = device(start)[1].T_B_C[:, 4:]
+    kept = [one for one in report.parameters if "position" in one.parameter]
+    assert len(report.parameters) == len(believed.parameters)
+    assert all(one.verdict.startswith("kept: the data would move") for one in kept)
+    rig_id = device(start)[1].id
+    assert np.abs(held.camera_rig(rig_id).T_B_C[:, 4:] - before).max() <= 1e-12
+    assert np.abs(free.camera_rig(rig_id).T_B_C[:, 4:] - before).max() > 1e-5
+
+
+def test_segments_likewise() -> None:
+    start = uncalibrated(scene_map(vertices=61, noise=1.0))
+    held, database, report = calibrate_with_checks(start, CAMERA, max_camera_shift_m=1e-5)
+    assert database is not None
+    rig = device(start)[1]
+    assert np.abs(held.camera_rig(rig.id).T_B_C[:, 4:] - rig.T_B_C[:, 4:]).max() <= 1e-12
+    assert any(one.verdict.startswith("kept") for one in report.parameters)
+
+
+def test_the_spread_of_parts_widens_deviations_and_never_narrows_them() -> None:
+    start = uncalibrated(scene_map(vertices=61, noise=1.0))
+    _, _, formal = calibrate_with_checks(start, CAMERA, batch=True)
+    _, _, widened = calibrate_with_checks(start, CAMERA, batch=True, parts=3)
+    ratio = [b.sigma / a.sigma for a, b in zip(formal.parameters, widened.parameters, strict=True)]
+    assert min(ratio) >= 1.0 - 1e-9
+    # the simulated device is what the model says: results scatter as announced
+    assert float(np.median(ratio)) <= 2.0
+    with pytest.raises(UserError, match="two parts"):
+        calibrate_with_checks(start, CAMERA, batch=True, parts=1)
+
+
+def test_the_spread_is_the_standard_error_of_the_mean_of_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = uncalibrated(scene_map(vertices=41, noise=1.0))
+    changes, deviations = [], []
+
+    def recorded(*arguments: Any, **keywords: Any) -> Any:
+        result, report = calibrate(*arguments, **keywords)
+        changes.append(result.change)
+        return result, report
+
+    def noted(report: Any, result: Any, *arguments: Any) -> Any:
+        deviations.append(result.uncertainty.model_sigma)
+        return with_spread(report, result, *arguments)
+
+    with_spread = checks._with_spread
+    monkeypatch.setattr(checks, "calibrate", recorded)
+    monkeypatch.setattr(checks, "_with_spread", noted)
+    _, _, report = calibrate_with_checks(start, CAMERA, batch=True, parts=4)
+    assert len(changes) == 5  # of all data, then of the parts
+    expected = np.maximum(np.std(changes[1:], axis=0, ddof=1) / 2.0, deviations[0])
+    # one of them at least must be larger than what the noise explains, or nothing is tested
+    assert np.any(expected > deviations[0])
+    np.testing.assert_allclose([one.sigma for one in report.parameters], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("segments_per_group", 0), ("segment_keyframes", 1), ("prior_position_m", 0.0)],
+)
+def test_flags_without_meaning_are_named(field: str, value: Any) -> None:
+    with pytest.raises(UserError, match=f"--sc_{field}"):
+        dataclasses.replace(OPTIONS, **{field: value})
+
+
+STILL = {"shake_m": 0.0, "shake_rad": 0.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("motion", "lacking"),
+    [
+        (
+            MotionOptions(kind="straight", duration_s=10.0, wall_distance_m=2.0, **STILL),
+            "gyroscope",
+        ),
+        (MotionOptions(kind="stationary", duration_s=10.0, **STILL), "gyroscope"),
+        (MotionOptions(kind="rotation", duration_s=14.0, turns=1.2, **STILL), "camera position"),
+        (MotionOptions(kind="rotation", duration_s=14.0, turns=1.2), "camera position"),
+    ],
+)
+def test_degenerate_motion_is_refused(motion: MotionOptions, lacking: str) -> None:
+    scenario = dataclasses.replace(
+        load_scenario("ar_room"), sessions=(SessionOptions(phases=(motion,)),)
+    )
+    with pytest.raises(EstimationError, match="not excited") as refused:
+        calibrate(simulate(scenario).maps[0], SelfCalibrationOptions())
+    assert lacking in str(refused.value)
+    # the user can act on it
+    assert "record motion" in str(refused.value)
+
+
+@pytest.mark.slow
+def test_turning_among_other_motion_does_not_spoil_the_calibration() -> None:
+    """A session that put the camera 9 sigmas off: 12 s of turning and shaking, badly tracked."""
+    scenario = load_scenario("ar_room")
+    seeds = dataclasses.replace(scenario.seeds, motion=106, measurement=206, appearance=306)
+    data = simulate(dataclasses.replace(scenario, seeds=seeds, sessions=(scenario.sessions[1],)))
+    options = SelfCalibrationOptions()
+    database, _ = collect(data.maps[0], options)
+    result, _ = calibrate(database.vi_map, options)
+    truth = build_segment_problem(
+        true_map(data.maps[0], data.truth), options, robust=False
+    ).states.blocks
+    off = result.parameters.difference(result.blocks, truth)
+    assert np.abs(off / np.sqrt(np.diag(result.uncertainty.formal))).max() <= 3.5

@@ -1,4 +1,4 @@
-"""Conduct: cancelling, time limits, hopeless input, any number of threads."""
+"""Conduct: cancelling, limits, hopeless input, threads, and the choice of the linear solver."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import numba
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
-from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
+from maplab_py.errors import Cancelled, EstimationError, FlagError, MaplabError, UserError
+from maplab_py.estimation.linear import supernodal_solver
+from maplab_py.estimation.problem import solver_choice
+from maplab_py.estimation.problem.iterative import IterativeProblem
+from maplab_py.memory import NotEnoughMemory
 from maplab_py.progress import SilentProgress
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
@@ -182,3 +187,189 @@ def test_any_number_of_threads_gives_the_same_bytes() -> None:
     for result, report in results[1:]:
         assert contents(result) == contents(results[0][0])
         assert report.cost_after == results[0][1].cost_after
+
+
+SESSIONS = Scene(missions=2, vertices=12, landmarks=200, noise=1.0)
+
+
+class Lines(SilentProgress):
+    """Keeps the lines about the linear solver."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def line(self, text: str) -> None:
+        """Keep a line."""
+        if text.startswith("linear solver"):
+            self.lines.append(text)
+
+
+def sessions() -> VIMap:
+    return corrupted(
+        SESSIONS.make(),
+        np.random.default_rng(2),
+        position_m=0.03,
+        quaternion=0.005,
+        landmark_m=0.03,
+    )
+
+
+def built(**flags: object) -> tuple[bool, list[str]]:
+    """Tell whether the problem is iterative, and what was said about it."""
+    progress = Lines()
+    options = VIOptimizationOptions(**flags)  # type: ignore[arg-type]
+    problem = build(sessions(), options, progress=progress).problem
+    return isinstance(problem, IterativeProblem), progress.lines
+
+
+def test_small_maps_stay_direct_without_a_word() -> None:
+    assert built() == (False, [])
+    assert built(linear_solver_type="multifrontal") == (False, [])
+
+
+def test_conjugate_gradients_on_request_give_the_same_map() -> None:
+    common = {"num_iterations": 40, "function_tolerance": 1e-10}
+    reports = {
+        name: optimize(sessions(), VIOptimizationOptions(linear_solver_type=name, **common))[1]  # type: ignore[arg-type]
+        for name in ("multifrontal", "pcg")
+    }
+    for name, report in reports.items():
+        assert report.linear_solver == name
+        assert (report.linear_iterations > 0) == (name == "pcg")
+        assert report.cost_after == pytest.approx(reports["multifrontal"].cost_after, rel=1e-8)
+
+
+def test_many_pairs_of_observations_decide_without_an_analysis(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(solver_choice, "ITERATIVE_FROM", 1.0)
+    monkeypatch.setattr(solver_choice, "analyse", None)
+    is_iterative, (line,) = built()
+    assert is_iterative
+    assert "would take as long as at least" in line
+
+
+def test_between_the_bounds_the_graph_of_the_vertices_decides(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    map_problem = build(sessions(), VIOptimizationOptions())
+    visual = map_problem.problem.visual
+    assert visual is not None
+    bound = solver_choice.predict_costs(visual)
+    assert bound.is_bound
+    monkeypatch.setattr(solver_choice, "ITERATIVE_FROM", 0.999 * bound.break_even)
+    exact = solver_choice.predict_costs(visual)
+    assert not exact.is_bound
+    assert 0.0 < exact.break_even <= bound.break_even
+    monkeypatch.setattr(solver_choice, "_FLOPS_PER_S", 1e3)  # factorisations take for ever
+    is_iterative, (line,) = built()
+    assert is_iterative
+    assert "would take as long as at least" not in line
+
+
+def test_conjugate_gradients_where_the_direct_solver_does_not_fit() -> None:
+    is_iterative, lines = built(max_memory_gb=1e-4)
+    assert is_iterative
+    assert lines == ["linear solver: conjugate gradients, since the direct solver does not fit"]
+
+
+def test_steps_are_as_exact_as_the_forcing_says() -> None:
+    iterations = [
+        optimize(sessions(), VIOptimizationOptions(linear_solver_type="pcg", pcg_forcing=forcing))[
+            1
+        ].linear_iterations
+        for forcing in (0.1, 1e-5)
+    ]
+    assert iterations[0] < iterations[1]
+    for forcing in (0.0, 1.0, -0.1, float("nan")):
+        with pytest.raises(FlagError, match=r"--ba_pcg_forcing=.* must be above 0 and below 1"):
+            built(pcg_forcing=forcing)
+
+
+def test_a_large_factor_is_announced_before_it_is_allocated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(supernodal_solver, "_WORTH_TELLING", 0.0)
+    is_iterative, lines = built()
+    assert not is_iterative
+    assert lines == ["linear solver: direct, a factor of 0.00 GB in 0 Gflop an iteration"]
+    with pytest.raises(NotEnoughMemory):
+        built(linear_solver_type="multifrontal", max_memory_gb=1e-4)
+
+
+def test_the_direct_solver_refuses_and_names_the_remedies() -> None:
+    with pytest.raises(NotEnoughMemory) as error:
+        built(linear_solver_type="multifrontal", max_memory_gb=1e-4)
+    assert "--ba_linear_solver_type=pcg" in str(error.value)
+    assert "--ba_max_memory_gb" in str(error.value)
+
+
+def test_estimated_cameras_take_the_direct_solver_and_say_so() -> None:
+    is_iterative, lines = built(linear_solver_type="pcg", fix_ncamera_intrinsics=False)
+    assert not is_iterative
+    assert lines == [
+        "linear solver: direct, since conjugate gradients do not support cameras that are estimated"
+    ]
+    is_iterative, lines = built(fix_ncamera_intrinsics=False)
+    assert (is_iterative, lines) == (False, [])
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"fix_imu_intrinsics": False},
+        {"fix_landmark_positions": True},
+        {"fix_velocity": True, "fix_gyro_bias": True},
+        {"include_inertial": False},
+        {"position_prior_sigma_m": 0.1, "landmark_prior_sigma_m": 0.1},
+        {"loss": "huber"},
+    ],
+    ids=lambda flags: next(iter(flags)),
+)
+def test_whatever_is_estimated_the_optimum_is_that_of_the_direct_solver(
+    flags: dict[str, object],
+) -> None:
+    """Begin near the optimum: IMU edges are integrated where the biases were on the way there."""
+    near, _ = optimize(sessions(), VIOptimizationOptions(loss="none", num_iterations=5))
+    costs = []
+    for name in ("multifrontal", "pcg"):
+        options = VIOptimizationOptions(
+            linear_solver_type=name, num_iterations=100, function_tolerance=1e-12,
+            use_visual_outlier_rejection_solver=False, **flags,  # type: ignore[arg-type]
+        )  # fmt: skip
+        costs.append(optimize(near, options)[1].cost_after)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-8)
+
+
+def test_submaps_on_request_give_the_same_map() -> None:
+    common = {"num_iterations": 8, "function_tolerance": 0.0}
+    reports = {}
+    for submaps in (0, 4):
+        options = VIOptimizationOptions(submaps=submaps, **common)  # type: ignore[arg-type]
+        reports[submaps] = optimize(sessions(), options)[1]
+    assert "submaps" in reports[4].linear_solver
+    assert reports[4].cost_after == pytest.approx(reports[0].cost_after, rel=1e-9)
+    options = VIOptimizationOptions(submaps=4, submap_rounds=2, **common)  # type: ignore[arg-type]
+    assert optimize(sessions(), options)[1].iterations == 2
+
+
+def test_submaps_say_what_is_in_memory_and_refuse_other_solvers() -> None:
+    progress = Lines()
+    build(sessions(), VIOptimizationOptions(submaps=4), progress=progress)
+    (line,) = progress.lines
+    assert "submaps" in line
+    assert "GB in memory, the rest in" in line
+    for flags, said in (
+        ({"submaps": 4, "linear_solver_type": "pcg"}, "drop --ba_linear_solver_type=pcg"),
+        ({"submaps": -1}, "--ba_submaps=-1: must be at least 0"),
+        ({"submap_rounds": -1}, "--ba_submap_rounds=-1: must be at least 0"),
+    ):
+        with pytest.raises(FlagError, match=said):
+            build(sessions(), VIOptimizationOptions(**flags))  # type: ignore[arg-type]
+
+
+def test_cameras_that_are_estimated_stay_direct() -> None:
+    progress = Lines()
+    options = VIOptimizationOptions(submaps=4, fix_ncamera_intrinsics=False)
+    build(sessions(), options, progress=progress)
+    assert progress.lines[0].startswith("linear solver: direct, since submaps do not support")

@@ -1,22 +1,34 @@
-"""What the console proposes, and how it colours a line."""
+"""What the console proposes, how it colours a line, and how soon."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from prompt_toolkit.completion import CompleteEvent
+from prompt_toolkit.document import Document
 
-from maplab_py.console.commands.registry import load_registry
+from maplab_py.algorithms.loop_closure.closure_record import (
+    ClosureRecord,
+    LoopRecord,
+    write_record,
+)
+from maplab_py.console.commands.command import describe
+from maplab_py.console.commands.registry import Plugin, load_registry
 from maplab_py.console.prompt.completion import complete, match_rank
-from maplab_py.console.prompt.loop import coloured_parts
+from maplab_py.console.prompt.loop import CommandCompleter, coloured_parts
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError
+from maplab_py.plugin import CommandContext
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import save_map
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap
 from tests.console.sample_plugin import make_registry, make_session, map_of
+from tests.support.machine import slowness
 
 REGISTRY = make_registry()
 
@@ -144,7 +156,7 @@ def test_commands_show_their_help(session: Session) -> None:
 
 def test_map_keys_and_missions(session: Session) -> None:
     from maplab_py.console.commands.registry import Plugin
-    from maplab_py.plugin import CommandContext, Message, command
+    from maplab_py.plugin import Message, command
 
     @command("pick", needs_map=False)
     def pick(
@@ -213,3 +225,80 @@ def test_clear_clears_the_screen_and_is_proposed_before_clear_storage() -> None:
     assert texts("clear", session) == ["clear", "clear_storage"]
     session.run("clear")
     assert len(session.maps) == 1
+
+
+MOST_SECONDS = 0.030
+COMMANDS, MAPS, MISSIONS, CLOSURES = 150, 20, 1000, 5000
+
+
+def filler(context: CommandContext) -> None:
+    """Be one of many commands."""
+
+
+@pytest.fixture(scope="module")
+def large_session() -> Session:
+    registry = load_registry()
+    for number in range(max(0, COMMANDS - len(registry.commands))):
+        registry.add(describe(filler, f"filler_{number}", ()), Plugin("many"))
+    large_session = Session(registry)
+    generator = np.random.default_rng(0)
+    ids = generator.integers(0, 2**63, (MISSIONS, 2), dtype=np.uint64)
+    vi_map = VIMap(
+        missions=Missions.filled(MISSIONS, id=ids, baseframe=np.arange(MISSIONS)),
+        baseframes=BaseFrames.filled(MISSIONS, id=ids),
+    )
+    vi_map = vi_map.replace(vertices=Vertices.filled(2, id=ids[:2], mission=[0, 1]))
+    closures = ClosureRecord.filled(
+        CLOSURES,
+        id=generator.integers(0, 2**64, (CLOSURES, 2), dtype=np.uint64),
+        query=np.repeat(ids[:1], CLOSURES, axis=0),
+        place=np.repeat(ids[1:2], CLOSURES, axis=0),
+    )
+    vi_map = write_record(vi_map, LoopRecord(closures))
+    for number in range(MAPS):
+        large_session.maps.add(f"map_{number}", vi_map)
+    return large_session
+
+
+@pytest.mark.parametrize(
+    ("line", "at_least"),
+    [
+        ("", 100),
+        ("fil", 1),
+        ("ovi", 1),
+        ("optvi --", 20),
+        ("set --", 100),
+        ("select_map ", MAPS),
+        ("sbk --map_mission=", MISSIONS),
+        ("optvi --map_mission_list=1", 10),
+        ("remove_loopclosure ", 1000),
+        ("remove_loopclosure a", 100),
+        ("remove_loopclosure zz", 0),
+    ],
+)
+def test_completion_latency(large_session: Session, line: str, at_least: int) -> None:
+    completer = CommandCompleter(large_session)
+    seconds = []
+    for _ in range(7):
+        start = time.process_time()
+        found = list(completer.get_completions(Document(line), CompleteEvent()))
+        seconds.append(time.process_time() - start)
+        assert len(found) >= at_least
+    assert sorted(seconds)[3] <= MOST_SECONDS * slowness()
+
+
+def test_the_first_key_on_many_closures_does_not_wait(large_session: Session) -> None:
+    """Nothing is remembered of this value of the map: it is read and described for the first time."""
+    completer = CommandCompleter(large_session)
+    list(completer.get_completions(Document("remove_loopclosure "), CompleteEvent()))  # imports
+    seconds = []
+    for number in range(5):
+        changed = large_session.vi_map.replace(missions=large_session.vi_map.missions.replace())
+        large_session.maps.add(f"changed_{number}", changed)
+        start = time.process_time()
+        found = list(completer.get_completions(Document("remove_loopclosure "), CompleteEvent()))
+        seconds.append(time.process_time() - start)
+        assert len(found) == 1000
+    assert (
+        min(seconds) <= MOST_SECONDS * slowness()
+    )  # every map is new; what is more is the machine's

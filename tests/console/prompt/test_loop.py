@@ -1,8 +1,9 @@
-"""The loop around the prompt."""
+"""The prompt: its first lines, its history file, and the loop around it."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,75 @@ from typing import Any
 import pytest
 from prompt_toolkit import PromptSession
 from prompt_toolkit.application import create_app_session
+from prompt_toolkit.history import InMemoryHistory
 from prompt_toolkit.input import create_pipe_input
 from prompt_toolkit.output import DummyOutput
 
-from maplab_py.console.prompt.loop import run_prompt
+from maplab_py.console.prompt.greeting import greeting
+from maplab_py.console.prompt.loop import open_history, run_prompt
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from tests.console.sample_plugin import make_registry
+
+
+def _map_at(folder: Path) -> None:
+    (folder / "vi_map").mkdir(parents=True)
+    (folder / "vi_map" / "vi_map_metadata").touch()
+
+
+def test_it_names_the_version_and_the_way_to_help() -> None:
+    (line,) = greeting([])
+    assert line.startswith("maplab-py ")
+    assert "help" in line
+
+
+def test_it_proposes_the_maps_of_the_last_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b c", "d"):
+        _map_at(Path(name))
+    lines = [
+        "load d",
+        "load gone",
+        "load --map_folder=a; optvi",
+        "save --map_folder='b c'",
+        "load a",
+    ]
+    assert greeting(lines)[1:] == ["recent maps: load a · load 'b c' · load d"]
+
+
+def test_lines_that_no_shell_reads_are_left_out() -> None:
+    assert len(greeting(["load 'a", "", "; ;", "load"])) == 1
+
+
+def test_lines_of_two_consoles_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "history"
+    first, second = (open_history(path)[0] for _ in range(2))
+    first.append_string("load maps/office")
+    second.append_string("elq\nrbl")
+    first.append_string("save")
+    kept = list(open_history(path)[0].load_history_strings())
+    assert kept == ["save", "elq\nrbl", "load maps/office"]
+
+
+def test_a_line_that_cannot_be_kept_is_still_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "history"
+    history, problem = open_history(path)
+    assert problem == ""
+    shutil.rmtree(path.parent)
+    history.append_string("elq")
+    assert history.get_strings() == ["elq"]
+    assert not path.exists()
+
+
+def test_without_a_file_there_is_a_history_in_memory(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    history, problem = open_history(tmp_path / "file" / "history")
+    assert isinstance(history, InMemoryHistory)
+    assert "file" in problem
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Running lines: statuses, output, scripts, the program's own command line."""
+"""Scripts and batch files: status, output, folders with any name."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from pathlib import Path
 import pytest
 
 from maplab_py.console.scripts.arguments import parse_arguments
-from maplab_py.console.scripts.batch import Batch, read_batch, read_script, run_batch
+from maplab_py.console.scripts.batch import (
+    FOLDER_TEMPLATE,
+    Batch,
+    read_batch,
+    read_script,
+    run_batch,
+)
 from maplab_py.console.scripts.runner import Runner, format_seconds
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import FlagError, UserError
+from maplab_py.storage.native import save_map
 from tests.console.sample_plugin import make_registry, map_of
+from tests.vimap.builders import walk_map
 
 Capture = pytest.CaptureFixture[str]
 
@@ -262,3 +270,18 @@ def test_wrong_program_arguments(argv: list[str]) -> None:
 
 def test_durations() -> None:
     assert [format_seconds(s) for s in (0.123, 12.34, 125)] == ["0.12 s", "12.3 s", "2 min 05 s"]
+
+
+@pytest.mark.parametrize("name", ["two words", "a;b", "it's", 'a "map"', "# no comment"])
+def test_folders_are_taken_literally(tmp_path: Path, name: str) -> None:
+    save_map(walk_map(), tmp_path / name)
+    loaded = []
+
+    def make_runner() -> Runner:
+        runner = Runner(Session(), ConsoleTerminal())
+        loaded.append(runner)
+        return runner
+
+    batch = Batch((str(tmp_path / name),), (f"load --map_folder={FOLDER_TEMPLATE}",))
+    assert run_batch(batch, make_runner, keep_going=False, discard=False) == Status.OK
+    assert [entry.folder for entry in loaded[0].session.maps] == [tmp_path / name]

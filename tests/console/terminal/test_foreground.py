@@ -1,14 +1,18 @@
-"""Ctrl-C while a command runs, questions from it, and commands that do not stop."""
+"""The terminal while a command runs: foreground, pager, progress, questions."""
 
 from __future__ import annotations
 
 import io
 import os
 import signal
+import sys
 import threading
 import time
+from collections.abc import Iterator
+from io import TextIOWrapper
 from pathlib import Path
 
+import pyte
 import pytest
 
 from maplab_py.cancellation import check_cancelled, current_token, ending_early, lasting_effect
@@ -17,6 +21,7 @@ from maplab_py.console.commands.registry import Plugin
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
+from maplab_py.console.terminal import output
 from maplab_py.console.terminal.foreground import (
     SECONDS_OF_GRACE,
     cancelling_interrupts,
@@ -24,6 +29,8 @@ from maplab_py.console.terminal.foreground import (
     run_in_foreground,
 )
 from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.console.terminal.progress import SECONDS_BEFORE_BAR, TerminalProgress
+from maplab_py.console.terminal.protocol import SilentTerminal
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.plugin import CommandContext, Message, write_text
 from tests.console.sample_plugin import make_registry, map_of
@@ -331,3 +338,104 @@ def test_an_interrupt_that_the_shell_has_let_be_ignored_cancels() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Give the end of a pseudo-terminal at which the keys are typed."""
+    typing_end, reading_end = os.openpty()
+    with os.fdopen(reading_end, "r") as stdin:
+        assert isinstance(stdin, TextIOWrapper)
+        monkeypatch.setattr(sys, "stdin", stdin)
+        yield typing_end
+    os.close(typing_end)
+
+
+@pytest.mark.parametrize("keys", [b"x", b"map_stats\r"])
+def test_typed_keys_are_seen_and_left_to_be_read(keyboard: int, keys: bytes) -> None:
+    assert not output.keys_are_waiting()
+    os.write(keyboard, keys)
+    assert wait_until(output.keys_are_waiting)
+    if keys.endswith(b"\r"):
+        assert sys.stdin.readline() == "map_stats\n"
+    else:
+        os.write(keyboard, b"\n")
+        assert sys.stdin.readline() == "x\n"
+
+
+def test_nothing_waits_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open(os.devnull) as null:
+        monkeypatch.setattr(sys, "stdin", null)
+        assert not output.keys_are_waiting()
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def lines(width: int, what: str, total: float, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return what a terminal of some width shows of a bar at three tenths."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    stream = _Terminal()
+    progress = TerminalProgress(stream)
+    progress._start -= 2 * SECONDS_BEFORE_BAR
+    progress.step(0.3 * total, total, what)
+    assert progress._bar is not None
+    progress._bar.refresh()  # the next of ten a second
+    screen = pyte.Screen(width, 6)
+    pyte.Stream(screen).feed(stream.getvalue().replace("\n", "\r\n"))
+    shown = [line.rstrip() for line in screen.display if line.strip()]
+    progress.close()
+    return shown
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("total", [0.0, 20.0])
+def test_a_long_step_is_cut_and_the_time_stays(
+    width: int, total: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    what = "12.4 s  287 tracks  164 landmarks  21 ms (read 2, tracking 11, window 7, map 1)"
+    (line,) = lines(width, what, total, monkeypatch)
+    assert line.startswith(what[: width // 3])
+    assert line.endswith("0:00:00 elapsed")
+    assert ("…" in line) == (width < 120)
+
+
+def test_a_short_step_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = lines(80, "iteration 3 of at most 20", 20.0, monkeypatch)
+    assert line.startswith("iteration 3 of at most 20 ━")
+    assert "30%" in line
+
+
+ANSWERS = ("yes", "no", "quit")
+
+
+def choose(typed: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    return ConsoleTerminal().choose("remove?", ANSWERS)
+
+
+@pytest.mark.parametrize(
+    ("typed", "answer"), [("y\n", "yes"), ("No\n", "no"), (" quit \n", "quit"), ("q", "quit")]
+)
+def test_words_and_first_letters_are_answers(
+    typed: str, answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert choose(typed, monkeypatch) == answer
+
+
+def test_the_question_is_repeated_until_there_is_an_answer(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert choose("\nmaybe\nye\nn\n", monkeypatch) == "no"
+    assert capsys.readouterr().err == "remove? [y/n/q] " * 4
+
+
+def test_the_end_of_the_input_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Cancelled, match="the input has ended"):
+        choose("maybe\n", monkeypatch)
+    with pytest.raises(UserError, match="nobody is there to answer"):
+        SilentTerminal().choose("remove?", ANSWERS)

@@ -1,4 +1,4 @@
-"""Preintegration against exact integration, finite differences, Monte Carlo and itself."""
+"""Preintegration and propagation against closed forms and on recorded samples."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import pytest
 from maplab_py.errors import MapError
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu.propagation import propagate
 from maplab_py.estimation.terms.inertial import SPEEDED_MPS, TURNED_RAD
-from maplab_py.geometry import so3
+from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics
-from tests.estimation.imu.motion import one_edge, sampled, truth
+from tests.estimation.imu.motion import GRAVITY, one_edge, sampled, truth
+from tests.support.data import shared_data
 from tests.support.imu_model import distort_imu
 from tests.support.machine import slowness
 
@@ -211,3 +213,78 @@ def test_speed_and_bits_do_not_depend_on_threads():
         results.append(edge.covariance.tobytes() + edge.dp.tobytes() + edge.q_A_B.tobytes())
     assert results[0] == results[1] == results[2]
     assert best < 0.3 * slowness()  # 25,000 samples; a tenth of it on an idle machine
+
+
+def test_last_state_is_what_the_preintegrated_edge_predicts():
+    data = one_edge(*sampled(1.0, 200))
+    b_g, b_a = np.array([0.02, -0.01, 0.03]), np.array([0.1, 0.2, -0.05])
+    T_A = se3.make(so3.exp([[0.1, -0.2, 0.7]]), [[1.0, 2.0, 3.0]])
+    v_A = np.array([[0.5, -0.4, 0.3]])
+    T, v = propagate(data, T_A, v_A, b_g, b_a, GRAVITY)
+    edge = integrate(data, b_g, b_a)
+    t = edge.duration_s[0]
+    q = so3.multiply(T_A[0, :4], edge.q_A_B[0])
+    p = T_A[0, 4:] + v_A[0] * t + GRAVITY * t**2 / 2 + so3.rotate(T_A[0, :4], edge.dp[0])
+    np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(q), T[-1, :4])), 0, atol=1e-13)
+    np.testing.assert_allclose(T[-1, 4:], p, atol=1e-11)
+    expected_v = v_A[0] + GRAVITY * t + so3.rotate(T_A[0, :4], edge.dv[0])
+    np.testing.assert_allclose(v[-1], expected_v, atol=1e-11)
+    np.testing.assert_allclose(T[0], T_A[0], atol=1e-15)
+
+
+def test_free_fall_of_several_edges_one_of_them_empty():
+    stamps = np.concatenate([np.arange(11), np.arange(5)]) * 10_000_000
+    data = InertialData(
+        np.array([0, 11, 11, 16]), stamps, np.zeros((16, 6)), (Imu("0" * 32),), np.zeros(3, int)
+    )
+    v = np.array([[1.0, 0, 0], [9, 9, 9], [0, 2.0, 0]])
+    T, velocity = propagate(data, se3.identity(3), v, np.zeros(3), np.zeros(3), GRAVITY)
+    t = stamps * 1e-9
+    start_v = np.repeat(v[[0, 2]], [11, 5], axis=0)
+    np.testing.assert_allclose(
+        T[:, 4:], start_v * t[:, None] + GRAVITY * t[:, None] ** 2 / 2, atol=1e-14
+    )
+    np.testing.assert_allclose(velocity, start_v + GRAVITY * t[:, None], atol=1e-14)
+
+
+def test_one_second_predictions_of_euroc_meet_motion_capture():
+    folder = shared_data("euroc_imu")
+    imu = np.loadtxt(folder / "V101.imu.csv", delimiter=",", dtype=np.float64)
+    imu_ns = np.loadtxt(
+        folder / "V101.imu.csv",
+        delimiter=",",
+        dtype=np.int64,
+        usecols=0,
+        converters=int,
+    )
+    truth = np.loadtxt(folder / "V101.gt.csv", delimiter=",")
+    truth_ns = np.loadtxt(
+        folder / "V101.gt.csv",
+        delimiter=",",
+        dtype=np.int64,
+        usecols=0,
+        converters=int,
+    )
+    T = se3.make(truth[:, [5, 6, 7, 4]], truth[:, 1:4])
+    every = 20  # one second at 20 Hz
+    begin = np.arange(0, len(truth) - every, every)
+    first = np.searchsorted(imu_ns, truth_ns[begin])
+    last = np.searchsorted(imu_ns, truth_ns[begin + every])
+    fits = (imu_ns[first] == truth_ns[begin]) & (imu_ns[last] == truth_ns[begin + every])
+    begin, first, last = begin[fits], first[fits], last[fits]
+    assert len(begin) > 100
+    rows = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
+    start = np.concatenate([[0], np.cumsum(last - first + 1)])
+    samples = imu[rows][:, [4, 5, 6, 1, 2, 3]]
+    data = InertialData(start, imu_ns[rows], samples, (Imu("0" * 32),), np.zeros(len(begin), int))
+    T_end, v_end = propagate(
+        data, T[begin], truth[begin, 8:11], truth[begin, 11:14], truth[begin, 14:17], GRAVITY
+    )
+    at_end = start[1:] - 1
+    q_error = so3.multiply(so3.inverse(T[begin + every, :4]), T_end[at_end, :4])
+    angle = np.rad2deg(np.linalg.norm(so3.log(q_error), axis=1))
+    position = np.linalg.norm(T_end[at_end, 4:] - T[begin + every, 4:], axis=1)
+    velocity = np.linalg.norm(v_end[at_end] - truth[begin + every, 8:11], axis=1)
+    assert np.median(angle) < 0.15  # the attitude of motion capture itself is good to about 0.1 deg
+    assert np.median(position) < 0.03
+    assert np.median(velocity) < 0.05

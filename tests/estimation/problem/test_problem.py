@@ -1,4 +1,4 @@
-"""Assembled normal equations, gradients and steps against dense algebra on numeric Jacobians."""
+"""Problems: residuals, steps uphill, trust region."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ import pytest
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.problem import Linearization, Problem
+from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
+from maplab_py.estimation.problem.trust_region import Schedule, StepJudge, TrustRegion
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION
 from maplab_py.estimation.symbolic.sources import absolute_pose, relative_pose
 from maplab_py.estimation.terms import factor as factor_terms
 from maplab_py.estimation.terms.pose import AbsolutePoseTerm, RelativePoseTerm, whitening
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.geometry import se3, so3
+from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.vimap import VIMap
 from tests.estimation.dense import system_matrix
@@ -260,3 +263,120 @@ def test_terms_of_the_same_name_all_count() -> None:
     assert twice.try_step(dense.states, doubled, 1.0).cost == pytest.approx(
         2.0 * step.cost, rel=1e-9
     )
+
+
+def region(schedule: Schedule) -> TrustRegion:
+    return TrustRegion(100.0, 1e-3, 1e4, schedule)
+
+
+def test_the_schedule_of_ceres() -> None:
+    it = region(Schedule.CERES)
+    it.accept(1.0)
+    assert it.radius == pytest.approx(300.0)  # 1 / max(1/3, 1 - 1)
+    it.accept(0.5)
+    assert it.radius == pytest.approx(300.0)  # 1 / (1 - 0)
+    it.accept(0.25)
+    assert it.radius == pytest.approx(300.0 / 1.125)
+    before = it.radius
+    for divisor in (2, 8, 64):  # 2, then 2 * 4, then 2 * 4 * 8
+        it.reject()
+        assert it.radius == pytest.approx(before / divisor)
+    it.accept(0.5)
+    it.reject()
+    assert it.radius == pytest.approx(before / 128)  # begins again with 2
+
+
+@pytest.mark.parametrize(
+    ("gain", "factor"), [(0.95, 10.0), (1.0, 100.0), (1.05, 10.0), (1.5, 10.0)]
+)
+def test_steps_as_good_as_promised_widen_most(gain: float, factor: float) -> None:
+    it = region(Schedule.STEP_QUALITY)
+    for gain, factor in ((0.5, 1.0), (0.97, 1.0 / (1.0 - 0.94**3)), (0.99, 1.0 / (1.0 - 0.98**3))):
+        before = it.radius
+        it.accept(gain)
+        assert it.radius == pytest.approx(min(factor, 3.0 if gain == 0.97 else 100.0) * before)
+    before = it.radius
+    it.reject()
+    assert it.radius == pytest.approx(before / 2.0)
+
+
+def test_a_perfect_step_widens_a_hundredfold() -> None:
+    it = region(Schedule.STEP_QUALITY)
+    it.accept(1.0)
+    assert it.radius == pytest.approx(1e4)
+
+
+@pytest.mark.parametrize("schedule", list(Schedule))
+def test_the_radius_keeps_its_limits(schedule: Schedule) -> None:
+    it = region(schedule)
+    for _ in range(20):
+        it.accept(1.0)
+    assert it.radius == 1e4
+    assert not it.is_exhausted
+    while not it.is_exhausted:
+        it.reject()
+    assert it.radius < 1e-3
+
+
+def test_descent_only() -> None:
+    judge = StepJudge(10.0)
+    assert judge.gain(9.0, 2.0) == pytest.approx(0.5)
+    assert judge.gain(11.0, 2.0) == pytest.approx(-0.5)
+    assert judge.gain(9.0, 0.0) == -1.0
+
+
+def test_uphill_steps_count_from_the_reference() -> None:
+    judge = StepJudge(10.0, max_uphill=2)
+    assert judge.accept(4.0, 6.0)  # the least so far
+    assert judge.gain(5.0, 1.0) == pytest.approx((10.0 - 5.0) / 7.0)
+    assert not judge.accept(5.0, 1.0)
+    assert judge.gain(6.0, 1.0) == pytest.approx((10.0 - 6.0) / 8.0)
+    assert not judge.accept(6.0, 1.0)  # the second: the reference comes down to the highest, 6
+    assert judge.gain(7.0, 1.0) < 0.0
+    assert judge.gain(5.0, 1.0) == pytest.approx(1.0)
+
+
+def test_a_changed_problem_begins_anew() -> None:
+    judge = StepJudge(10.0, max_uphill=3)
+    judge.accept(2.0, 8.0)
+    judge.restart(50.0)
+    assert judge.gain(60.0, 1.0) < 0.0
+    assert judge.accept(49.0, 1.0)
+
+
+def test_a_problem_known_better_shifts_all_costs() -> None:
+    known, shifted = StepJudge(10.0, max_uphill=2), StepJudge(10.0, max_uphill=2)
+    for judge in (known, shifted):
+        judge.accept(4.0, 6.0)
+        judge.accept(5.0, 1.0)
+    shifted.shift(3.0)
+    assert shifted.gain(9.0, 1.0) == pytest.approx(known.gain(6.0, 1.0))
+    assert shifted.accept(6.5, 1.0)  # less than the least was, with the difference
+
+
+def test_more_iterations_never_give_a_higher_cost() -> None:
+    start = corrupted(
+        Scene(vertices=4, landmarks=20, seen_share=0.8).make(),
+        np.random.default_rng(2),
+        position_m=0.2,
+        quaternion=0.03,
+        landmark_m=0.2,
+        velocity_mps=0.5,
+        gyro_bias=1e-3,
+        accel_bias=0.02,
+        keep=0,
+    )
+    dense = dense_problem(start)
+    costs = []
+    for iterations in range(1, 7):  # the fourth step goes uphill
+        problem = dense.problem()
+        options = SolverOptions(num_iterations=iterations, max_uphill_steps=3)
+        states, summary = optimize_states(problem, dense.states, options, SILENT)
+        costs.append(sum(summary.final_costs.values()))
+        assert sum(problem.linearize(states, 1e-9).costs.values()) == pytest.approx(
+            costs[-1], rel=1e-9
+        )
+    # inertial edges are integrated anew at the states that are returned to: the cost is known better
+    assert np.all(costs[1:] <= 1.05 * np.minimum.accumulate(costs)[:-1])
+    assert costs[3] == pytest.approx(costs[2], rel=0.05)
+    assert costs[-1] < 0.1 * costs[2]

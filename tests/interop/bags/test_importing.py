@@ -1,7 +1,9 @@
-"""import_bag_resources: images, depth maps and clouds of bags come to their frames and sensors."""
+"""Resources of bags; bags that are damaged or hold messages of unknown types."""
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,19 @@ import pytest
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.exporting import export_bag
 from maplab_py.interop.bags.importing import import_bag_resources
+from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.bags.options import BagExportOptions, BagImportOptions
+from maplab_py.interop.bags.poses import add_poses_to_bag
 from maplab_py.interop.bags.sensor_messages import CLOUD, COMPRESSED, IMAGE, MessageMaker
 from maplab_py.interop.ply import PlyCloud
-from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.bag_writing import BagFormat, BagMessage, Channel, write_bag
+from maplab_py.interop.recordings.bag_files import message_types, opened_bag
+from maplab_py.interop.recordings.bag_writing import (
+    BagFormat,
+    BagMessage,
+    Channel,
+    bag_files,
+    write_bag,
+)
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from tests.interop.bags.small_bags import (
@@ -32,6 +42,8 @@ from tests.interop.recordings.written import image_message
 from tests.interop.small_map import IMU_ID, VERTICES, make_map
 
 pytest.importorskip("rosbags")
+
+from rosbags.typesys import get_types_from_msg
 
 LEFT = BagImportOptions(resource_topic="/left/image_raw")
 ROS1 = MessageMaker(is_ros_2=False)
@@ -263,3 +275,118 @@ def test_damaged_messages_are_refused(tmp_path: Path) -> None:
     cloud = ROS1.cloud(inside, "lidar", PlyCloud(np.eye(3)))
     broken = [cloud.replace(b"x\x00\x00\x00\x00\x07", b"q\x00\x00\x00\x00\x07")]
     refused("has no x, y, z", "cloud.bag", CLOUD, stamps[:1], broken)
+
+
+pytest.importorskip("rosbags")
+
+CONTENT = "poses,tf,imu"
+POSES = BagImportOptions("/points0", sensor_id=IMU_ID)
+
+
+@pytest.fixture
+def vi_map() -> VIMap:
+    return with_time_offset(make_map())
+
+
+def tried(path: Path, vi_map: VIMap, target: Path) -> list[str]:
+    """Use a bag in every way; return what was refused."""
+    problems = []
+    for use in (
+        lambda: bag_info(path),
+        lambda: add_poses_to_bag(vi_map, path, target),
+        lambda: import_bag_resources(vi_map, 0, path, POSES),
+    ):
+        try:
+            use()
+        except (MapError, UserError) as error:
+            problems.append(str(error))
+    assert [problem for problem in problems if "\n" in problem or path.stem not in problem] == []
+    return problems
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_cut_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
+    path = named(tmp_path, kind)
+    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
+    whole = bag_files(path, kind)[0].read_bytes()
+    for number, length in enumerate(np.linspace(0, len(whole) - 1, 12).astype(int).tolist()):
+        damaged = named(tmp_path, kind, f"cut{number}")
+        if kind.is_ros_2:
+            shutil.copytree(path, damaged)
+            (damaged / path.name).with_suffix(bag_files(path, kind)[0].suffix).write_bytes(
+                whole[:length]
+            )
+        else:
+            damaged.write_bytes(whole[:length])
+        problems = tried(damaged, vi_map, named(tmp_path, kind, f"out{number}"))
+        assert len(problems) == 3, length
+        assert not named(tmp_path, kind, f"out{number}").exists()
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_changed_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
+    rng = np.random.default_rng(7)
+    path = named(tmp_path, kind)
+    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
+    whole = bag_files(path, kind)[0].read_bytes()
+    for number in range(15):
+        data = np.frombuffer(whole, dtype=np.uint8).copy()
+        data[rng.integers(0, len(data), 40)] = rng.integers(0, 256, 40)
+        bag_files(path, kind)[0].write_bytes(data.tobytes())
+        tried(path, vi_map, named(tmp_path, kind, f"out{number}"))
+
+
+def test_a_folder_without_its_file(tmp_path: Path, vi_map: VIMap) -> None:
+    export_bag(vi_map, tmp_path, 0, tmp_path / "walk", BagExportOptions(content=CONTENT))
+    (tmp_path / "walk" / "walk.mcap").unlink()
+    with pytest.raises(MapError, match="walk: the bag cannot be read"):
+        bag_info(tmp_path / "walk")
+    (tmp_path / "walk" / "metadata.yaml").write_text(
+        "- !!python/object/apply:os.system [touch x]\n"
+    )
+    with pytest.raises(MapError, match="walk: the bag cannot be read"):
+        bag_info(tmp_path / "walk")
+
+
+ODD = "odd_msgs/msg/Odd"
+
+
+def odd_bag(path: Path, kind: BagFormat) -> Path:
+    """Write a bag whose messages have a type of their own."""
+    store = message_types(is_ros_2=kind.is_ros_2)
+    store.register(get_types_from_msg("uint32 number\nstring text\n", ODD))
+    definition, md5 = store.generate_msgdef(ODD, ros_version=2 if kind.is_ros_2 else 1)
+    digest = store.hash_rihs01(ODD) if kind.is_ros_2 else md5
+    channel = Channel("/odd", ODD, definition, digest)
+    message = store.types[ODD](7, "seven")
+    serialize = store.serialize_cdr if kind.is_ros_2 else store.serialize_ros1
+    data = bytes(serialize(message, ODD))
+    write_bag(path, kind, [BagMessage(time_ns, channel, data) for time_ns in (10, 20)])
+    return path
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_unknown_types_are_listed_and_copied(tmp_path: Path, kind: BagFormat) -> None:
+    source = odd_bag(named(tmp_path, kind, "odd"), kind)
+    (topic,) = bag_info(source).topics
+    assert (topic.topic, topic.type, topic.messages) == ("/odd", ODD, 2)
+    target = named(tmp_path, kind, "out")
+    add_poses_to_bag(make_map(), source, target, missions=np.array([0]))
+    with opened_bag(target) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == "/odd"]
+        read = [reader.deserialize(data, ODD) for _, _, data in reader.messages([connection])]
+    assert [(message.number, message.text) for message in read] == [(7, "seven")] * 2
+    with pytest.raises(UserError, match=f"/odd has messages of type {ODD}"):
+        import_bag_resources(make_map(), 0, source, BagImportOptions("/odd"))
+
+
+def test_types_without_definition_are_refused_by_name(tmp_path: Path) -> None:
+    source = odd_bag(tmp_path / "odd", BagFormat.SQLITE3)
+    with sqlite3.connect(source / "odd.db3") as database:
+        database.execute("UPDATE message_definitions SET encoding = 'unknown'")
+        database.execute("DELETE FROM message_definitions")
+        database.execute("UPDATE topics SET type_description_hash = ''")
+    with pytest.raises(MapError, match=f"odd.*{ODD}") as error:
+        add_poses_to_bag(make_map(), source, tmp_path / "out")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()

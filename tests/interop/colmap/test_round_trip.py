@@ -1,4 +1,4 @@
-"""Map -> COLMAP model -> map, and the model as pycolmap sees it."""
+"""Map -> COLMAP model -> map, the model as pycolmap sees it, cameras, times of images."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.evaluation.map_comparison import compare_maps
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3, so3
+from maplab_py.interop.calibration_import import import_calibration
 from maplab_py.interop.colmap.binary import compile_kernels
 from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
-from maplab_py.interop.colmap.importing import import_colmap
+from maplab_py.interop.colmap.importing import image_times, import_colmap, read_times
 from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
 from maplab_py.interop.trajectories import Trajectory, write_tum
@@ -30,6 +31,7 @@ from maplab_py.vimap.scale_marks import is_metric
 from tests.interop.small_map import make_map
 from tests.support.data import shared_data
 from tests.support.scene import Scene
+from tests.vimap.test_edits import two_types
 
 PINHOLES = tuple((Projection.PINHOLE, distortion) for distortion in Distortion)
 SHARED = (*PINHOLES, (Projection.EXTENDED_UNIFIED, Distortion.NONE))
@@ -227,3 +229,149 @@ def test_maps_without_images_have_nothing_to_export(tmp_path: Path) -> None:
         export_colmap(VIMap(), tmp_path)
     with pytest.raises((MapError, UserError), match="has no COLMAP model"):
         import_colmap(tmp_path)
+
+
+OPENCV = "1 OPENCV 752 480 458.6 457.2 367.7 248.8 -0.28 0.07 0.0002 0.00002"
+
+
+def cameras_txt(folder: Path, *lines: str) -> Path:
+    path = folder / "cameras.txt"
+    path.write_text("# Camera list with one line of data per camera:\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def test_a_file_of_one_camera(tmp_path: Path) -> None:
+    calibration = import_calibration(cameras_txt(tmp_path, OPENCV))
+    assert calibration.format == "COLMAP"
+    assert not calibration.imu_id
+    rig = calibration.sensors.camera_rig(calibration.rig_id)
+    (camera,) = rig.cameras
+    assert camera.distortion is Distortion.RADTAN
+    # the centre of the first pixel is at 0.5 in COLMAP
+    np.testing.assert_allclose(camera.intrinsics, [458.6, 457.2, 367.2, 248.3])
+    np.testing.assert_allclose(camera.distortion_parameters, [-0.28, 0.07, 0.0002, 0.00002])
+    np.testing.assert_array_equal(rig.T_B_C, [se3.identity()])
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_the_rig_of_a_model(rig_map, tmp_path: Path, form: str) -> None:  # type: ignore[no-untyped-def]
+    one = rig_map
+    options = ColmapExportOptions(colmap_format=form)
+    export_colmap(one, tmp_path / "model", options)
+    calibration = import_calibration(tmp_path / "model")
+    rig = calibration.sensors.camera_rig(calibration.rig_id)
+    (original,) = (sensor for sensor in one.sensors.sensors.values() if hasattr(sensor, "cameras"))
+    assert len(rig.cameras) == len(original.cameras)
+    for camera, other in zip(rig.cameras, original.cameras, strict=True):
+        assert camera.distortion is other.distortion
+        np.testing.assert_allclose(camera.intrinsics, other.intrinsics, atol=1e-9)
+    expected = se3.compose(se3.inverse(original.T_B_C[0]), original.T_B_C)
+    np.testing.assert_allclose(np.abs(rig.T_B_C), np.abs(expected), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ((), "has 0 cameras"),
+        ((OPENCV, OPENCV.replace("1 ", "2 ", 1)), "has 2 cameras, and does not say how they are"),
+        (("1 OPENCV 752",), r"cameras\.txt:2: wants id, camera model, width"),
+        (("1 NEWEST 752 480 1 2 3",), r"cameras\.txt:2: wants id, camera model"),
+        (("1 PINHOLE 752 480 1 2 3",), "PINHOLE has 4 parameters that are numbers, not 3"),
+        (("1 PINHOLE 752 480 1 2 3 nan",), "PINHOLE has 4 parameters that are numbers"),
+        (("1 PINHOLE 752 x 1 2 3 4",), "invalid literal"),
+        (("1 PINHOLE 0 480 1 2 3 4",), "the images have no pixels"),
+        (("1 DIVISION 752 480 1 2 3 4 5",), "maplab has no camera model DIVISION"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:
+    with pytest.raises((MapError, UserError), match=message):
+        import_calibration(cameras_txt(tmp_path, *lines))
+
+
+def test_a_cut_binary_file_is_refused(rig_map, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    export_colmap(rig_map, tmp_path / "model", ColmapExportOptions())
+    path = tmp_path / "model" / "cameras.bin"
+    data = path.read_bytes()
+    for size in range(0, len(data), 29):
+        path.write_bytes(data[:size])
+        with pytest.raises(MapError, match=r"cameras\.bin: is damaged"):
+            import_calibration(path)
+
+
+@pytest.mark.parametrize(("name", "number"), [("SIFT", 3), ("Binary", 0)])
+def test_a_database_of_one_type(tmp_path: Path, name: str, number: int) -> None:
+    vi_map = two_types()
+    options = ColmapExportOptions(quality="all", colmap_database=True, colmap_feature_type=name)
+    export_colmap(vi_map, tmp_path, options)
+    again, _ = import_colmap(tmp_path, database=tmp_path / "database.db")
+    of_type = vi_map.feature_type == number
+    assert len(again.keypoints) == np.count_nonzero(of_type)
+    size = 128 if number else 48
+    np.testing.assert_array_equal(
+        again.keypoints.descriptor[:, :size], vi_map.keypoints.descriptor[of_type, :size]
+    )
+    assert set(again.feature_type.tolist()) == {number}
+
+
+def test_types_that_are_not_there(tmp_path: Path) -> None:
+    vi_map = two_types()
+    with pytest.raises(UserError, match="no such keypoints; its types: Binary, SIFT"):
+        export_colmap(vi_map, tmp_path, ColmapExportOptions(colmap_feature_type="R2D2"))
+    with pytest.raises(FlagError, match="--colmap_feature_type: surf is no feature type"):
+        export_colmap(vi_map, tmp_path, ColmapExportOptions(colmap_feature_type="surf"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("names", "times_ns"),
+    [
+        (("cam0/1403715273262142976.jpg",), [1403715273262142976]),
+        (
+            ("left_1403715273262143.png", "left_1403715273312143.png"),
+            [1403715273262143000, 1403715273312143000],
+        ),
+        (("1403715273312.png", "1403715273262.png"), [1403715273312000000, 1403715273262000000]),
+        (("a/1403715273.262142976.png",), [1403715273262142976]),
+        (("frame_12.5.png", "frame_12.75.png"), [12_500_000_000, 12_750_000_000]),
+        (("600000000000.png", "600050000000.png"), [600_000_000_000, 600_050_000_000]),
+    ],
+)
+def test_stamps_in_names(names: tuple[str, ...], times_ns: list[int]) -> None:
+    assert image_times(names, "name", None, interval_s=1.0).tolist() == times_ns
+
+
+def test_the_unit_of_one_number_is_not_guessed() -> None:
+    names = ("left_1403715273262143.png",)
+    with pytest.raises(MapError, match="--time_unit"):
+        image_times(names, "name", None, interval_s=1.0)
+    assert image_times(names, "name", None, interval_s=1.0, time_unit="us").tolist() == [
+        1403715273262143000
+    ]
+
+
+def test_cameras_of_a_rig_that_are_microseconds_apart() -> None:
+    names = tuple(
+        f"cam{c}/{600_000_000_000 + 50_000_000 * k + 900 * c}.png" for k in range(4) for c in (0, 1)
+    )
+    times_ns = image_times(names, "name", None, interval_s=1.0)
+    assert times_ns[:3].tolist() == [600_000_000_000, 600_000_000_900, 600_050_000_000]
+
+
+def test_a_file_of_stamps(tmp_path: Path) -> None:
+    file = tmp_path / "times.txt"
+    file.write_text("# name, time [ms]\nImage 1.png, 1000.5\nb.png 1033.5\n")
+    assert read_times(file) == {"Image 1.png": 1_000_500_000, "b.png": 1_033_500_000}
+    file.write_text("a.png later\n")
+    with pytest.raises(MapError, match=":1: wants an image name and a time stamp"):
+        read_times(file)
+
+
+@pytest.mark.parametrize("name", ["image.png", "cam0/000123.png", "1" * 25 + ".png"])
+def test_names_without_stamp_are_refused(name: str) -> None:
+    with pytest.raises(UserError, match="has no time stamp"):
+        image_times((name,), "name", None, interval_s=1.0)
+
+
+def test_frames_share_the_time_of_their_order() -> None:
+    names = ("left/2.png", "right/1.png", "left/1.png")
+    assert image_times(names, "order", None, interval_s=2.0).tolist() == [4e9, 2e9, 2e9]

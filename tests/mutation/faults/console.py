@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.mutation.fault import Fault
 
-_SETTINGS = ("tests/console/session/test_settings.py",)
+_SETTINGS = ("tests/console/session/test_session.py",)
 _JOBS = (
     "tests/console/session/test_maps.py",
     "tests/console/session/test_jobs.py",
@@ -18,14 +18,14 @@ _MAPS = (
     "tests/console/session/test_session.py",
 )
 _LINES = (
-    "tests/console/commands/test_lines.py",
+    "tests/console/commands/test_registry.py",
     "tests/console/scripts/test_typed_lines.py",
 )
 _FLAGS = (
     "tests/console/commands/test_flags.py",
-    "tests/console/session/test_settings.py",
+    "tests/console/session/test_session.py",
 )
-_BATCH = ("tests/console/scripts/test_batch.py",)
+_BATCH = ("tests/console/scripts/test_runner.py",)
 
 CONSOLE = (
     Fault(

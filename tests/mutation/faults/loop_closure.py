@@ -6,12 +6,12 @@ from tests.mutation.fault import Fault
 
 _GATES = ("tests/algorithms/loop_closure/test_gates.py",)
 _PAIRS = ("tests/algorithms/loop_closure/test_mission_pairs.py",)
-_ALIKE = ("tests/algorithms/loop_closure/test_ambiguity.py",)
+_ALIKE = ("tests/algorithms/loop_closure/test_gates.py",)
 _EDGES = (
-    "tests/algorithms/loop_closure/test_edges.py",
+    "tests/algorithms/loop_closure/test_gates.py",
     "tests/algorithms/loop_closure/test_closing.py",
 )
-_RECORD = ("tests/algorithms/loop_closure/test_record.py",)
+_RECORD = ("tests/algorithms/loop_closure/test_explanation.py",)
 _ANCHORING = ("tests/algorithms/anchoring/test_anchoring.py",)
 
 LOOP_CLOSURE = (

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from tests.mutation.fault import Fault
 
-_SINGLE = ("tests/algorithms/self_calibration/uncertainty/test_single_segments.py",)
-_SEGMENTS = ("tests/algorithms/self_calibration/segments/test_segments.py",)
-_OUTLIERS = ("tests/algorithms/self_calibration/estimation/test_outliers.py",)
-_SCALE = ("tests/algorithms/self_calibration/estimation/test_scale.py",)
-_CHECKS = ("tests/algorithms/self_calibration/test_checks.py",)
+_SINGLE = ("tests/algorithms/self_calibration/test_uncertainty.py",)
+_SEGMENTS = ("tests/algorithms/self_calibration/test_segments.py",)
+_OUTLIERS = ("tests/algorithms/self_calibration/test_estimation.py",)
+_SCALE = ("tests/algorithms/self_calibration/test_estimation.py",)
+_CHECKS = ("tests/algorithms/self_calibration/test_calibration.py",)
 
 SELF_CALIBRATION = (
     Fault(
