@@ -21,7 +21,7 @@ EUROC = (
     "evaluate_trajectory --ground_truth={truth}"
 )
 MH_01 = (
-    "rovioli {mh_01}; optvi; "
+    "rovioli {mh_01} --vio_rosbag_end_s=5; optvi; "
     "evaluate_trajectory --ground_truth={mh_01}/mav0/state_groundtruth_estimate0/data.csv"
 )
 TANGO = "load {tango}; elq; kfh; optvi; relax; lc; optvi"

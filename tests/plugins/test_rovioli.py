@@ -14,12 +14,18 @@ from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, Us
 from maplab_py.frontend import finishing
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.reports import MappingReport
+from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.storage.native import SaveReport, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
-from tests.frontend.simulated import REST_FIRST, replayed
+from tests.frontend.simulated import replayed
 from tests.interop.recordings.written import make_content, write_folder
 from tests.support.data import shared_data
+
+REST_FIRST = (
+    MotionOptions(kind="stationary", duration_s=2.0),
+    MotionOptions(kind="room_scan", duration_s=4.0, turns=0.15),
+)
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,7 @@ class Servers:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.scratch = folder / "scratch"
-        self.spool = Spool(folder / "spool", quiet_s=0.3)
+        self.spool = Spool(folder / "spool", quiet_s=0.1)
         self.map_folder = folder / "city"
         self.options = MapServerOptions(
             merged_map_folder=str(self.map_folder),
@@ -103,7 +103,7 @@ class Servers:
             enable_visual_loop_closure_based_map_anchoring=False,
             backup_interval_s=0,
         )
-        self.service = ServiceOptions(stop_when_idle_s=0.5)
+        self.service = ServiceOptions(stop_when_idle_s=0.2)
         self.incremental = IncrementalOptions(full_optimization_every_nth=0)
         self._monkeypatch = monkeypatch
         self.work(copying)

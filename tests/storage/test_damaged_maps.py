@@ -135,23 +135,22 @@ _IN_THE_PROGRAM = [
 ]
 
 
-@pytest.mark.parametrize("name", _IN_THE_PROGRAM)
-def test_the_program_says_it_and_keeps_its_maps(
-    whole_map: Path, folder: Path, tmp_path: Path, name: str
-) -> None:
-    DAMAGES[name].apply(folder)
-    bound = f"--proto_max_size_megabytes={BOUND_MEGABYTES}"
-    (tmp_path / "script").write_text(
-        f"load --map_folder={whole_map} --map_key=earlier\n"
-        f"load --map_folder={folder} {bound}\nlist\n"
-    )
+def test_the_program_says_it_and_keeps_its_maps(whole_map: Path, tmp_path: Path) -> None:
+    lines = [f"load --map_folder={whole_map} --map_key=earlier"]
+    for number, name in enumerate(_IN_THE_PROGRAM):
+        folder = tmp_path / f"damaged_{number}"
+        shutil.copytree(whole_map, folder)
+        DAMAGES[name].apply(folder)
+        lines.append(f"load {folder} --proto_max_size_megabytes={BOUND_MEGABYTES}")
+    (tmp_path / "script").write_text("\n".join([*lines, "list"]))
     done = run_program(tmp_path, "run", "script", "--keep_going")
     assert done.returncode == Status.USER_ERROR
     assert "Traceback" not in done.stderr + done.stdout
-    (line,) = [one for one in done.stderr.splitlines() if one.startswith("error: load: ")]
-    assert str(folder) in line
-    assert all(part in line for part in DAMAGES[name].said)
-    (listed,) = [one for one in done.stdout.splitlines() if " saved " in one]
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: load: ")]
+    for number, (name, error) in enumerate(zip(_IN_THE_PROGRAM, errors, strict=True)):
+        assert str(tmp_path / f"damaged_{number}") in error
+        assert all(part in error for part in DAMAGES[name].said)
+    (listed,) = [line for line in done.stdout.splitlines() if " saved " in line]
     assert listed.startswith("earlier")
 
 

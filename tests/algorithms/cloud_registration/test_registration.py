@@ -308,7 +308,7 @@ def test_maps_without_clouds_or_pairs() -> None:
 def test_no_wrong_edges_over_twenty_seeds(world: WorldOptions, motion: SessionOptions) -> None:
     edges = 0
     for seed in range(20):
-        data = simulate(session(world, motion, rate_hz=0.5, seed=seed))
+        data = simulate(session(world, motion, rate_hz=0.35, seed=seed))
         vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
         off_m, off_deg = edge_errors(vi_map, data.truth)
         assert off_m.max(initial=0.0) < 0.1

@@ -101,7 +101,7 @@ class Collection:
         self._merged: MapsState | None = None
 
     def screens(self, name: str) -> str:
-        """Return the golden text of a command: its example at every width."""
+        """Return the golden text of a command: its example, once for widths at which it is the same."""
         here = self._copies / name
         shutil.copytree(self._original, here, copy_function=os.link)
         try:
@@ -109,7 +109,10 @@ class Collection:
                 line, shown = self._shown(name)
         finally:
             shutil.rmtree(here)
-        parts = [f"== {width} columns: {line}\n\n{text_of(shown, width)}\n" for width in WIDTHS]
+        widths: dict[str, list[str]] = {}
+        for width in WIDTHS:
+            widths.setdefault(text_of(shown, width), []).append(str(width))
+        parts = [f"== {', '.join(at)} columns: {line}\n\n{text}\n" for text, at in widths.items()]
         return "\n".join(parts)
 
     def _shown(self, name: str) -> tuple[str, list[object]]:
