@@ -22,7 +22,15 @@ from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.vimap import MissionSensor
 from maplab_py.vimap.ids import to_hex
-from tests.registry.workspace import MERGED, SLOW, WITH_ROBOT, digest, lines_before, make_workspace
+from tests.registry.workspace import (
+    MERGED,
+    OTHER_EXAMPLES,
+    SLOW,
+    WITH_ROBOT,
+    digest,
+    lines_before,
+    make_workspace,
+)
 from tests.support.data import REPOSITORY
 
 Capture = pytest.CaptureFixture[str]
@@ -101,7 +109,7 @@ def prepare(runner: Runner, name: str, capsys: Capture) -> str:
     """Type what must precede the command's example; return the example."""
     assert runner.run_text(lines_before(name)) == Status.OK, capsys.readouterr().err
     capsys.readouterr()
-    example = REGISTRY.find(name).example
+    example = OTHER_EXAMPLES.get(name, REGISTRY.find(name).example)
     if name == "tour":  # somebody has to type
         runner.terminal.is_prompt = True
     if name == "remove_mission_interactive":  # somebody has to answer

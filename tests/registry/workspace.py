@@ -149,6 +149,17 @@ PREPARED["get_dense_map_in_range"] = (
     f"{_SERVING} &; serve_status --spool=spool --wait_s=100"
 )
 
+OTHER_EXAMPLES = {
+    "simulate_robots": "simulate_robots --spool=spool --scenario=walk.yaml --robots_rate=0"
+}
+"""Lines that take the place of examples which take long."""
+_WALK = """
+name: walk
+world: {landmarks_per_room: 600}
+measurement: {frame_rate_hz: 3.0, max_keypoints: 100}
+sessions: [{duration_s: 9.0, turns: 0.6}]
+"""
+
 _SHOWING = ("images", "depth_maps", "disparity_maps", "pointclouds")
 
 
@@ -173,7 +184,6 @@ SLOW = (
     "relax_missions_independently",
     "serve",
     "simulate",
-    "simulate_robots",
     "warmup",
 )
 """Commands whose examples take more than a second or two."""
@@ -199,6 +209,7 @@ def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         save_map(vi_map, folder / place)
     save_with_resources(first, folder / "with_resources" / "office")
+    (folder / "walk.yaml").write_text(_WALK)
     _write_closures(first, second, folder / "closures.yaml")
     _write_fixes(first, folder / "track.csv")
     _write_wheels(first, folder / "wheels.csv")

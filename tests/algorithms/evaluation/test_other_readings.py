@@ -17,7 +17,7 @@ from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_traje
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.trajectories import Trajectory
-from tests.algorithms.evaluation.test_evaluation import make_map, make_truth, moved
+from tests.algorithms.evaluation.test_evaluation import make_truth, moved, walked_map
 
 OPTIONS = TrajectoryEvaluationOptions()
 ROWS = np.arange(0, 4000, 40)
@@ -40,7 +40,7 @@ def test_wrong_orders_are_named_with_figures(misread: object, name: str) -> None
     truth = make_truth()
     wrong = se3.make(misread(truth.T_R_B[:, :4]), truth.T_R_B[:, 4:])  # type: ignore[operator]
     report = evaluate_trajectory(
-        make_map(truth, ROWS), Trajectory(truth.times_ns, wrong, source="t"), OPTIONS
+        walked_map(truth, ROWS), Trajectory(truth.times_ns, wrong, source="t"), OPTIONS
     )
     assert len(report.notes) == 1
     assert name in report.notes[0]
@@ -50,7 +50,7 @@ def test_wrong_orders_are_named_with_figures(misread: object, name: str) -> None
 
 def test_right_orders_and_mounted_bodies_get_no_hint() -> None:
     truth = make_truth()
-    vi_map = moved(make_map(truth, ROWS), np.random.default_rng(1).normal(size=(100, 3)) * 0.02)
+    vi_map = moved(walked_map(truth, ROWS), np.random.default_rng(1).normal(size=(100, 3)) * 0.02)
     turn = se3.make(so3.exp([0.4, -1.2, 2.0]), np.zeros(3))
     for T in (truth.T_R_B, se3.compose(truth.T_R_B, turn)):
         report = evaluate_trajectory(vi_map, Trajectory(truth.times_ns, T, source="truth"), OPTIONS)
@@ -83,12 +83,12 @@ def test_a_shifted_clock_is_named(offset_s: float, has_orientation: bool) -> Non
         times_ns=truth.times_ns + round(offset_s * 1e9),
         has_orientation=has_orientation,
     )
-    report = evaluate_trajectory(make_map(truth, ROWS), late, OPTIONS)
+    report = evaluate_trajectory(walked_map(truth, ROWS), late, OPTIONS)
     assert len(report.notes) == 1
     said = float(report.notes[0].split("--time_offset_s=")[1].split()[0])
     assert said == pytest.approx(-offset_s, abs=2e-3)
     right = dataclasses.replace(OPTIONS, time_offset_s=said)
-    after = evaluate_trajectory(make_map(truth, ROWS), late, right)
+    after = evaluate_trajectory(walked_map(truth, ROWS), late, right)
     assert after.notes == ()
     assert after.ape_m.rmse < 0.01
 
@@ -97,7 +97,7 @@ def test_a_clock_from_zero_is_named_in_the_refusal() -> None:
     truth = make_truth()
     boot = dataclasses.replace(truth, times_ns=truth.times_ns - truth.times_ns[0])
     with pytest.raises(EstimationError, match=r"--time_offset_s=1403715273\.26\d\d would"):
-        evaluate_trajectory(make_map(truth, ROWS), boot, OPTIONS)
+        evaluate_trajectory(walked_map(truth, ROWS), boot, OPTIONS)
 
 
 def test_another_path_gets_no_clock() -> None:
@@ -107,7 +107,7 @@ def test_another_path_gets_no_clock() -> None:
     q = so3.exp(np.cumsum(rng.normal(size=(4000, 3)), axis=0) * 0.01)
     other = Trajectory(truth.times_ns - 10**15, se3.make(q, p), source="other")
     with pytest.raises(EstimationError) as caught:
-        evaluate_trajectory(make_map(truth, ROWS), other, OPTIONS)
+        evaluate_trajectory(walked_map(truth, ROWS), other, OPTIONS)
     assert "time_offset_s" not in str(caught.value)
 
 
@@ -115,7 +115,7 @@ def test_positions_alone_have_errors_of_position() -> None:
     truth = make_truth()
     T = se3.make(np.tile(so3.identity(), (len(truth), 1)), truth.T_R_B[:, 4:])
     positions = Trajectory(truth.times_ns, T, source="truth", has_orientation=False)
-    report = evaluate_trajectory(make_map(truth, ROWS), positions, OPTIONS)
+    report = evaluate_trajectory(walked_map(truth, ROWS), positions, OPTIONS)
     assert report.ape_m.rmse < 1e-9
     assert (report.ape_deg, report.rpe_deg, report.body_rotation_deg) == (None, None, None)
     assert "positions only" in report.display().summary

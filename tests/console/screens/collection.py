@@ -18,7 +18,15 @@ from maplab_py.vimap import MissionSensor
 from maplab_py.vimap.ids import to_hex
 from tests.console.screens.recording import WIDTHS, Screen, changed, screen_of, text_of
 from tests.console.screens.stable import Stable
-from tests.registry.workspace import MERGED, SERVED, SLOW, WITH_ROBOT, lines_before, make_workspace
+from tests.registry.workspace import (
+    MERGED,
+    OTHER_EXAMPLES,
+    SERVED,
+    SLOW,
+    WITH_ROBOT,
+    lines_before,
+    make_workspace,
+)
 
 GOLDEN = Path(__file__).with_name("golden")
 NOT_RECORDED = {
@@ -122,7 +130,7 @@ class Collection:
         try:
             before, line = FURTHER.get(name) or (
                 lines_before(name),
-                self._registry.find(name).example,
+                OTHER_EXAMPLES.get(name, self._registry.find(name).example),
             )
             self._prepare(runner, name, before)
             shown = screen_of(runner, screen, self._completed(session, name, line))
