@@ -132,13 +132,15 @@ def _numbers(kind: type, prefix: str = "") -> list[str]:
     return keys
 
 
-@pytest.mark.parametrize("key", _numbers(Scenario))
 @pytest.mark.parametrize("value", ["some", "null", "true", "[]", "{}", ".nan", ".inf", "1.0e+300"])
-def test_no_number_takes_what_is_none(key: str, value: str) -> None:
-    group, name = key.split(".")
-    with pytest.raises(UserError, match=rf"^here\.yaml: {group}\.{name}: ") as caught:
-        parse_scenario(f"{group}: {{{name}: {value}}}", "here.yaml")
-    assert "\n" not in str(caught.value)
+def test_no_number_takes_what_is_none(value: str) -> None:
+    keys = _numbers(Scenario)
+    assert len(keys) > 50
+    for key in keys:
+        group, name = key.split(".")
+        with pytest.raises(UserError, match=rf"^here\.yaml: {group}\.{name}: ") as caught:
+            parse_scenario(f"{group}: {{{name}: {value}}}", "here.yaml")
+        assert "\n" not in str(caught.value)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_ids_and_their_beginnings_are_understood(digits: int) -> None:
     vertex = find_by_id(DRAWING, to_hex(WALK.vertices.id[3])[:digits])
     assert (vertex.entity, vertex.row) == (Entity.VERTEX, 3)
     np.testing.assert_allclose(vertex.p, WALK.T_G_I[3, 4:])
-    landmark = find_by_id(DRAWING, f"  {to_hex(MAP.landmarks.id[7])[:digits].upper()} ")
+    landmark = find_by_id(DRAWING, f"  {to_hex(WALK.landmarks.id[7])[:digits].upper()} ")
     assert (landmark.entity, landmark.row) == (Entity.LANDMARK, 7)
     np.testing.assert_allclose(landmark.p, WALK.p_G[7])
     closure = find_by_id(DRAWING, to_hex(WALK.loop_closure_edges.id[1])[:digits])

@@ -55,7 +55,7 @@ def of_one_colour(picture: Any) -> int:
 
 @pytest.mark.parametrize(
     ("rule", "legend"),
-    [("shaded", ""), ("colour", ""), ("height", "height"), ("distance", "distance")],
+    [("shaded", ""), ("colour", ""), ("distance", "distance")],
 )
 def test_a_mesh_by_every_rule(page: Page, viewer: Viewer, rule: MeshColouring, legend: str) -> None:
     viewer.show(SUBJECT)
