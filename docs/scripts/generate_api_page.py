@@ -18,9 +18,9 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.table import Table
 
 PAGE = Path(__file__).resolve().parents[1] / "python_api.md"
-_HEAD = """<!-- made by docs/scripts/generate_api_page.py; do not edit -->
+_HEAD = """# Python API
 
-# Python API
+<!-- made by docs/scripts/generate_api_page.py; do not edit -->
 
 ```python
 import maplab_py

@@ -22,12 +22,13 @@ DECISIONS = FOLDER.with_name("decisions")
 STUDIES = FOLDER.with_name("studies")
 SHARED = "flags.md"
 _FEW = 3  # commands from which a flag with the same help is told once
-_SHARED_HEAD = """# Flags of several commands
+_NOTE = "<!-- made by docs/scripts/generate_command_pages.py; do not edit -->\n"
+_SHARED_HEAD = f"""# Flags of several commands
 
+{_NOTE}
 Commands link to these entries; a command with another default says so. Flags that every command has are in
 [console](../console.md#flags).
 """
-_NOTE = "<!-- made by docs/scripts/generate_command_pages.py; do not edit -->\n"
 
 
 def pages(registry: Registry) -> dict[str, str]:
@@ -36,7 +37,7 @@ def pages(registry: Registry) -> dict[str, str]:
     shared = SharedFlags(plugins)
     texts = {
         "index.md": _index(plugins),
-        SHARED: f"{_NOTE}\n{_SHARED_HEAD}\n{shared.sections(SHARED)}",
+        SHARED: f"{_SHARED_HEAD}\n{shared.sections(SHARED)}",
     }
     for plugin in plugins:
         texts[f"{plugin.name}.md"] = _page(plugin, shared)
@@ -45,7 +46,7 @@ def pages(registry: Registry) -> dict[str, str]:
 
 def decisions() -> str:
     """Return the list of decision records."""
-    lines = [_NOTE, "# Decisions\n"]
+    lines = ["# Decisions\n", _NOTE]
     lines += ["Choices that would be costly to reverse, why, and what was rejected.\n"]
     for path in sorted(DECISIONS.glob("0*.md")):
         title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
@@ -55,7 +56,7 @@ def decisions() -> str:
 
 def studies() -> str:
     """Return the list of studies, each with the question that it answers."""
-    lines = [_NOTE, "# Studies\n"]
+    lines = ["# Studies\n", _NOTE]
     lines += ["Experiments behind the decisions: question, answer, limits, figures.\n"]
     for path in sorted(STUDIES.glob("*.md")):
         if path.name == "index.md":
@@ -72,7 +73,7 @@ def _is_built_in(plugin: Plugin) -> bool:
 
 
 def _index(plugins: list[Plugin]) -> str:
-    lines = [_NOTE, "# Commands\n"]
+    lines = ["# Commands\n", _NOTE]
     lines += [
         f"[Flags of several commands]({SHARED}) are told once. In the console `help WORDS` searches.\n"
     ]
@@ -87,7 +88,7 @@ def _index(plugins: list[Plugin]) -> str:
 
 
 def _page(plugin: Plugin, shared: SharedFlags) -> str:
-    parts = [f"{_NOTE}\n# {plugin.name}\n"]
+    parts = [f"# {plugin.name}\n\n{_NOTE}"]
     commands = sorted(plugin.commands, key=lambda c: c.name)
     parts += [_section(command, f"{plugin.name}.md", shared) for command in commands]
     if text := shared.sections(f"{plugin.name}.md"):
@@ -98,7 +99,7 @@ def _page(plugin: Plugin, shared: SharedFlags) -> str:
 def _section(command: Command, page: str, shared: SharedFlags) -> str:
     lines = [f"## {command.name}\n", command.summary + "\n"]
     if command.description:
-        lines.append(command.description + "\n")
+        lines.append(_marked(command.description) + "\n")
     facts = []
     if command.aliases:
         facts.append("Aliases: " + ", ".join(f"`{alias}`" for alias in command.aliases) + ".")
@@ -237,13 +238,22 @@ class SharedFlags:
 
 def flag_entry(flag: Flag, anchor: str) -> str:
     """Return the entry of a flag in a definition list."""
-    facts = "" if flag.type.is_bool else flag.type.text.replace("|", " \\| ").strip(" \\|")
+    *choices, last = filter(None, flag.type.text.split("|"))
+    facts = f"{', '.join(choices)} or {last}" if choices else last
+    facts = "" if flag.type.is_bool else facts
     if flag.is_required:
         facts += ", required"
     elif flag.default_text:
         facts += f" `{flag.default_text}` {flag.unit}"
     term = f"[`--{flag.name}`](#{anchor}){{#{anchor}}}"  # a click shows the address of the entry
-    return f"{term} {facts.strip()}".rstrip() + f"\n: {flag.help}\n"
+    return f"{term} {facts.strip()}".rstrip() + f"\n: {_marked(flag.help)}\n"
+
+
+def _marked(text: str) -> str:
+    """Return a text whose flags are marked as code."""
+    parts = text.split("`")  # every other part is code already
+    parts[::2] = [re.sub(r"(?<![\w-])--\w+(=[\w./:]*\w)?", r"`\g<0>`", part) for part in parts[::2]]
+    return "`".join(parts)
 
 
 def _shared_groups(commands: Iterable[Command]) -> dict[type, dict[str, Flag]]:

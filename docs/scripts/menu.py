@@ -23,6 +23,8 @@ def on_config(config: Any) -> Any:
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """Turn links to files of the repository outside docs, which the site does not have, into code.
 
+    The search ranks decisions and studies below the users' pages.
+
     Args:
         markdown: Text of a page.
         page: The page.
@@ -30,6 +32,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     Returns:
         The text; links to files that do not exist stay, and fail the build.
     """
+    if page.file.src_uri.startswith(("decisions/", "studies/")):
+        page.meta.setdefault("search", {"boost": 0.3})
     source = Path(page.file.abs_src_path)
     docs = Path(__file__).resolve().parents[1]
 

@@ -42,30 +42,35 @@ def test_command_pages_are_those_of_the_registry() -> None:
     assert stale == [], "run docs/scripts/generate_command_pages.py"
 
 
-def test_every_flag_of_a_command_has_an_entry_that_can_be_linked() -> None:
+def _flag_sections() -> dict[str, tuple[set[str], set[str]]]:
+    """Return the flags that each section and each entry tells, and its links, by page#anchor."""
     entry = re.compile(r"^\[`--(\w+)`\]\(#([\w-]+)\)\{#\2\}.*\n: ", re.MULTILINE)
-    headings = re.compile(r"^##+ (.*)$", re.MULTILINE)
-    sections: dict[str, set[str]] = {}  # flags by page and anchor of the heading
+    sections: dict[str, tuple[set[str], set[str]]] = {}
     for path in (DOCS / "commands").glob("*.md"):
         text = path.read_text()
-        anchors = [anchor for _, anchor in entry.findall(text)]
-        assert len(anchors) == len(set(anchors)), path.name
-        sections |= {f"{path.name}#{anchor}": {name} for name, anchor in entry.findall(text)}
-        for title, body in zip(headings.findall(text), headings.split(text)[2::2], strict=True):
-            slug = re.sub(r"[^\w\s-]", "", title).strip().lower().replace(" ", "-")
-            sections[f"{path.name}#{slug}"] = {name for name, _ in entry.findall(body)}
-            links = re.findall(r"\]\(([\w.]*#[\w-]+)\)(?!\{)", body)
-            sections[f"{path.name}#{slug}>"] = {
-                link if link[0] != "#" else path.name + link for link in links
-            }
+        anchors = {anchor: name for name, anchor in entry.findall(text)}
+        assert len(anchors) == len(entry.findall(text)), f"{path.name} has an anchor twice"
+        sections |= {f"{path.name}#{anchor}": ({name}, set()) for anchor, name in anchors.items()}
+        parts = re.split(r"^##+ (.*)$", text, flags=re.MULTILINE)
+        for title, body in zip(parts[1::2], parts[2::2], strict=True):
+            links = re.findall(r"\]\(([\w.]*)#([\w-]+)\)(?!\{)", body)
+            sections[f"{path.name}#{title.lower().replace(' ', '-')}"] = (
+                {name for name, _ in entry.findall(body)},
+                {f"{page or path.name}#{anchor}" for page, anchor in links},
+            )
+    return sections
+
+
+def test_every_flag_of_a_command_has_an_entry_that_can_be_linked() -> None:
+    sections = _flag_sections()
     registry = load_registry()
     for command in registry.commands:
-        start = f"{registry.owner(command)}.md#{command.name}"
-        told, pending = set(sections[start]), list(sections[start + ">"])
+        told: set[str] = set()
+        pending = [f"{registry.owner(command)}.md#{command.name}"]
         while pending:
-            link = pending.pop()
-            told |= sections[link]
-            pending += sections.get(link + ">", ())
+            flags, links = sections.get(pending.pop(), (set(), set()))
+            told |= flags
+            pending += links
         assert set(command.flags) <= told, command.name
 
 
