@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.external_poses.alignment import robust_yaw_position
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
@@ -45,7 +44,7 @@ def truth(vi_map: VIMap, mission: int = 0, T_I_S: Any = None) -> Trajectory:
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("small", flat_map())
     return session
 
@@ -113,7 +112,7 @@ def test_odometry_edges_are_the_motion(session: Session, tmp_path: Path) -> None
 def test_a_mission_of_its_own(tmp_path: Path) -> None:
     path, poses = tmp_path / "walk.txt", truth(flat_map())
     write_tum(poses, path)
-    with Session(load_registry()) as session:
+    with Session() as session:
         report: Any = session.run("import_trajectory", trajectory_file=path, **{"as": "mission"})
         assert (report.kind, report.added) == ("mission", len(poses))
         assert session.maps.selected_key == "walk"

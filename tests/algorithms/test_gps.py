@@ -17,7 +17,6 @@ from maplab_py.algorithms.external_poses.trajectories import as_mission
 from maplab_py.algorithms.vi_optimization.absolute_outliers import absolute_outliers
 from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.geometry import se3, so3
@@ -133,7 +132,7 @@ def test_a_drifting_loop_with_outliers(seed: int, tmp_path: Path) -> None:
     truth = loop()
     p, wrong = fixes(truth, 2, seed)
     path = write_csv(tmp_path / "track.csv", truth.times_ns[::2], p)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("loop", map_of(drifting(truth, seed)))
         flags = {"gps_sigma_m": 0.5, "gps_sigma_vertical_m": 0.5, "gps_lever_arm_m": "0.2,-0.1,0.5"}
         lat, lon, alt = ORIGIN
@@ -165,7 +164,7 @@ def test_positions_say_nothing_of_orientation(tmp_path: Path) -> None:
     truth = loop(60, 2, 20.0)
     p = fixes(truth, 2, 1)[0]
     path = write_csv(tmp_path / "track.csv", truth.times_ns[::2], p)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("walk", map_of(truth))
         session.run("import_gps", gps_file=path, gps_sigma_m=0.5, gps_sigma_vertical_m=1.0)
         vi_map = session.vi_map
@@ -198,7 +197,7 @@ def test_g_becomes_east_north_up(tmp_path: Path) -> None:
         write_csv(tmp_path / "track.csv", times_ns, middle),
         write_nmea(tmp_path / "track.nmea", times_ns, middle),
     ):
-        with Session(load_registry()) as session:
+        with Session() as session:
             session.maps.add("walk", vi_map)
             report: Any = session.run("import_gps", gps_file=path, **flags)
             after = session.vi_map
@@ -227,7 +226,7 @@ def test_a_map_has_one_origin_and_known_missions_move_along(tmp_path: Path) -> N
         write_csv(tmp_path / f"{row}.csv", walk.times_ns, moved)
         for row, walk in enumerate((first, later))
     ]
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("two", vi_map)
         session.run("import_gps", gps_file=files[0], map_mission=missions[0])
         np.testing.assert_allclose(session.vi_map.T_G_M[0], session.vi_map.T_G_M[1], atol=1e-9)
@@ -415,7 +414,7 @@ def test_dates_of_zda_and_fixes_of_gns(tmp_path: Path) -> None:
 def test_wrong_files(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.csv"
     path.write_text(text)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("walk", map_of(loop(10, 2)))
         before = session.vi_map
         with pytest.raises(MaplabError, match=message) as error:
@@ -435,7 +434,7 @@ def test_wrong_files(text: str, message: str, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_flags_are_named(flags: dict[str, Any], tmp_path: Path) -> None:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("walk", map_of(loop(10, 2)))
         with pytest.raises(MaplabError, match=f"--{next(iter(flags))}"):
             session.run("import_gps", gps_file=tmp_path / "track.csv", **flags)

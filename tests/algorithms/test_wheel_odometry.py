@@ -15,7 +15,6 @@ from maplab_py.algorithms.relaxation.map_edges import trajectory_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
@@ -77,7 +76,7 @@ def wheel_edges(vi_map: VIMap) -> Any:
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("walk", walk_map(VERTICES, first_ns=START_NS))
     return session
 
@@ -364,7 +363,7 @@ def test_simulated_wheels_give_their_scale_to_a_tenth_of_a_percent(
     recording = data.recordings[0].recording
     wheels = wheel_velocities(recording, scenario.other_sensors, np.random.default_rng(seed))
     write_wheel_velocities(wheels, tmp_path / "wheels.csv", overwrite=False)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("vehicle", data.maps[0])
         report: Any = session.run(
             "import_wheel_odometry",

@@ -14,7 +14,6 @@ from maplab_py.algorithms.image_features.tracks import track_features
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.console.commands.lines import split_commands
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap.exporting import export_colmap
@@ -74,7 +73,7 @@ def write_model(vi_map: VIMap, folder: Path) -> None:
 def test_the_page_runs(room: StereoRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_model(described(room), tmp_path / "office")
-    with Session(load_registry()) as session:
+    with Session() as session:
         reports = {}
         for _, text in blocks(PAGE, "maplab"):
             for words in split_commands(text):

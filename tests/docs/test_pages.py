@@ -108,7 +108,7 @@ def test_links_lead_somewhere(path: Path) -> None:
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_commands_on_pages_exist_with_their_flags(path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     for _, text in blocks(path, "maplab"):
         for words in split_commands(text):
             call = session.parse(words)
@@ -136,7 +136,7 @@ def _run(session: Session, texts: list[str], shown: str) -> list[Report]:
 def test_tutorial_of_three_sessions_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     parts = _tutorial("sessions")
-    with Session(load_registry()) as session:
+    with Session() as session:
         before, after = _run(
             session, [text for kind, text in parts if kind == "maplab"], "evaluate_map"
         )
@@ -150,7 +150,7 @@ def test_tutorial_of_three_sessions_runs(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.slow
 def test_tutorial_of_a_recording_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with Session(load_registry()) as session:
+    with Session() as session:
         odometry, closed = _run(
             session, [text for _, text in _tutorial("recording")], "evaluate_trajectory"
         )
@@ -162,7 +162,7 @@ def test_tutorial_of_a_recording_runs(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.slow
 def test_dense_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with Session(load_registry()) as session:
+    with Session() as session:
         for _, text in blocks(DOCS / "tutorial_dense.md", "maplab"):
             for words in split_commands(text):
                 assert session.execute(session.parse(words)).failure == ""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.dense.resources import FrameResources
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.vimap import LandmarkQuality
@@ -22,7 +21,7 @@ _MIN_OBSERVERS = 4
 @pytest.mark.slow
 def test_depth_agrees_with_triangulated_landmarks(tmp_path: Path) -> None:
     recording = shared_data("euroc_mh01_10s")
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("rovioli", datasource_folder=recording)
         for command in ("optvi", "rtl", "elq"):
             session.run(command)

@@ -9,7 +9,6 @@ import pytest
 
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.commands.lines import typed_commands
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.scripts.batch import read_stages
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.settings import Layer
@@ -29,7 +28,7 @@ PLACES = ["--maps_folder=maps", "--map_folder=out"]
 
 @pytest.mark.parametrize("script", sorted(FLAGS.glob("*.maplab")), ids=lambda path: path.name)
 def test_every_line_of_a_script_is_a_command_with_its_flags(script: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.settings.assign(PLACES, Layer.START_UP, "start-up")
     commands = typed_commands(script.read_text(), lambda name: f"value_of_{name}")
     assert len(commands) > 5
@@ -40,7 +39,7 @@ def test_every_line_of_a_script_is_a_command_with_its_flags(script: Path) -> Non
 
 @pytest.mark.parametrize("path", sorted(FLAGS.glob("*.flags")), ids=lambda path: path.name)
 def test_every_flag_of_a_flag_file_exists(path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.settings.assign_file(path, Layer.START_UP)
     assert session.settings.current()
 
@@ -51,7 +50,7 @@ def test_every_line_of_the_pipeline_is_a_command_with_its_flags() -> None:
     assert [stage.name for stage in ordered(Pipeline(path.name, (), stages))] == [
         stage.name for stage in stages
     ]
-    session = Session(load_registry())
+    session = Session()
     for stage in stages:
         for command in typed_commands("\n".join(stage.commands)):
             session.parse(command.words).arguments()
@@ -90,7 +89,7 @@ def test_localization_map(tmp_path: Path) -> None:
     script = str(FLAGS / "localization_map.maplab")
     done = run_program(tmp_path, "--json", "run", script, *places, seconds=300)
     assert done.returncode == 0, done.stderr
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("load", map_folder=tmp_path / "maps" / "v1_01")
         before = session.vi_map
         session.run("load", map_folder=tmp_path / "small")
@@ -114,7 +113,7 @@ def test_calibration(tmp_path: Path) -> None:
     assert focal["before"] != focal["after"]
     again = run_program(tmp_path, "--json", "-c", "load calibrated; check_map_consistency")
     assert again.returncode == 0, again.stderr
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("load", map_folder=tmp_path / "calibrated")
         rig_id = device_of(session.vi_map)[1]
         camera = session.vi_map.sensors.camera_rig(rig_id).cameras[0]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from tests.support.data import shared_data
 
@@ -20,7 +19,7 @@ TRUTH = "euroc_imu/V101.gt.csv"
 def test_pieces_of_the_flight_are_localised_in_the_others(
     tmp_path: Path, left_out: tuple[int, int]
 ) -> None:
-    session = Session(load_registry())
+    session = Session()
     folders = [shared_data(f"{SUBMAPS}/euroc_v1_01_submap_{i}") for i in range(8)]
     for number, folder in enumerate(folders):
         if number not in left_out:

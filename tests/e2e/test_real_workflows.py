@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3, so3
 from maplab_py.storage.native import load_map
@@ -32,11 +31,11 @@ SUBMAPS, TANGO = "maplab_maps/euroc_v1_01", "maplab_maps/tango_handheld"
 
 @pytest.fixture
 def session() -> Session:
-    return Session(load_registry())
+    return Session()
 
 
 def session_with(vi_map: VIMap) -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("map", vi_map)
     return session
 
@@ -44,7 +43,7 @@ def session_with(vi_map: VIMap) -> Session:
 @pytest.fixture(scope="module")
 def euroc() -> dict[str, VIMap]:
     """Return the map of all submaps as it is loaded, optimised, and closed and optimised."""
-    session = Session(load_registry())
+    session = Session()
     session.run("load_merge_all_submaps", maps_folder=shared_data(SUBMAPS))
     stages = {"loaded": session.vi_map}
     for name, commands in (("optimised", ("elq", "optvi")), ("closed", ("lc", "optvi"))):
@@ -57,7 +56,7 @@ def euroc() -> dict[str, VIMap]:
 @pytest.fixture(scope="module")
 def tango() -> tuple[VIMap, list[Any]]:
     """Return the walk, closed and optimised, and the reports of both optimisations."""
-    session = Session(load_registry())
+    session = Session()
     session.run("load", map_folder=shared_data(TANGO))
     reports = [session.run("optvi")]
     for command in ("set_mission_baseframe_to_known", "relax", "lc"):
@@ -131,7 +130,7 @@ def test_tango_walk_is_optimised_and_its_loop_closed(tango: tuple[VIMap, list[An
 def test_same_input_same_bytes(tmp_path: Path) -> None:
     saved = []
     for name in ("a", "b"):
-        session = Session(load_registry())
+        session = Session()
         session.run("load_merge_all_submaps", maps_folder=shared_data(SUBMAPS))
         session.run("optvi", ba_num_iterations=5)
         session.run("lc")

@@ -11,7 +11,6 @@ import pytest
 
 from maplab_py.algorithms.evaluation.localization_evaluation import read_localized
 from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.frontend.localization.record import _HEADER as LOCALIZED_HEADER
 from maplab_py.geometry import se3, so3
@@ -116,7 +115,7 @@ def test_trajectories_are_read_by_every_command(name: str, tmp_path: Path) -> No
     (tmp_path / "truth").mkdir()
     truth = as_tum(vi_map, tmp_path / "truth")
     mission = vi_map.mission(0).id[:8]
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("small", vi_map)
         flags: dict[str, Any] = {"map_mission": mission, "trajectory_file": path}
         for kind in ("absolute", "odometry"):
@@ -167,7 +166,7 @@ def test_colmap_models_are_read_as_maps_and_calibrations(form: str, tmp_path: Pa
 
     vi_map = Scene(missions=1, vertices=6, models=PINHOLES[:2]).make()
     export_colmap(vi_map, tmp_path, ColmapExportOptions(quality="all", colmap_format=form))
-    with Session(load_registry()) as session:
+    with Session() as session:
         report: Any = session.run("import_colmap", colmap_folder=tmp_path, map_key="again")
         assert report.frames == len(vi_map.frames)
         np.testing.assert_allclose(session.vi_map.T_G_I, vi_map.T_G_I, atol=1e-12)
@@ -181,7 +180,7 @@ def calibrations(vi_map: VIMap, folder: Path, form: str) -> tuple[Path, ...]:
         save_map(vi_map, folder / "map")
         return (next((folder / "map").rglob("sensors.yaml")),)
     if form == "export_ncamera_calibration":
-        with Session(load_registry()) as session:
+        with Session() as session:
             session.maps.add("small", vi_map)
             session.run(form, ncamera_calibration_export_folder=folder)
         return tuple(folder.glob("ncamera-*.yaml"))
@@ -197,7 +196,7 @@ def test_calibrations_are_read_by_the_import_and_by_flags(form: str, tmp_path: P
     vi_map = scene_map(distortion=Distortion.RADTAN)
     device = device_of(vi_map)
     files = calibrations(vi_map, tmp_path, form)
-    with Session(load_registry()) as session:
+    with Session() as session:
         flags = dict(zip(("calibration_file", "imu_calibration_file"), files, strict=False))
         report: Any = session.run("import_calibration", **flags)
         assert len(report.cameras) == len(vi_map.sensors.camera_rig(device.rig).cameras)
@@ -219,7 +218,7 @@ def test_calibrations_are_read_by_the_import_and_by_flags(form: str, tmp_path: P
 
 def test_graphs_are_read_with_their_values(tmp_path: Path) -> None:
     vi_map = flat_map()
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("small", vi_map)
         session.run("export_g2o", file=tmp_path / "graph.g2o")
         session.run("import_g2o", file=tmp_path / "graph.g2o", map_key="graph")
@@ -235,7 +234,7 @@ def test_bags_are_described_by_recording_info(kind: BagFormat, tmp_path: Path) -
     path = named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
     (tmp_path / "sensors.yaml").write_text(write_sensors(vi_map.sensors))
-    with Session(load_registry()) as session:
+    with Session() as session:
         report: Any = session.run(
             "recording_info",
             recording=path,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.vimap.ids import to_hex
@@ -18,7 +17,7 @@ def session_of(*, known: list[bool]) -> Session:
     vi_map = make_map(WALKS)[0]
     T_G_M = vi_map.baseframes.T_G_M + np.where(known, 0.0, 5.0)[:, None] * np.eye(7)[5]
     frames = vi_map.baseframes.replace(T_G_M=T_G_M, is_known=np.array(known))
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("rooms", vi_map.replace(baseframes=frames))
     return session
 
@@ -68,7 +67,7 @@ def twins() -> tuple[Session, list[str]]:
     """Return a session with the twins, of which mission 2 is known, and the missions' names."""
     vi_map = make_map(TWINS)[0]
     frames = vi_map.baseframes.replace(is_known=np.array([False, False, True]))
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("twins", vi_map.replace(baseframes=frames))
     return session, [to_hex(words)[:8] for words in vi_map.missions.id]
 

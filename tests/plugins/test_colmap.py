@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.evaluation.reports import MapComparisonReport
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.interop.colmap.options import ColmapImportReport
@@ -25,7 +24,7 @@ from tests.support.stereo_room import StereoRoom, quarter_size
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("scene", Scene(vertices=8, landmarks=60).make())
     return session
 
@@ -49,7 +48,7 @@ def test_out_in_and_compared(session: Session, tmp_path: Path) -> None:
 
 
 def test_missions_are_chosen(tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("two", Scene(missions=2, vertices=5, landmarks=60).make())
     name = to_hex(session.vi_map.missions.id[0])
     session.run("export_colmap", colmap_folder=tmp_path, missions=name)
@@ -97,7 +96,7 @@ def test_arbitrary_scale_is_refused_by_optvi_alone(session: Session, tmp_path: P
 
 @pytest.mark.slow
 def test_the_commands_run_without_imu(tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     walks = [Walk(room=1), Walk(room=1, start_s=60.0, drift=(0.2, -0.1, 0.05, 0.01))]
     session.maps.add("rooms", make_map(walks)[0])
     folder = tmp_path / "model"
@@ -118,7 +117,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> StereoRoom:
 
 @pytest.fixture
 def room_session(room: StereoRoom) -> Iterator[Session]:
-    with Session(load_registry()) as room_session:
+    with Session() as room_session:
         room_session.run("load", map_folder=room.map_folder)
         yield room_session
 

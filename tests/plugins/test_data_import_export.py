@@ -11,7 +11,6 @@ from maplab_plugins import data_import_export
 
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import read_trajectory
@@ -31,7 +30,7 @@ from tests.simulation.small import simulated
 
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
-    session = Session(load_registry())
+    session = Session()
     folder = tmp_path / "map"
     folder.mkdir()
     session.maps.add("small", make_map(), folder=folder)
@@ -51,7 +50,7 @@ def test_csv_export(tmp_path: Path, session: Session) -> None:
 
 
 def test_projected_descriptors_are_those_of_loop_closure(tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("walk", merge_maps(*simulated().maps)[0])
     vi_map = session.vi_map
     session.run("csv_export", csv_export_path=tmp_path / "csv", export_projected_descriptor=True)
@@ -167,7 +166,7 @@ def test_help_is_complete() -> None:
 
 def test_recording_info(tmp_path: Path) -> None:
     folder = write_folder(make_content(), tmp_path / "room")
-    with Session(load_registry()) as session:  # needs no map
+    with Session() as session:  # needs no map
         report = session.run("recording_info", recording=folder, check_images=True)
         assert (report.frame_sets, report.checked_images, report.kind) == (8, 16, "EuRoC folder")
         assert report.as_dict()["imu"]["samples"] == len(make_content().imu_ns)
@@ -184,7 +183,7 @@ def test_recording_info(tmp_path: Path) -> None:
 
 
 def test_a_calibration_is_looked_at_and_written(tmp_path: Path) -> None:
-    with Session(load_registry()) as session:
+    with Session() as session:
         report: Any = session.run("import_calibration", calibration_file=basalt(tmp_path))
         assert (report.format, len(report.cameras), report.has_imu) == ("Basalt", 2, True)
         assert "--apply" in report.advice
@@ -202,7 +201,7 @@ def test_a_calibration_is_looked_at_and_written(tmp_path: Path) -> None:
 def test_a_calibration_is_applied_and_taken_back(tmp_path: Path) -> None:
     vi_map = scene_map(distortion=Distortion.RADTAN)
     device = device_of(vi_map)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("walk", vi_map)
         folder = tmp_path / "kalibr"
         session.run("export_calibration", folder=folder, format="kalibr")

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from maplab_py.atomic.files import PendingFile
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3
@@ -37,7 +36,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> StereoRoom:
 
 @pytest.fixture
 def session(room: StereoRoom) -> Iterator[Session]:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("load", map_folder=room.map_folder)
         session.run("import_images", dataset_folder=room.recording)
         yield session

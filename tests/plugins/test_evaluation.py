@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from maplab_plugins.evaluation import evaluate_trajectory
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.interop.trajectories import Trajectory, write_euroc
@@ -17,7 +16,7 @@ from tests.interop.small_map import make_map
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("small", make_map())
     return session
 

@@ -10,7 +10,6 @@ import pytest
 
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.frontend.reports import MappingReport
@@ -28,7 +27,7 @@ LENIENT = {"elq_min_observers": 3, "elq_min_observation_angle_deg": 1.0}
 
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
-    session = Session(load_registry())
+    session = Session()
     data = simulated()
     data.truth.save(tmp_path / "truth.npz")
     session.maps.add("query", data.maps[0])
@@ -91,7 +90,7 @@ def test_a_file_is_not_overwritten_unasked(session: Session, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_the_workflow_makes_one_localisation_map_of_two_raw_sessions(tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.run("simulate", map_folder=tmp_path / "s", scenario="three_sessions")
     session.run("load", map_folder=tmp_path / "s" / "session_1", map_key="raw")
     session.run("load_merge_map", map_folder=tmp_path / "s" / "session_2")

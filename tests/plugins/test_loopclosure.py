@@ -19,7 +19,6 @@ from maplab_py.algorithms.loop_closure.explanation import (
     MissionExplanation,
     PairExplanation,
 )
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
@@ -33,7 +32,7 @@ UNRELATED = [Walk(room=1), Walk(room=2, start_s=60.0)]
 
 
 def session_of(walks: list[Walk]) -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("rooms", make_map(walks)[0])
     return session
 
@@ -149,14 +148,14 @@ sessions: [{duration_s: 22.0, turns: 1.7}]
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("lidar")
     (folder / "lidar.yaml").write_text(SCENARIO)
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("simulate", scenario=str(folder / "lidar.yaml"), map_folder=folder / "maps")
     return folder / "maps"
 
 
 @pytest.fixture
 def session(simulated: Path) -> Iterator[Session]:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("load", map_folder=simulated / "session_1")
         yield session
 
@@ -213,7 +212,7 @@ WALKS = [Walk(room=1), Walk(room=1, mission=1, start_s=60.0, drift=(0.2, -0.1, 0
 
 @pytest.fixture(scope="module")
 def closed_rooms() -> Session:
-    closed_rooms = Session(load_registry())
+    closed_rooms = Session()
     closed_rooms.maps.add("rooms", make_map(WALKS)[0])
     first, second = (to_hex(words) for words in closed_rooms.vi_map.missions.id)
     closed_rooms.run("rename_mission", "monday", map_mission=first)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
 from maplab_py.vimap.consistency import check_consistency
@@ -15,7 +14,7 @@ from tests.vimap.builders import walk_map
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("walk", walk_map())
     return session
 

@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from maplab_py.algorithms.loop_closure.workflow import find_loop_closures
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3
@@ -21,7 +20,7 @@ TWICE = [Walk(room=1), Walk(room=1, start_s=60.0, drift=(0.2, -0.1, 0.05, 0.01))
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("rooms", make_map(TWICE)[0])
     return session
 
@@ -121,7 +120,7 @@ def test_a_graph_is_exported_imported_and_relaxed(session: Session, tmp_path: Pa
 
 @pytest.fixture
 def walk_session() -> Session:
-    walk_session = Session(load_registry())
+    walk_session = Session()
     walk_session.maps.add("walk", walk_map())
     return walk_session
 

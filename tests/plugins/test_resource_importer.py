@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
 from tests.support.stereo_room import StereoRoom
@@ -32,7 +31,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def session(room: StereoRoom, temporary: Path) -> Iterator[Session]:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.run("load", map_folder=room.map_folder)
         yield session
 

@@ -16,7 +16,6 @@ import pytest
 from maplab_py.algorithms.self_calibration import checks
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.algorithms.self_calibration.segments import database as database_file
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
@@ -38,7 +37,7 @@ FLAGS = {
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("walk", uncalibrated(scene_map(vertices=61, noise=1.0)))
     return session
 

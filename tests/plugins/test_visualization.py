@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from maplab_plugins.visualization.following import Following
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
@@ -28,7 +27,7 @@ TYPES = {kind.name: kind.number for kind in RESOURCE_TYPES}
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.set_flags(["--viewer_port=0"])
         session.maps.add("walk", walk_map())
         yield session

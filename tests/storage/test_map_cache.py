@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError
 from maplab_py.storage import native
@@ -217,7 +216,7 @@ def test_commands_do_the_same_on_mapped_columns(
     monkeypatch.setattr(native, "MapCache", lambda max_gb: MapCache(max_gb, tmp_path / "cache"))
     results = []
     for flags in ({}, {"map_cache": True}, {"map_cache": True}):
-        session = Session(load_registry())
+        session = Session()
         session.run("load", map_folder=folder, **flags)
         session.run("kfh")
         session.run("landmark_sparsify", num_landmarks_to_keep=300)

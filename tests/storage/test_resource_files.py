@@ -12,7 +12,6 @@ import pytest
 
 from maplab_py.atomic import files as atomic_files
 from maplab_py.cancellation import CancelToken, obeying
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import Cancelled, MapError, UserError
 from maplab_py.storage.native import load_map, save_map
@@ -265,7 +264,7 @@ def test_store_loads_and_stays_within_its_bound(folder: Path) -> None:
 
 
 def test_resources_come_along(folder: Path, tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.run("load", map_folder=folder)
     session.run("save", map_folder=tmp_path / "other")
     before, after = load_map(folder)[0], load_map(tmp_path / "other")[0]
@@ -273,7 +272,7 @@ def test_resources_come_along(folder: Path, tmp_path: Path) -> None:
 
 
 def test_move_out_and_copy_back(folder: Path, tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.run("load", map_folder=folder)
     wanted = contents(load_map(folder)[0], folder)
     outside = str(tmp_path / "outside")
@@ -290,7 +289,7 @@ def test_move_out_and_copy_back(folder: Path, tmp_path: Path) -> None:
 
 
 def test_contradictions_are_refused(folder: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.run("load", map_folder=folder)
     with pytest.raises(UserError, match="only one"):
         session.run(
@@ -366,7 +365,7 @@ def test_the_temporary_folder_is_deleted_with_the_last_map(
 
 
 def test_undo_leaves_nothing_behind(plain_map: VIMap, temporary: Path, tmp_path: Path) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("map", plain_map)
     session.maps.update(session.maps.selected.with_value(with_images(plain_map, temporary), "add"))
     session.run("undo")

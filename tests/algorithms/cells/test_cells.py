@@ -8,7 +8,6 @@ import pytest
 from maplab_py.algorithms.cells.cells import join_cells, split_by_position
 from maplab_py.algorithms.cells.options import CellOptions
 from maplab_py.algorithms.evaluation.map_comparison import compare_maps
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3
@@ -187,7 +186,7 @@ def test_maps_that_are_no_cells_are_refused() -> None:
 
 
 def test_the_commands_are_inverse() -> None:
-    session = Session(load_registry())
+    session = Session()
     vi_map = sessions()
     session.maps.add("city", vi_map)
     session.run("split_map", cell_count=3, cell_overlap_m=0.6)

@@ -95,7 +95,7 @@ def test_a_name_fits_if_it_has_the_letters_in_order(typed: str, name: str) -> No
 
 
 def test_ovi_finds_optvi_first_among_all_commands() -> None:
-    assert texts("ovi", Session(load_registry()))[0] == "optvi"
+    assert texts("ovi", Session())[0] == "optvi"
 
 
 def test_what_is_used_comes_before_what_fits_as_well(session: Session) -> None:
@@ -106,7 +106,7 @@ def test_what_is_used_comes_before_what_fits_as_well(session: Session) -> None:
 
 
 def test_values_that_the_session_knows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("office", named(map_of(2), ["monday", "tuesday"]))
     session.run("snapshot", "before_relax")
     session.aliases["tidy"] = "elq"
@@ -220,7 +220,7 @@ def test_unknown_commands_and_flags_are_marked() -> None:
 
 
 def test_clear_clears_the_screen_and_is_proposed_before_clear_storage() -> None:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("office", map_of(3))
     assert texts("clear", session) == ["clear", "clear_storage"]
     session.run("clear")

@@ -148,7 +148,7 @@ def remedies() -> Iterator[str]:
 
 
 def test_remedies_of_errors_are_commands_that_need_no_more() -> None:
-    session = Session(load_registry())
+    session = Session()
     lines = {line for line in remedies() if line in session.registry.names}
     assert {"retriangulate_landmarks", "loopclosure_all_missions"} <= lines
     for line in lines:

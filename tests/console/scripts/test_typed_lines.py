@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from maplab_py.console.commands.lines import typed_commands, variable_lookup
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.prompt.loop import toolbar_text
 from maplab_py.console.scripts.aliases import read_aliases
 from maplab_py.console.scripts.runner import Runner
@@ -264,7 +263,7 @@ def test_wrong_redirections(
 
 
 def test_the_only_required_flag_may_be_given_by_position() -> None:
-    session = Session(load_registry())
+    session = Session()
     call = session.parse(["rename_map", "office"])
     assert call.values["map_key"] == "office"
     assert session.parse(["evaluate_trajectory", "t.tum"]).values["ground_truth"] == Path("t.tum")
@@ -290,6 +289,6 @@ def test_the_only_required_flag_may_be_given_by_position() -> None:
     ],
 )
 def test_a_flag_without_which_a_command_refuses_may_be_given_by_position(name: str) -> None:
-    call = Session(load_registry()).parse([name, "9"])
+    call = Session().parse([name, "9"])
     (flag,) = call.command.positional
     assert str(call.values[flag]) == "9"

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
@@ -100,7 +99,7 @@ def changed(vi_map: VIMap, table: str, column: str) -> VIMap:
 
 @pytest.fixture
 def session() -> Session:
-    session = Session(load_registry())
+    session = Session()
     session.maps.add("map", Scene(vertices=20, landmarks=200).make())
     return session
 
@@ -179,7 +178,7 @@ def test_merging_maps_one_by_one_keeps_to_the_bound(tmp_path: Path) -> None:
     for number, folder in enumerate(folders):
         save_map(walk_map(seed=number, first_ns=10**9 * (1 + 100 * number)), folder)
     bound_gb = 2.5e-9 * load_map(folders[0])[0].nbytes()
-    session = Session(load_registry())
+    session = Session()
     session.set_flags([f"--undo_max_gb={bound_gb}"])
     session.run("load", map_folder=folders[0])
     for count, folder in enumerate(folders[1:], start=2):
@@ -195,7 +194,7 @@ def test_merging_maps_one_by_one_keeps_to_the_bound(tmp_path: Path) -> None:
 def saved_walks(tmp_path: Path) -> Session:
     for number in range(3):
         save_map(walk_map(seed=number), tmp_path / f"walk {number}")
-    return Session(load_registry())
+    return Session()
 
 
 def run(saved_walks: Session, *lines: str) -> None:
@@ -228,7 +227,7 @@ def test_the_script_makes_the_same_map_in_a_new_session(
         "restore merged",
     )
     script = script_of(saved_walks)
-    again = Session(load_registry())
+    again = Session()
     run(again, *script)
     assert is_same(again.vi_map, saved_walks.vi_map)
     assert not any(line.startswith(("undo", "restore", "remove_mission")) for line in script)
@@ -251,7 +250,7 @@ def test_undone_commands_are_shown_but_not_written(saved_walks: Session, tmp_pat
 def test_a_renamed_map_and_a_dry_run(saved_walks: Session, tmp_path: Path) -> None:
     run(saved_walks, f"load '{tmp_path}/walk 0'", "rename_map office", "sbk --dry_run", "sbk")
     script = script_of(saved_walks)
-    again = Session(load_registry())
+    again = Session()
     run(again, *script)
     assert is_same(again.vi_map, saved_walks.vi_map)
     assert [line.split()[0] for line in script] == [

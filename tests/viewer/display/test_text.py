@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.sensors.projection import back_project
@@ -214,7 +213,7 @@ def test_the_corners_of_the_pinhole_are_those_of_the_camera(tmp_path: Path) -> N
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    with Session(load_registry()) as session:
+    with Session() as session:
         session.maps.add("walk", walk_map())
         yield session
 
