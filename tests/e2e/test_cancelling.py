@@ -1,14 +1,20 @@
-"""Ctrl-C in long commands on a large map: the prompt is back within a second, the map untouched."""
+"""Ctrl-C in commands of every kind and on a large map: the prompt is back, nothing has changed.
+
+All commands: `python -m benchmarks.interruptions`.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.support import Console, run_program
 from tests.registry.workspace import folder_digest
+from tests.support.data import shared_data
+from tests.support.interruptions import Interrupter, Workspace
 from tests.support.machine import slowness
 
 pytestmark = pytest.mark.slow
@@ -90,3 +96,38 @@ def interrupt(console: Console, line: str, pause_s: float) -> float:
     console.wait_for(lambda screen: screen.startswith("maplab <map>:/$") and "^C" not in screen)
     console.wait_for_prompt("maplab <map>:/$")
     return passed
+
+
+PROMPT_S = 1.0
+NAMES = (
+    "create_esdf_from_depth_resource",
+    "csv_export",  # several files
+    "generate_summary_map_and_save_to_disk",
+    "load",
+    "optimize_visual_inertial",
+    "plot_trajectory",  # imports a heavy library
+    "register_point_clouds",
+    "save",
+    "schema",
+    "simulate",
+    "stereo_dense_reconstruction",
+    "train_projection_matrix",
+    "visualize",
+)
+
+
+@pytest.fixture(scope="module")
+def interrupter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupter]:
+    tango = shared_data("maplab_maps/tango_handheld")
+    console = Interrupter(Workspace(tmp_path_factory.mktemp("interruptions"), tango))
+    yield console
+    console.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_prompt_is_back_and_nothing_has_changed(interrupter: Interrupter, name: str) -> None:
+    presses = interrupter.interrupt(name, at_most_s=4.0)
+    assert [press for press in presses if press.harm] == []
+    assert {press.outcome for press in presses} <= {"cancelled", "done"}
+    # other work on the machine may hold one of them up: the second slowest counts
+    assert sorted(press.prompt_s for press in presses)[-2] <= PROMPT_S * slowness(), presses

@@ -1,14 +1,21 @@
-"""Matching of time stamps against an exhaustive search."""
+"""What tests rely on: association, IMU model, collection, waiting."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from maplab_py.algorithms.self_calibration.pruning import test_mutual_consistency, test_segments
+from maplab_py.geometry import so3
 from maplab_py.geometry.association import nearest_rows
+from maplab_py.sensors import ImuIntrinsics
 from tests.support.association import associate
+from tests.support.imu_model import correct_imu, distort_imu
+from tests.support.waiting import wait_until
 
 stamps = st.lists(st.integers(0, 60), max_size=12, unique=True).map(sorted).map(np.array)
 
@@ -64,3 +71,41 @@ def test_empty_lists(a: list[int], b: list[int]) -> None:
 def test_nearest_rows_of_one_stamp() -> None:
     assert nearest_rows([5], [1, 5, 9]).tolist() == [0, 0, 0]
     assert nearest_rows([0, 10], [5, 6, -3, 40]).tolist() == [0, 1, 0, 1]
+
+
+def test_the_equations() -> None:
+    rng = np.random.default_rng(1)
+    T_g, T_a = (np.eye(3) + np.triu(rng.normal(size=(3, 3))) * 0.02 for _ in range(2))
+    R_A_I = so3.to_matrix(so3.exp(rng.normal(size=3)))
+    b_a, b_g, f, w = rng.normal(size=(4, 3))
+    out = distort_imu(ImuIntrinsics(T_g, T_a, R_A_I), np.concatenate([f, w]), b_a, b_g)
+    assert np.allclose(out[:3], T_a @ (R_A_I @ f) + b_a)
+    assert np.allclose(out[3:], T_g @ w + b_g)
+
+
+def test_correction_inverts_and_batches() -> None:
+    rng = np.random.default_rng(2)
+    T = np.eye(3) + np.triu(rng.normal(size=(3, 3))) * 0.02
+    R_A_I = so3.to_matrix(so3.exp(rng.normal(size=3)))
+    values, biases = rng.normal(size=(4, 5, 6)), rng.normal(size=(2, 4, 1, 3))
+    for intrinsics in (None, ImuIntrinsics(T, T.copy(), R_A_I)):
+        reported = distort_imu(intrinsics, values, *biases)
+        assert reported.shape == values.shape
+        assert np.max(np.abs(correct_imu(intrinsics, reported, *biases) - values)) < 1e-13
+
+
+def test_no_intrinsics_adds_biases_only() -> None:
+    out = distort_imu(None, np.arange(6.0), [1, 2, 3], [10, 20, 30])
+    assert out.tolist() == [1, 3, 5, 13, 24, 35]
+
+
+def test_functions_of_the_product_are_not_collected(request: pytest.FixtureRequest) -> None:
+    collected = {item.name for item in request.session.items if item.path == request.path}
+    assert request.node.name in collected
+    assert not collected & {test_segments.__name__, test_mutual_consistency.__name__}
+
+
+def test_waiting_ends_with_the_condition_or_the_time() -> None:
+    numbers = itertools.count()
+    assert wait_until(lambda: next(numbers) == 3)
+    assert not wait_until(lambda: False, at_most_s=0.02)
