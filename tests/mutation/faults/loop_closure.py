@@ -6,7 +6,6 @@ from tests.mutation.fault import Fault
 
 _GATES = ("tests/algorithms/loop_closure/test_gates.py",)
 _PAIRS = ("tests/algorithms/loop_closure/test_mission_pairs.py",)
-_ALIKE = ("tests/algorithms/loop_closure/test_gates.py",)
 _EDGES = (
     "tests/algorithms/loop_closure/test_gates.py",
     "tests/algorithms/loop_closure/test_closing.py",
@@ -48,7 +47,7 @@ LOOP_CLOSURE = (
         "maplab_py/algorithms/loop_closure/gates.py",
         "ambiguous & c.related & ~c.is_usual",
         "ambiguous & c.related",
-        _ALIKE,
+        _GATES,
     ),
     Fault(
         "edges_without_smallest_deviation",

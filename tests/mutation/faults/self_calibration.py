@@ -6,8 +6,7 @@ from tests.mutation.fault import Fault
 
 _SINGLE = ("tests/algorithms/self_calibration/test_uncertainty.py",)
 _SEGMENTS = ("tests/algorithms/self_calibration/test_segments.py",)
-_OUTLIERS = ("tests/algorithms/self_calibration/test_estimation.py",)
-_SCALE = ("tests/algorithms/self_calibration/test_estimation.py",)
+_ESTIMATION = ("tests/algorithms/self_calibration/test_estimation.py",)
 _CHECKS = ("tests/algorithms/self_calibration/test_calibration.py",)
 
 SELF_CALIBRATION = (
@@ -79,21 +78,21 @@ SELF_CALIBRATION = (
         "maplab_py/algorithms/self_calibration/estimation/solution.py",
         "freedom[kept] + 2.0",
         "freedom[kept]",
-        _OUTLIERS,
+        _ESTIMATION,
     ),
     Fault(
         "remainders_of_tracks_are_trusted",
         "maplab_py/algorithms/self_calibration/estimation/solution.py",
         "    whole = alive[left[alive] >= _MIN_SHARE_LEFT * np.diff(data.start)[alive]]\n",
         "    whole = alive\n",
-        _OUTLIERS,
+        _ESTIMATION,
     ),
     Fault(
         "short_path_alone_is_lost_scale",
         "maplab_py/algorithms/self_calibration/calibration.py",
         "    has_shrunk = np.all(after_m < _MIN_RATIO * before_m, axis=0)\n",
         "    has_shrunk = np.any(after_m < _MIN_RATIO * before_m, axis=0)\n",
-        _SCALE,
+        _ESTIMATION,
     ),
     Fault(
         "spread_of_parts_not_of_their_mean",
