@@ -95,7 +95,7 @@ class Servers:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.scratch = folder / "scratch"
-        self.spool = Spool(folder / "spool", quiet_s=0.1)
+        self.spool = Spool(folder / "spool", quiet_s=0.3)
         self.map_folder = folder / "city"
         self.options = MapServerOptions(
             merged_map_folder=str(self.map_folder),
