@@ -1,24 +1,24 @@
-"""A run over a recording whose first seconds are checked, and that is mended where it does not start."""
+"""A run over a recording that is checked before and after, and mended where its calibration does not fit."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 
 from maplab_py.algorithms.recording_check.doctor import (
     Diagnosis,
     check_first_seconds,
+    check_map,
     diagnose,
     explain_refusal,
 )
-from maplab_py.algorithms.recording_check.mending import mended
+from maplab_py.algorithms.recording_check.mending import MendedRecording, mended
 from maplab_py.errors import EstimationError, MapError
 from maplab_py.frontend.mapping import Mapping
-from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.progress import SILENT, Progress
 
-_LEAST_SHARE = 0.5
+_LEAST_SHARE, _AS_MANY = 0.5, 0.9
+"""Shares of the frames: of a run that is not lost, and of those of the first run, for the second to count."""
 
 
 def run_checked(
@@ -29,9 +29,10 @@ def run_checked(
     is_to_end: Callable[[], bool] = lambda: False,
     is_repeatable: bool = True,
 ) -> Mapping:
-    """Look at the first seconds, and run; where that fails, mend what is wrong and run again.
+    """Look at the first seconds, run, and check the map; where something is wrong, mend it and run again.
 
-    It fails if the odometry does not start, or estimates fewer than half of the frames.
+    Where the first seconds show it, the recording is mended before the run. A run has failed if it does not
+    start, or estimates fewer than half of the frames. Figures of noise alone are no reason to run again.
 
     Args:
         make: Prepares a run over a recording.
@@ -45,39 +46,69 @@ def run_checked(
         EstimationError: The odometry has not started; says what is wrong with the recording.
     """
     mapping = make(recording)
-    error: EstimationError | None = None
-    stream = mapping.options.stream
-    doubts = check_first_seconds(recording, stream)
-    try:
-        mapping.run(progress, is_to_end=is_to_end)
-    except EstimationError as caught:
-        if mapping.is_ended_early:
-            raise
-        error = caught
-    estimated = mapping.statistics.estimated_frames
-    is_lost = not mapping.is_ended_early and estimated < _LEAST_SHARE * mapping.statistics.frames
-    if error is None and not (is_lost and is_repeatable):
-        mapping.statistics.notes.extend(doubts)
-        return mapping
-    diagnosis = _diagnose(recording, stream, progress)
-    again = None
-    if diagnosis is not None and mapping.options.odometry.apply_calibration:
-        again = mended(recording, diagnosis, stream)
-    if again is not None:
-        second = make(again)
-        with contextlib.suppress(EstimationError):
-            second.run(progress, is_to_end=is_to_end)
-        if second.statistics.estimated_frames > estimated:
-            return second
+    doctor = _Doctor(recording, mapping, progress)
+    notes = check_first_seconds(recording, mapping.options.stream)
+    first = doctor.mended() if notes else None
+    if first is not None:
+        mapping = make(first)
+    error = _run(mapping, progress, is_to_end)
+    is_bent = first is None and any(not f.check.startswith("noise") for f in mapping.doubts or ())
+    if not mapping.is_ended_early and (
+        error is not None or (is_repeatable and (_share(mapping) < _LEAST_SHARE or is_bent))
+    ):
+        again = doctor.mended() if first is None else recording
+        if again is not None:
+            progress.line("read once more: recording and calibration do not agree")
+            second = make(again)
+            least = _AS_MANY * _share(mapping) if is_bent else _share(mapping)
+            if _run(second, progress, is_to_end) is None and _share(second) > least:
+                return second
     if error is not None:
-        raise EstimationError(explain_refusal(diagnosis, recording.name, str(error))) from error
-    mapping.statistics.notes.extend(doubts)
+        if mapping.is_ended_early:
+            raise error
+        reason = explain_refusal(doctor.diagnosis(), recording.name, str(error))
+        raise EstimationError(reason) from error
+    mapping.statistics.notes.extend(notes if first is None else ())
     return mapping
 
 
-def _diagnose(recording: Recording, stream: StreamOptions, progress: Progress) -> Diagnosis | None:
-    """Diagnose a whole recording; None where a table of it is damaged."""
+def _share(mapping: Mapping) -> float:
+    """Return the share of the frames whose states a run has estimated."""
+    return mapping.statistics.estimated_frames / max(mapping.statistics.frames, 1)
+
+
+def _run(
+    mapping: Mapping, progress: Progress, is_to_end: Callable[[], bool]
+) -> EstimationError | None:
+    """Run, and check the map; return why it has not started, None if it has."""
     try:
-        return diagnose(recording, stream, progress=progress)
-    except MapError:
-        return None
+        mapping.run(progress, is_to_end=is_to_end)
+        mapping.doubts = check_map(mapping.builder.make_map()) if mapping.builder else ()
+    except EstimationError as error:
+        if not mapping.statistics.estimated_frames:
+            return error
+    return None
+
+
+class _Doctor:
+    """Diagnoses a whole recording at most once."""
+
+    def __init__(self, recording: Recording, mapping: Mapping, progress: Progress) -> None:
+        self._recording, self._options, self._progress = recording, mapping.options, progress
+        self._found: list[Diagnosis | None] = []
+
+    def diagnosis(self) -> Diagnosis | None:
+        """Return the diagnosis; None where a table of the recording is damaged."""
+        if not self._found:
+            try:
+                stream = self._options.stream
+                self._found = [diagnose(self._recording, stream, progress=self._progress)]
+            except MapError:
+                self._found = [None]
+        return self._found[0]
+
+    def mended(self) -> MendedRecording | None:
+        """Return the recording with what was found, unless the user does not want that."""
+        if not self._options.odometry.apply_calibration or (found := self.diagnosis()) is None:
+            return None
+        return mended(self._recording, found, self._options.stream)

@@ -7,15 +7,19 @@ import tempfile
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from maplab_py.algorithms.recording_check.doctor import check_map
+from maplab_py.algorithms.recording_check.findings import cause
 from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
-from maplab_py.errors import Cancelled, MaplabError, UserError
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.frontend.localization.record import summarised
 from maplab_py.frontend.localization.reports import LocalizationSummary
 from maplab_py.frontend.mapping import Mapping
@@ -73,7 +77,11 @@ def finish(
         if mapping.builder is not None:
             vi_map, _ = mapping.builder.finish(progress=progress)
             doubts = scale_doubts(vi_map)
-            notes += check_map(vi_map)
+            first = cause(check_map(vi_map) if mapping.doubts is None else mapping.doubts)
+            notes += [] if first is None else [f"this recording shows: {first.line}"]
+            if mapping.is_mended and not is_to_end():
+                vi_map, doubts, words = _adjusted(vi_map, doubts, progress)
+                notes += words
             if output.optimize_map_to_localization_map:
                 try:
                     vi_map = localization_map(
@@ -121,6 +129,33 @@ def localization_map(vi_map: VIMap, output: OutputOptions, *, progress: Progress
         keep = max(1, round(share * _good(result)))
         result, _, _ = sparsify(result, keep, SparsificationOptions(), progress=progress)
     return result
+
+
+def _adjusted(
+    vi_map: VIMap, doubts: tuple[str, ...], progress: Progress
+) -> tuple[VIMap, tuple[str, ...], list[str]]:
+    """Optimise the map of a recording whose calibration was mended, with the calibration of the cameras free.
+
+    Most vertices have left the window before it knew the calibration.
+
+    Returns:
+        Map, doubts of its scale, and a note; as they are if it contradicts the accelerometers then.
+    """
+    names = [field.name for field in dataclasses.fields(VIOptimizationOptions)]
+    free: dict[str, Any] = {name: False for name in names if name.startswith("fix_ncamera_")}
+    try:
+        result, report = optimize(vi_map, VIOptimizationOptions(**free), progress=progress)
+    except EstimationError as error:
+        return vi_map, doubts, [f"not optimised with its calibration free: {error}"]
+    left = scale_doubts(result)
+    if len(left) > len(doubts):
+        return vi_map, doubts, [f"not optimised with its calibration free: {left[0]}"]
+    note = (
+        "the map was optimised with the calibration of the cameras free, since the recording's was wrong: "
+        f"reprojection error {report.median_reprojection_before_px:.2f} px before, "
+        f"{report.median_reprojection_after_px:.2f} px after"
+    )
+    return result, left, [note]
 
 
 class _EndRequested(Cancelled):

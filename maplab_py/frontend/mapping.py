@@ -10,6 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
+from maplab_py.algorithms.recording_check.findings import Finding
+from maplab_py.algorithms.recording_check.mending import MendedRecording
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
@@ -60,6 +62,8 @@ class Mapping:
         statistics: Counts and times.
         problem: Why the run ended before the end of the recording; empty if it did not.
         is_ended_early: The user has ended the run before the end of the recording.
+        doubts: What the map says against the calibration; None if nobody has looked.
+        is_mended: The recording is read with another calibration than its own.
     """
 
     def __init__(
@@ -97,9 +101,11 @@ class Mapping:
         self.localized = LocalizationRecord()
         self.localized_frame: LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"
+        self.is_mended = isinstance(recording, MendedRecording)
+        odometry = self.options.odometry
         self.odometry = Odometry(
             device,
-            self.options.odometry,
+            odometry.for_doubted() if self.is_mended else odometry,
             make_starter=make_starter,
             map_rule=localization.rule if is_tight else None,
         )
@@ -112,6 +118,7 @@ class Mapping:
         self.statistics = RunStatistics()
         self.problem = ""
         self.is_ended_early = False
+        self.doubts: tuple[Finding, ...] | None = None
         self._keeps_states = keeps_states
         self._states = array("d")  # time apart, rows of 16 numbers
         self._times_ns = array("q")

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from maplab_py.errors import FlagError
 from maplab_py.estimation.window.options import CALIBRATED, WindowOptions
 from maplab_py.frontend.initialization.options import InitializationOptions
 from maplab_py.options import Options, option
 from maplab_py.vision.tracking.options import TrackingOptions
+
+_AUTO = "auto"
+_IN_WORDS: dict[tuple[str, ...], tuple[str, ...]] = {("none",): (), (_AUTO,): ("time_offset",)}
 
 
 class RestOptions(Options, prefix="vio_rest_"):
@@ -56,12 +61,13 @@ class OdometryOptions(Options, prefix="vio_"):
     max_imu_gap_s: float = option(0.2, gt=0, lt=1e9)
     """Start again after an interval between IMU samples that is longer than this"""
 
-    estimate: str = "time_offset"
+    estimate: str = "auto"
     """Calibration that is estimated beside the motion, separated by commas: extrinsics, time_offset (of the
-    images on the clock of the IMU), intrinsics, line_delay; or none"""
+    images on the clock of the IMU), intrinsics, line_delay; or none; auto = time_offset, and all of them
+    where check_recording has found the calibration wrong"""
     apply_calibration: bool = True
     """Give the map the calibration that was estimated, where it differs significantly; and read a recording
-    that does not start in the units, axes and calibration that check_recording finds"""
+    in the units, axes and calibration that check_recording finds, where its own do not fit"""
     imu_noise: str = option("auto", choices=("auto", "file"))
     """Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that it
     cannot be"""
@@ -77,7 +83,12 @@ class OdometryOptions(Options, prefix="vio_"):
     def estimated(self) -> tuple[str, ...]:
         """Kinds of calibration that are estimated."""
         names = tuple(name.strip() for name in self.estimate.split(","))
-        return () if names == ("none",) else names
+        return _IN_WORDS.get(names, names)
+
+    def for_doubted(self) -> OdometryOptions:
+        """Return the options for a recording whose calibration has been found wrong."""
+        is_auto = self.estimate.strip() == _AUTO
+        return dataclasses.replace(self, estimate=",".join(CALIBRATED)) if is_auto else self
 
     @property
     def window_states(self) -> tuple[str, ...]:
@@ -98,7 +109,7 @@ class OdometryOptions(Options, prefix="vio_"):
             if name not in CALIBRATED:
                 raise FlagError(
                     f"--{self.flag_prefix}estimate: there is no {name}: give some of "
-                    f"{', '.join(CALIBRATED)}, separated by commas, or none"
+                    f"{', '.join(CALIBRATED)}, separated by commas, or none, or auto"
                 )
         window = self.window
         if window.num_keyframes < 2 and window.num_keyframes != 0:

@@ -144,10 +144,10 @@ def explain_refusal(diagnosis: Diagnosis | None, name: str, reason: str) -> str:
     return f"{name}: the odometry has not started: {first.line} (check_recording tells more)"
 
 
-def check_map(vi_map: VIMap) -> tuple[str, ...]:
-    """Return a line on what the tracks and samples of the longest mission say against the calibration.
+def check_map(vi_map: VIMap) -> tuple[Finding, ...]:
+    """Return what the tracks and samples of the longest mission say against the calibration.
 
-    The first seconds of a recording may not show it, and a map bends by it. None if all is well.
+    The first seconds of a recording may not show it, and a map bends by it.
     """
     counts = np.bincount(vi_map.vertices.mission, minlength=len(vi_map.missions))
     try:
@@ -158,8 +158,8 @@ def check_map(vi_map: VIMap) -> tuple[str, ...]:
     if cannot_work(signals, is_whole=True):
         return ()
     cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
-    first = cause(tuple(_check_motion(signals, cameras)))
-    return () if first is None else (f"this recording shows: {first.line}",)
+    found = _check_motion(signals, cameras)
+    return tuple(f for f in found if f.verdict in (Verdict.WRONG, Verdict.NOTE))
 
 
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.algorithms.recording_check.correction import correct
-from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose_signals, first_cause
+from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose_signals
 from maplab_py.algorithms.recording_check.findings import Verdict
 from maplab_py.algorithms.recording_check.inertial_checks import (
     accel_unit,
@@ -57,8 +57,8 @@ class MendedRecording:
     def notes(self) -> tuple[str, ...]:
         """Notes of the reader, and what is mended."""
         note = (
-            f"does not work as it is; read with what check_recording finds: {', '.join(self.words)} "
-            "(--vio_apply_calibration=false refuses that)"
+            f"does not fit its calibration; read with what check_recording finds: {', '.join(self.words)} "
+            "(--vio_apply_calibration=false does not do so)"
         )
         return (*self.plain.notes, note)
 
@@ -94,8 +94,7 @@ def mended(
     recording: Recording, diagnosis: Diagnosis, stream: StreamOptions
 ) -> MendedRecording | None:
     """Return a recording with what its diagnosis finds wrong, and can put right; None if nothing."""
-    first = first_cause(diagnosis)
-    if first is None or first.verdict is Verdict.HOPELESS or not diagnosis.cameras:
+    if any(f.verdict is Verdict.HOPELESS for f in diagnosis.findings) or not diagnosis.cameras:
         return None
     read = _with_samples(recording, diagnosis)
     if read.words:

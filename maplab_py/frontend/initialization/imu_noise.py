@@ -14,6 +14,8 @@ from maplab_py.sensors import Imu
 
 _LEAST_REDUNDANCY = 5.0
 _LEAST_SCATTERED = 50
+_APART = 0.5
+"""Least interval that counts, as a share of the mean."""
 _SIGMA_OF_MEDIAN = 1.4826
 _LARGEST_FACTOR = 2.0
 _COLUMNS = FRAME_SIZE + 9
@@ -58,8 +60,12 @@ def scatter_density(times_ns: I64, accel_gyro: F64) -> tuple[float, float]:
     """Return the densities of independent noise that samples at about equal intervals scatter by.
 
     The second difference of independent samples has six times their variance. The largest of the three axes
-    counts, and medians over time, so that shocks do not.
+    counts, and medians over time, so that shocks do not. Of samples that come close together, as where a
+    driver has merged those of gyroscope and accelerometer, one counts.
     """
+    step_ns = np.diff(times_ns)
+    is_apart = np.concatenate([[True], step_ns >= _APART * np.mean(step_ns)])
+    times_ns, accel_gyro = times_ns[is_apart], accel_gyro[is_apart]
     step_ns = np.diff(times_ns)
     usual_ns = float(np.median(step_ns))
     is_usual = np.abs(step_ns - usual_ns) < 0.5 * usual_ns

@@ -348,9 +348,9 @@ def test_a_map_tells_what_contradicts_its_calibration():
     vi_map, device = replayed(MOTION)[0], mission().device
     assert check_map(vi_map) == ()
     turned = faults.with_rig(mission(), turn_deg=(0.0, 8.0, 0.0)).device
-    (line,) = check_map(vi_map.replace(sensors=turned.sensors))
-    assert line.startswith("this recording shows: rotation of the extrinsics")
-    assert "--vio_estimate=extrinsics" in line
+    found = check_map(vi_map.replace(sensors=turned.sensors))[0]
+    assert found.check.startswith("rotation of the extrinsics")
+    assert "--vio_estimate=extrinsics" in found.remedy
     alone = dataclasses.replace(device.sensors, sensors={device.rig_id: device.rig})
     assert check_map(vi_map.replace(sensors=alone)) == ()
 
@@ -392,7 +392,7 @@ def test_a_run_that_is_lost_is_mended_or_noted() -> None:
     mapping = run_checked(Mapping, wrong)
     notes = finish(mapping, wrong.name).report.notes
     assert any(
-        "does not work as it is; read with what check_recording finds: accelerations times 9.81"
+        "does not fit its calibration; read with what check_recording finds: accelerations times 9.81"
         in note
         for note in notes
     )
@@ -400,3 +400,32 @@ def test_a_run_that_is_lost_is_mended_or_noted() -> None:
     lost = run_checked(lambda read: Mapping(read, refusing), wrong)
     assert lost.statistics.estimated_frames < 0.5 * lost.statistics.frames
     assert "unit of the accelerometer" in lost.statistics.notes[-1]
+
+
+def test_a_map_that_contradicts_its_calibration_is_made_again() -> None:
+    wrong = faults.with_rig(mission(), turn_deg=(0.0, 5.0, 0.0))
+    plain = Mapping(wrong)
+    plain.run()
+    assert plain.builder is not None
+    found = check_map(plain.builder.make_map())
+    assert found[0].check == "rotation of the extrinsics, camera 0"
+    for is_repeatable in (True, False):
+        mapping = run_checked(Mapping, wrong, is_repeatable=is_repeatable)
+        assert mapping.doubts == ()
+        assert "camera 0: turned by" in mapping.recording_notes[-1]
+        assert mapping.odometry.calibration_estimate is not None
+        off = np.abs(se3.local(mission().device.T_I_C, mapping.odometry.device.T_I_C))[:, 3:]
+        assert np.degrees(off.max()) < 1.0
+
+
+def test_a_sound_recording_is_read_once_and_keeps_its_calibration() -> None:
+    made: list[Mapping] = []
+
+    def make(read: Recording) -> Mapping:
+        made.append(Mapping(read))
+        return made[-1]
+
+    mapping = run_checked(make, mission())
+    assert made == [mapping]
+    assert mapping.doubts == ()
+    assert mapping.odometry.calibration_estimate is None
