@@ -102,25 +102,6 @@ def _csv(path: Path, version: int) -> None:
     write_euroc(_trajectory(version), path, overwrite=True)
 
 
-def _tum(path: Path, version: int) -> None:
-    from maplab_py.interop.trajectories import write_tum
-
-    write_tum(_trajectory(version), path, overwrite=True)
-
-
-def _ply(path: Path, version: int) -> None:
-    from maplab_py.interop.ply import PlyCloud, write_ply
-
-    write_ply(PlyCloud(np.full((3, 3), float(version)), None, None), path)
-
-
-def _projection(path: Path, version: int) -> None:
-    from maplab_py.vision.projection import DescriptorProjection
-    from maplab_py.vision.projection_file import save_projection
-
-    save_projection(DescriptorProjection(np.full((2, 8), float(version))), path, overwrite=True)
-
-
 def _plot(path: Path, version: int) -> None:
     from maplab_py.plotting.figure import new_figure, write_figure
 
@@ -129,24 +110,10 @@ def _plot(path: Path, version: int) -> None:
     write_figure(figure, path)
 
 
-def _view(path: Path, version: int) -> None:
-    from maplab_py.viewer.display.picture import save_picture
-
-    save_picture(np.full((2, 2, 3), version, dtype=np.uint8), path)
-
-
 def _page(path: Path, version: int) -> None:
     from maplab_py.output_files import write_text
 
     write_text(path, ["<html>", f"{version}" * 20_000, "</html>"], overwrite=True)
-
-
-def _truth(path: Path, version: int) -> None:
-    from maplab_py.simulation.raw_data import write_mesh
-    from maplab_py.simulation.surfaces import Surfaces
-
-    side = np.eye(3)[:1] * version
-    write_mesh(Surfaces(np.zeros((1, 3)), side, np.eye(3)[1:2], np.eye(3)[2:]), path)
 
 
 def _aliases(path: Path, version: int) -> None:
@@ -183,13 +150,8 @@ SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "summary map": lambda: _file(_summary, "localization_summary_map"),
     "new file": lambda: Scenario(_nothing, lambda folder: _csv(folder / "a/b.csv", 2)),
     "csv": lambda: _file(_csv, "poses.csv"),
-    "tum": lambda: _file(_tum, "poses.tum"),
-    "ply": lambda: _file(_ply, "points.ply"),
-    "projection matrix": lambda: _file(_projection, "projection.npz"),
     "plot": lambda: _file(_plot, "plot.svg"),
-    "picture of the view": lambda: _file(_view, "view.png"),
     "exported page": lambda: _file(_page, "map.html"),
-    "mesh": lambda: _file(_truth, "mesh.ply"),
     "aliases": lambda: _file(_aliases, "aliases"),
     "history": lambda: dataclasses.replace(_file(_history, "history"), may_be_cut=True),
     "files of one command": lambda: Scenario(_files(1), _files(2), has_many_files=True),

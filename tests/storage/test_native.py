@@ -6,10 +6,6 @@ import dataclasses
 import gzip
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -277,31 +273,6 @@ def test_the_fingerprint_stands_for_the_content(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--force"):
         save_map(vi_map, tmp_path / "a", overwrite=True, known=first)
     assert save_map(vi_map, tmp_path / "a", known=first, force=True).fingerprint == first
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-@pytest.mark.slow
-def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path: Path) -> None:
-    source = shared_data(SUBMAP)
-    folder = tmp_path / "map"
-    vi_map, _ = load_map(source)
-    save_map(vi_map, folder)
-    program = (
-        "import sys; from pathlib import Path; from maplab_py.storage.native import *\n"
-        "m, _ = load_map(Path(sys.argv[1])); print('ready', flush=True)\n"
-        "while True: save_map(m, Path(sys.argv[2]), overwrite=True)"
-    )
-    rng = np.random.default_rng(0)
-    for _ in range(12):
-        child = subprocess.Popen(
-            [sys.executable, "-c", program, str(source), str(folder)], stdout=subprocess.PIPE
-        )
-        assert child.stdout is not None
-        child.stdout.readline()
-        time.sleep(float(rng.uniform(0.0, 0.3)))
-        child.send_signal(signal.SIGKILL)
-        child.wait()
-        assert differences(vi_map, load_map(folder)[0]) == []
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the lock is a POSIX one")
