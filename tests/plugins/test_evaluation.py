@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from maplab_plugins.evaluation import evaluate_trajectory
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, MapError, UserError
@@ -55,13 +54,6 @@ def test_wrong_requests(tmp_path: Path, session: Session) -> None:
     write_euroc(early, tmp_path / "early.csv")
     with pytest.raises(EstimationError, match="only 0 of 12 vertices"):
         session.run("evaluate_trajectory", ground_truth=tmp_path / "early.csv")
-
-
-def test_help_is_complete() -> None:
-    described = evaluate_trajectory.maplab_command
-    assert all(flag.help for flag in described.flags.values())
-    wanted = {"ground_truth", "map_mission", "alignment", "max_time_difference_s", "interpolate"}
-    assert wanted <= set(described.flags)
 
 
 def test_the_second_evaluation_shows_the_difference_to_the_first(

