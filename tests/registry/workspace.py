@@ -150,7 +150,8 @@ PREPARED["get_dense_map_in_range"] = (
 )
 
 OTHER_EXAMPLES = {
-    "simulate_robots": "simulate_robots --spool=spool --scenario=walk.yaml --robots_rate=0"
+    "save_view": "save_view --file=map.png --width_px=320 --height_px=200",
+    "simulate_robots": "simulate_robots --spool=spool --scenario=walk.yaml --robots_rate=0",
 }
 """Lines that take the place of examples which take long."""
 _WALK = """

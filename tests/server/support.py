@@ -103,7 +103,7 @@ class Servers:
             enable_visual_loop_closure_based_map_anchoring=False,
             backup_interval_s=0,
         )
-        self.service = ServiceOptions(stop_when_idle_s=0.2)
+        self.service = ServiceOptions(stop_when_idle_s=0.5)
         self.incremental = IncrementalOptions(full_optimization_every_nth=0)
         self._monkeypatch = monkeypatch
         self.work(copying)

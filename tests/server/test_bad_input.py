@@ -14,7 +14,6 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.sensors import SensorSet
-from maplab_py.server.options import ServiceOptions
 from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Arrival, Entry, Spool, push
 from maplab_py.server.worker import SubmapOrder
@@ -95,7 +94,6 @@ def test_a_duplicate_that_was_saved_again(servers: Servers) -> None:
 def test_a_submap_that_is_half_copied_is_left_alone_until_nothing_comes_any_more(
     servers: Servers,
 ) -> None:
-    servers.service = ServiceOptions(stop_when_idle_s=0.5)  # longer than nothing has to come
     servers.spool.make()
     whole = servers.scratch / "whole"
     save_map(submaps("ant")[0], whole)
