@@ -195,13 +195,16 @@ def mission_map(
     Ids follow from the sensors and the time of the first vertex: equal input gives equal maps.
     """
     states = BodyStates.concatenate(mission.states)
-    rng = np.random.default_rng(_id_seed(device, int(states.times_ns[0])))
+    seed = np.random.default_rng(_id_seed(device, int(states.times_ns[0])))
+    rng, edge_rng, frame_rng, vertex_rng, set_rng = seed.spawn(
+        5
+    )  # an id stays while the mission grows
     count = len(states)
     sensor_id = np.zeros((1, len(MissionSensor), 2), dtype=np.uint64)
     sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
     sensor_id[0, MissionSensor.NCAMERA] = from_hex(device.rig_id)
-    edges, samples = _imu_tables(mission, rng)
-    frames = _frame_table(mission, rng)
+    edges, samples = _imu_tables(mission, edge_rng)
+    frames = _frame_table(mission, frame_rng)
     vi_map = VIMap(
         sensors=device.sensors,
         missions=Missions.filled(
@@ -210,14 +213,14 @@ def mission_map(
         baseframes=BaseFrames.filled(1, id=random_ids(1, rng)),
         vertices=Vertices.filled(
             count,
-            id=random_ids(count, rng),
+            id=random_ids(count, vertex_rng),
             mission=np.zeros(count, dtype=np.int32),
             T_M_I=states.T_M_I,
             v_M=states.v_M_I,
             accel_bias=states.accel_bias,
             gyro_bias=states.gyro_bias,
             timestamp_ns=states.times_ns,
-            nframe_id=random_ids(count, rng),
+            nframe_id=random_ids(count, set_rng),
         ),
         frames=frames,
         keypoints=_keypoint_table(mission),

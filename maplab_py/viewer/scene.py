@@ -167,9 +167,3 @@ def is_same_part(a: Part | None, b: Part | None) -> bool:
     return all(
         np.array_equal(x, y) if isinstance(x, np.ndarray) else bool(x == y) for x, y in pairs
     )
-
-
-def is_elsewhere(before: Scene, after: Scene) -> bool:
-    """Tell whether the view shall move: another map, or one that now takes more room."""
-    larger = after.extent.radius_m > 1.2 * before.extent.radius_m
-    return before.title != after.title or larger

@@ -45,6 +45,9 @@ class ImageFeatures:
 _LARGEST_KEYPOINT = 1e7
 """Of pixels and scales; a file that is damaged has others, and numbers that are none."""
 
+_DAMAGES = (sqlite3.Error, UnicodeDecodeError, MemoryError)
+"""Raised by sqlite for a damaged file; MemoryError where sizes in it are huge."""
+
 
 class ColmapDatabase:
     """A database, opened for reading only."""
@@ -64,8 +67,8 @@ class ColmapDatabase:
             self._connection = sqlite3.connect(uri, uri=True)
             self._id_of = dict(self._connection.execute("SELECT name, image_id FROM images"))
             columns = self._connection.execute("PRAGMA table_info(descriptors)").fetchall()
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise self._damaged(str(error)) from error
+        except _DAMAGES as error:
+            raise self._damaged(str(error) or "its sizes make no sense") from error
         self._has_types = any(column[1] == "type" for column in columns)
 
     def close(self) -> None:
@@ -127,8 +130,8 @@ class ColmapDatabase:
         query = f"SELECT {columns} FROM {table} WHERE image_id = ?"
         try:
             row: tuple[int, ...] | None = self._connection.execute(query, (image,)).fetchone()
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise self._damaged(str(error)) from error
+        except _DAMAGES as error:
+            raise self._damaged(str(error) or "its sizes make no sense") from error
         if row is not None and not all(isinstance(value, int) for value in row[:-1]):
             raise self._damaged(f"{table} of image {image} have no sizes")
         return row

@@ -13,8 +13,8 @@ import viser
 from numpy.typing import NDArray
 
 from maplab_py.viewer.colours import HIDDEN, from_hex
+from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.display.parts import by_user
-from maplab_py.viewer.display.server import VIEWS
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
@@ -271,11 +271,12 @@ class Panel:
             self._mission_widgets.append(button)
 
     def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
-        """Show what was picked; without facts the hint."""
+        """Show what was picked; without facts the hint, and the image that is there unless it was picked."""
         table = fact_table(facts) if facts else hint(_HINT)
         self.facts.content = (hint(note) if note else "") + table
+        if facts or self.clear.visible:
+            self.show_image(image)
         self.clear.visible = bool(facts)
-        self.show_image(image)
 
     def show_hint(self, message: str) -> None:
         """Say in the place of the facts why nothing was selected."""

@@ -22,8 +22,9 @@ from maplab_py.child_processes import kill, start
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.viewer.display import panel
+from maplab_py.viewer.display.camera import aim, aim_initially, view_of
 from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
-from maplab_py.viewer.display.server import aim, aim_initially, page_script
+from maplab_py.viewer.display.server import page_script
 from maplab_py.viewer.scene import Extent, Scene
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -190,9 +191,8 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
     Raises:
         UserError: The file cannot be written.
     """
-    aim_initially(server.initial_camera, scene.extent, beside_panel=False)
+    aim_initially(server.initial_camera, scene.extent, view_of(scene.extent))
     page = server.scene.as_html(dark_mode=is_dark)
-    aim_initially(server.initial_camera, scene.extent)
     entries = [entry for layer in scene.layers if layer.name in layers for entry in layer.legend]
     overlay = _OVERLAY.format(
         ground="rgba(24,26,31,0.82)" if is_dark else "rgba(255,255,255,0.82)",

@@ -18,10 +18,10 @@ from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.colours import AXES, hex_codes
 from maplab_py.viewer.display import panel
+from maplab_py.viewer.display.camera import FREE, RIDES, ride
 from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, no_image
-from maplab_py.viewer.display.server import FREE, RIDES, ride
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Signal, vertex_signals

@@ -18,20 +18,21 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
+from maplab_py.viewer.display.camera import Cameras, aim, approach
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes, by_user
 from maplab_py.viewer.display.picture import export_html, save_picture, take_picture
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
-from maplab_py.viewer.display.server import LOOPBACK, aim, aim_initially, approach, start_server
+from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, pick
 from maplab_py.viewer.playback import moved_scene, without_played
-from maplab_py.viewer.scene import Scene, is_elsewhere
+from maplab_py.viewer.scene import Scene
 from maplab_py.vimap import VIMap
 
 _MAX_SHARE = 0.02
@@ -61,6 +62,7 @@ class Viewer:
         """
         self._lock = threading.RLock()
         self._server = start_server(port)
+        self._cameras = Cameras(self._server)
         self._nodes = Nodes(self._server)
         self._panel = Panel(self._server, self, self._lock)
         self.show_image = self._panel.show_image
@@ -142,10 +144,7 @@ class Viewer:
             self._playback.configure(playback or PlaybackOptions(), image_of)
             self._image_of = image_of
             self._choices = {}
-            moves_view = self.scene is None or is_elsewhere(self.scene, scene)
             self._show(subject, drawing, scene)
-            if moves_view:
-                self.look_at_everything()
         return scene
 
     def follow(self, subject: Subject) -> None:
@@ -185,11 +184,8 @@ class Viewer:
 
     def look_at_everything(self) -> None:
         """Let all pages, and those that will be opened, see the whole map."""
-        if self.scene is None:
-            return
-        aim_initially(self._server.initial_camera, self.scene.extent)
-        for client in self._server.get_clients().values():
-            aim(client.camera, self.scene.extent)
+        if self.scene is not None:
+            self._cameras.show_all(self.scene.extent)
 
     def save_picture(self, path: Path, size_px: tuple[int, int], view: str = "") -> int:
         """Save a picture of the scene; return the number of open pages that could have taken it.
@@ -222,7 +218,10 @@ class Viewer:
         self.wait()
         layers = self.visible_layers
         with self._lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
-            return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
+            try:
+                return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
+            finally:
+                self._cameras.aim_new_pages(scene.extent)
 
     def _shown(self) -> Scene:
         if self.scene is None:
@@ -453,12 +452,17 @@ class Viewer:
     def _show(self, subject: Subject, drawing: Drawing, scene: Scene) -> None:
         is_new_map = self.subject is None or self.subject.vi_map is not subject.vi_map
         is_new_place = self.scene is None or self.scene.extent.radius_m != scene.extent.radius_m
+        is_other_map = self.scene is None or self.scene.title != scene.title
         self.subject, self.scene, self._drawing = subject, scene, drawing
         if is_new_map:
             self._selection.clear()
         self._playback.stop()
         if is_new_place:
             self._show_ground(scene)
+        if is_other_map:
+            self._cameras.show_all(scene.extent)
+        else:
+            self._cameras.keep_in_view(scene.extent)
         self._panel.show_colouring(subject.options, scene.missions)
         self._panel.show_reasons(scene, subject.options.refused_closures_reason)
         self.redraw()

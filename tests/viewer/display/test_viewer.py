@@ -21,8 +21,9 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import so3
 from maplab_py.sensors import SensorSet
 from maplab_py.viewer.building import Subject, make_checked_drawing
+from maplab_py.viewer.display.camera import BEHIND, INSIDE, ride
 from maplab_py.viewer.display.parts import add_part, by_user
-from maplab_py.viewer.display.server import BEHIND, INSIDE, page_script, ride
+from maplab_py.viewer.display.server import page_script
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions

@@ -1,0 +1,209 @@
+"""The cameras of the viewer's pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from maplab_py.array_types import F64
+from maplab_py.geometry import se3, so3
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.layers.cameras import mission_cameras
+from maplab_py.viewer.scene import Extent
+
+FIELD_OF_VIEW_RAD = float(np.radians(45.0))
+_ELEVATIONS_DEG = {"overview": 38.0, "top": 89.9, "side": 8.0}
+VIEWS = tuple(_ELEVATIONS_DEG)
+FREE, BEHIND, INSIDE = "free", "ride behind", "through the camera"
+RIDES = (FREE, BEHIND, INSIDE)
+"""Camera mode of a page for a mission that is played."""
+_ASPECT = 1.35
+"""Width by height that a view of everything is sure to fit."""
+_MARGIN = 1.08
+_FREE = 0.74
+"""Part of a page's width that the panel leaves free."""
+_LEAST_SHARE, _ROOM = 0.5, 1.25
+"""Share of the picture below which a map is moved closer to; room that a map gets to grow."""
+
+
+def view_of(
+    extent: Extent, view: str = "overview", *, beside_panel: bool = False, room: float = 1.0
+) -> tuple[F64, F64]:
+    """Return camera position (3,) and target (3,) that just show the whole outline; z is up.
+
+    The overview and the view from the side look across the longest direction of the map.
+
+    Args:
+        extent: What to show.
+        view: One of `VIEWS`.
+        beside_panel: Leave the part of the page free that the panel covers.
+        room: Width of the picture by that of the outline.
+    """
+    azimuth = _across(extent.outline)
+    if view == "overview":
+        azimuth -= np.radians(22.0)
+    elevation = np.radians(_ELEVATIONS_DEG[view])
+    back = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    p = (extent.outline - extent.centre) @ axes.T
+    tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([_ASPECT, 1.0]) / (_MARGIN * room)
+    if beside_panel:
+        tangent[0] *= _FREE
+    middle = 0.5 * (p[:, :2].min(axis=0) + p[:, :2].max(axis=0))
+    for _ in range(3):  # near points need more room: centre what is seen, not what is there
+        distance = _distance(p, middle, tangent)
+        seen = (p[:, :2] - middle) / (distance - p[:, 2:])
+        middle = middle + 0.5 * distance * (seen.min(axis=0) + seen.max(axis=0))
+    distance = max(_distance(p, middle, tangent), 0.2 * extent.radius_m)
+    if beside_panel:
+        middle[0] += distance * (1.0 - _FREE) * _ASPECT * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+    target = extent.centre + middle @ axes[:2]
+    return target + distance * back, target
+
+
+def _distance(p: F64, middle: F64, tangent: F64) -> float:
+    """Return from how far points (N, 3), right, up and back, fit into the opening (2,)."""
+    return max(float((np.abs(p[:, :2] - middle) / tangent + p[:, 2:]).max()), 0.1)
+
+
+def _across(outline: F64) -> float:
+    """Return the direction [rad] from which the outline (N, 3) is widest, on the side of -y."""
+    flat = outline[:, :2] - outline[:, :2].mean(axis=0)
+    _, axes = np.linalg.eigh(flat.T @ flat + 1e-12 * np.eye(2))
+    normal = axes[:, 0] if axes[1, 0] <= 0.0 else -axes[:, 0]
+    return float(np.arctan2(normal[1], normal[0]))
+
+
+def share_of_picture(extent: Extent, position: F64, target: F64) -> float:
+    """Return the share of the free part of a page that the outline spans; infinite if it is not all seen."""
+    back = (position - target) / np.linalg.norm(position - target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    p = (extent.outline - position) @ np.stack([right, np.cross(back, right), back]).T
+    if (p[:, 2] >= 0.0).any():
+        return np.inf
+    tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD)
+    seen = p[:, :2] / (-p[:, 2:] * tangent * np.array([_ASPECT, 1.0]))
+    seen[:, 0] = (seen[:, 0] + 1.0 - _FREE) / _FREE
+    if (np.abs(seen) > 1.0).any():
+        return np.inf
+    return float(0.5 * np.ptp(seen, axis=0).max())
+
+
+class Cameras:
+    """The cameras of open pages: those that nobody has moved keep the whole map in their picture."""
+
+    def __init__(self, server: Any) -> None:
+        """Start with a server that shows nothing yet."""
+        self._server = server
+        self._view = (np.array([0.0, -1.0, 1.0]), np.zeros(3))  # of new pages
+        self._given: dict[int, F64] = {}  # where a page's camera was put, by client
+
+    def show_all(self, extent: Extent) -> None:
+        """Let all pages, and those that will be opened, see everything."""
+        self._move(extent, list(self._server.get_clients().values()), room=1.0)
+
+    def keep_in_view(self, extent: Extent) -> None:
+        """Move cameras, unless the user has, when the map outgrows their picture or is small in it."""
+        if _LEAST_SHARE <= share_of_picture(extent, *self._view) <= 1.0:
+            return
+        clients = self._server.get_clients()
+        unmoved = [client for key, client in clients.items() if self._is_unmoved(key, client)]
+        self._move(extent, unmoved, room=_ROOM)
+
+    def aim_new_pages(self, extent: Extent) -> None:
+        """Let pages that will be opened look as those do that nobody has moved."""
+        aim_initially(self._server.initial_camera, extent, self._view)
+
+    def _is_unmoved(self, key: int, client: Any) -> bool:
+        given = self._given.get(key, self._view[0])
+        off = np.linalg.norm(np.asarray(client.camera.position) - given)
+        return bool(off < 0.01 * np.linalg.norm(self._view[0] - self._view[1]))
+
+    def _move(self, extent: Extent, clients: list[Any], room: float) -> None:
+        self._view = view_of(extent, beside_panel=True, room=room)
+        self.aim_new_pages(extent)
+        for client in clients:
+            with client.atomic():
+                _look(client.camera, extent, self._view)
+            self._given[client.client_id] = self._view[0]
+
+
+def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bool = True) -> None:
+    """Point the camera of a page."""
+    _look(camera, extent, view_of(extent, view, beside_panel=beside_panel))
+
+
+def _look(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+    position, target = view
+    camera.up_direction = (0.0, 0.0, 1.0)
+    camera.position = position
+    camera.look_at = target
+    camera.fov = FIELD_OF_VIEW_RAD
+    camera.near = max(1e-3, 2e-4 * extent.radius_m)
+    camera.far = 100.0 * extent.radius_m
+
+
+def approach(camera: Any, p: F64, distance_m: float) -> None:
+    """Look at a point (3,) of the scene from a distance, in the direction of the present view."""
+    back = np.asarray(camera.position) - np.asarray(camera.look_at)
+    length = float(np.linalg.norm(back))
+    back = back / length if length > 1e-9 else np.array([0.0, -0.8, 0.6])
+    camera.position = p + distance_m * back
+    camera.look_at = p
+
+
+def ride(camera: Any, drawing: Drawing, vertex: int, how: str) -> None:
+    """Move the camera of a page along with a vertex (row), behind it or where its camera is.
+
+    It looks where the first camera of the mission looks; without cameras where the path leads.
+    """
+    centre, forward = _line_of_sight(drawing, vertex)
+    length = 0.3 * drawing.unit_m
+    if how == BEHIND:
+        level = np.array([forward[0], forward[1], 0.0])
+        norm = float(np.linalg.norm(level))
+        back = level / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0])
+        camera.position = centre + length * (np.array([0.0, 0.0, 0.6]) - back)
+        camera.look_at = centre + 0.2 * length * back
+    else:
+        camera.position = centre
+        camera.look_at = centre + 0.1 * length * forward
+
+
+def _line_of_sight(drawing: Drawing, vertex: int) -> tuple[F64, F64]:
+    """Return from where (3,) and in which direction (3,) the camera of a vertex looks."""
+    vi_map = drawing.vi_map
+    p = drawing.p_vertices[vertex]
+    mission = int(vi_map.vertices.mission[vertex])
+    cameras = mission_cameras(vi_map, mission)
+    if cameras:
+        T_G_C = se3.compose(vi_map.T_G_I[vertex], cameras[0].T_I_C)
+        offset = T_G_C[4:] - vi_map.T_G_I[vertex, 4:]
+        return p + offset, so3.rotate(T_G_C[:4], np.array([0.0, 0.0, 1.0]))
+    start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
+    step = (
+        drawing.p_vertices[min(vertex + 1, stop - 1)] - drawing.p_vertices[max(vertex - 1, start)]
+    )
+    length = float(np.linalg.norm(step))
+    return p, step / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
+
+
+def aim_initially(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+    """Set what new pages begin with (its field for the up direction has another name)."""
+    position, target = view
+    camera.position = tuple(position.tolist())
+    camera.look_at = tuple(target.tolist())
+    camera.up = (0.0, 0.0, 1.0)
+    camera.fov = FIELD_OF_VIEW_RAD
+    camera.near = max(1e-3, 2e-4 * extent.radius_m)
+    camera.far = 100.0 * extent.radius_m

@@ -1,0 +1,60 @@
+"""Cameras of pages: a map that grows stays in the picture, unless somebody has moved the camera."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maplab_py.viewer.display.camera import Cameras, share_of_picture, view_of
+from maplab_py.viewer.scene import Extent
+
+
+def extent(radius_m: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Extent:
+    rng = np.random.default_rng(0)
+    outline = np.asarray(centre) + radius_m * rng.uniform(-1.0, 1.0, (40, 3)) * [1.0, 0.6, 0.2]
+    return Extent(np.asarray(centre), radius_m, centre[2], outline)
+
+
+def page(number: int) -> Any:
+    camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+    return SimpleNamespace(client_id=number, camera=camera, atomic=threading.Lock)
+
+
+@pytest.mark.parametrize("room", [1.0, 1.25, 2.0])
+@pytest.mark.parametrize("radius_m", [0.3, 40.0])
+def test_a_view_shows_everything_beside_the_panel(radius_m: float, room: float) -> None:
+    seen = extent(radius_m, (5.0, -2.0, 1.0))
+    share = share_of_picture(seen, *view_of(seen, beside_panel=True, room=room))
+    assert 0.75 / room < share <= 1.0 / room
+    position, target = view_of(seen, beside_panel=True)
+    assert share_of_picture(seen, target, position) == np.inf  # it looks away
+
+
+def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
+    pages = {3: page(3), 7: page(7)}
+    server = SimpleNamespace(initial_camera=SimpleNamespace(), get_clients=lambda: pages)
+    cameras = Cameras(server)
+    cameras.show_all(extent(1.0))
+    pages[7].camera.position += np.array([0.5, 0.0, 0.0])  # its user turns it
+    moved = pages[7].camera.position.copy()
+    looks = []
+    for radius_m in (1.02, 2.0, 2.2, 9.0, 2.0):
+        cameras.keep_in_view(extent(radius_m))
+        looks.append(pages[3].camera.position.copy())
+        share = share_of_picture(
+            extent(radius_m), pages[3].camera.position, pages[3].camera.look_at
+        )
+        assert 0.5 <= share <= 1.0
+        np.testing.assert_array_equal(pages[7].camera.position, moved)
+        np.testing.assert_array_equal(server.initial_camera.position, pages[3].camera.position)
+    np.testing.assert_array_equal(looks[1], looks[2])  # there is room for growth
+    pages[9] = page(9)
+    pages[9].camera.position = np.array(server.initial_camera.position)  # opened since
+    cameras.keep_in_view(extent(30.0))
+    np.testing.assert_array_equal(pages[9].camera.position, pages[3].camera.position)
+    cameras.show_all(extent(1.0))  # another map is for all
+    np.testing.assert_array_equal(pages[7].camera.position, pages[3].camera.position)
