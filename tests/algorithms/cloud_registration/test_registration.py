@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
+from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport
 from maplab_py.algorithms.cloud_registration.registration import (
     PreparedCloud,
     Registration,
@@ -228,9 +229,15 @@ TWO_ROOMS = WorldOptions(rooms=2, landmarks_per_room=300)
 TOUR = SessionOptions(kind="loop", duration_s=60.0, turns=2.0, wall_distance_m=2.8)
 
 
+@functools.cache
+def closed() -> tuple[VIMap, CloudClosureReport]:
+    """Return the short walk with the loops that its clouds close, and the report."""
+    return close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
+
+
 def test_clouds_close_loops_that_a_relaxation_uses() -> None:
     data = simulated(SHORT)
-    vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
+    vi_map, report = closed()
     assert report.failure == ""
     assert report.clouds == 24
     assert report.edges_added == len(vi_map.loop_closure_edges) > 10
@@ -243,7 +250,7 @@ def test_clouds_close_loops_that_a_relaxation_uses() -> None:
 
 
 def test_closures_are_recorded_and_removed_like_those_of_images() -> None:
-    vi_map, report = close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
+    vi_map, report = closed()
     closures = read_record(vi_map).closures
     assert len(closures) == report.pairs
     listed = list_closures(vi_map)
@@ -259,7 +266,7 @@ def test_closures_are_recorded_and_removed_like_those_of_images() -> None:
 
 
 def test_a_repeated_search_replaces_the_edges() -> None:
-    vi_map, report = close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
+    vi_map, report = closed()
     again, second = close_cloud_loops(vi_map, Path(), OPTIONS)
     assert second == report
     np.testing.assert_array_equal(again.loop_closure_edges.id, vi_map.loop_closure_edges.id)
@@ -267,7 +274,7 @@ def test_a_repeated_search_replaces_the_edges() -> None:
 
 
 def test_recorded_closures_name_the_pairs() -> None:
-    vi_map, _ = close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
+    vi_map, _ = closed()
     options = dataclasses.replace(OPTIONS, from_closures=True, every_nth=2)
     again, report = close_cloud_loops(vi_map, Path(), options)
     assert 0 < report.accepted <= report.pairs

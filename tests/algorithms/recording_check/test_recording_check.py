@@ -388,7 +388,8 @@ def test_a_sound_recording_and_a_hopeless_one_stay() -> None:
 
 
 def test_a_run_that_is_lost_is_mended_or_noted() -> None:
-    wrong = faults.with_imu(mission(), EYE / 9.81, EYE)
+    short = (MOTION[0], dataclasses.replace(MOTION[1], duration_s=4.0, turns=0.2))
+    wrong = faults.with_imu(MapRecording(replayed(short)[0], 0), EYE / 9.81, EYE)
     mapping = run_checked(Mapping, wrong)
     notes = finish(mapping, wrong.name).report.notes
     assert any(
