@@ -24,8 +24,8 @@ LOOP_CLOSURE = (
     Fault(
         "support_counts_the_query_itself",
         "maplab_py/algorithms/loop_closure/consensus.py",
-        "            other = query[i] != query[j]\n",
-        "            other = query[i] >= 0\n",
+        "between < _NEAR_M, query[i] != query[j]",
+        "between < _NEAR_M, query[i] >= 0",
         _GATES,
     ),
     Fault(
@@ -38,15 +38,15 @@ LOOP_CLOSURE = (
     Fault(
         "drift_limits_closures_between_missions",
         "maplab_py/algorithms/loop_closure/gates.py",
-        '"--lc_max_drift_ratio", "m", applies=c.same,',
-        '"--lc_max_drift_ratio", "m",',
+        "between_m=np.where(a == b, np.abs(way_m[query] - way_m[place]), np.nan),",
+        "between_m=np.abs(way_m[query] - way_m[place]),",
         _ANCHORING,
     ),
     Fault(
         "look_alikes_not_resolved_by_odometry",
         "maplab_py/algorithms/loop_closure/gates.py",
-        "ambiguous & c.related & ~c.is_usual",
-        "ambiguous & c.related",
+        "v.accepted & v.is_related & ~j.is_usual",
+        "v.accepted & v.is_related",
         _GATES,
     ),
     Fault(
@@ -80,8 +80,8 @@ LOOP_CLOSURE = (
     Fault(
         "lone_closure_that_others_contradict",
         "maplab_py/algorithms/loop_closure/consensus.py",
-        "    lone = (support == 0) & (against == 0) & (inliers >= rule.lone_inliers)\n",
-        "    lone = (support == 0) & (inliers >= rule.lone_inliers)\n",
+        "return support, smallest, (support == 0) & (against == 0.0)",
+        "return support, smallest, support == 0",
         _GATES,
     ),
     Fault(
@@ -101,7 +101,7 @@ LOOP_CLOSURE = (
     Fault(
         "removed_closures_come_back",
         "maplab_py/algorithms/loop_closure/gates.py",
-        "    judgement.refuse(banned(vi_map, query, place), Verdict.REMOVED)\n",
+        "    j.refuse(banned(vi_map, query, place), Verdict.REMOVED)\n",
         "",
         _RECORD,
     ),
