@@ -1,4 +1,4 @@
-"""What tests rely on: association, IMU model, collection, waiting."""
+"""What tests rely on: association, IMU model, collection, waiting, planted faults."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from maplab_py.algorithms.self_calibration.pruning import test_mutual_consistenc
 from maplab_py.geometry import so3
 from maplab_py.geometry.association import nearest_rows
 from maplab_py.sensors import ImuIntrinsics
+from tests.mutation.fault import planted
+from tests.mutation.faults import AREAS
 from tests.support.association import associate
+from tests.support.data import REPOSITORY
 from tests.support.imu_model import correct_imu, distort_imu
 from tests.support.waiting import wait_until
 
@@ -109,3 +112,11 @@ def test_waiting_ends_with_the_condition_or_the_time() -> None:
     numbers = itertools.count()
     assert wait_until(lambda: next(numbers) == 3)
     assert not wait_until(lambda: False, at_most_s=0.02)
+
+
+@pytest.mark.parametrize("area", AREAS)
+def test_faults_can_be_planted_and_name_tests(area: str) -> None:
+    for fault in AREAS[area]:
+        planted(fault, (REPOSITORY / fault.file).read_text(encoding="utf-8"))
+        for test in fault.tests:
+            assert (REPOSITORY / test.partition("::")[0]).exists(), fault.name
