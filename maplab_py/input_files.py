@@ -7,6 +7,7 @@ or because its parts become objects. Everything that is read from outside passes
 from __future__ import annotations
 
 import os
+import re
 import stat
 import zlib
 from collections.abc import Iterable
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.errors import UserError
+from maplab_py.errors import MapError, UserError
 from maplab_py.options import Options, option
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ LARGEST = 1e100
 RAISE_THE_BOUND = "raise --proto_max_size_megabytes if it is really that large"
 _CHUNK = 1 << 20
 _UTF_16 = b"\xff\xfe", b"\xfe\xff"
+_CONTROLS = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
 _FIRST_CHUNK = 1 << 12
 _ZIP_DIRECTORY_ENTRIES = 10_000
 
@@ -94,20 +96,46 @@ def read_text(
     *,
     remedy: str = RAISE_THE_BOUND,
     error: type[UserError] = UserError,
-    encoding: str = "utf-8",
 ) -> str:
     """Return the text of a file with line ends `\\n`; see `read_bytes`.
-
-    With the encoding utf-8-sig, for which a byte order mark may come first, that of UTF-16 counts, too.
 
     Raises:
         OSError: The file cannot be read.
         UnicodeDecodeError: It is not text.
         UserError: It is larger than max_bytes.
     """
-    content = read_bytes(path, max_bytes, remedy=remedy, error=error)
-    is_utf_16 = encoding == "utf-8-sig" and content.startswith(_UTF_16)
-    text = content.decode("utf-16" if is_utf_16 else encoding)
+    text = read_bytes(path, max_bytes, remedy=remedy, error=error).decode("utf-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_foreign_text(path: Path, max_bytes: int, *, remedy: str = "split it into parts") -> str:
+    """Return the text of a file that another program wrote; see `decode_foreign` and `read_bytes`.
+
+    Raises:
+        MapError: The file cannot be read, is too large, or is not text.
+    """
+    try:
+        return decode_foreign(read_bytes(path, max_bytes, remedy=remedy, error=MapError))
+    except OSError as error:
+        raise MapError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"cannot read {path}: it is not text") from error
+
+
+def decode_foreign(content: bytes) -> str:
+    """Return text as UTF-16 or UTF-8, with a byte order mark or without, with line ends `\\n`.
+
+    Other encodings differ from ASCII in names and comments alone: they are read as Latin-1, for ° and µ.
+
+    Raises:
+        UnicodeDecodeError: The content is not text.
+    """
+    try:
+        text = content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+    except UnicodeDecodeError:
+        if b"\0" in content or content.startswith(_UTF_16):
+            raise
+        text = _CONTROLS.sub("\ufffd", content.decode("latin-1"))
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

@@ -62,8 +62,8 @@ KNOWN_FORMATS = (
 )
 _OPENVINS = "estimator_config.yaml"
 _SAME_POSE = 1e-9
-_ODD_ASPECT, _ODD_DISTANCE_M = 1.2, 5.0
-"""Ratio of focal lengths, and distance of a camera, that are noted."""
+_ODD_ASPECT, _ODD_DISTANCE_M, _LEAST_FOCAL, _ODD_SHIFT_NS = 1.2, 5.0, 0.05, 500_000_000
+"""Ratio of focal lengths, distance of a camera, share of the width, and time shift that are noted."""
 _LARGEST_NOISE = (("gyroscope", "rad/s/√Hz", 1.0), ("accelerometer", "m/s²/√Hz", 10.0))
 _ODD_SCALE = 0.1
 """Scales of IMUs that are further from 1 than this are noted: those on the market are within 0.03."""
@@ -187,9 +187,19 @@ def _camera_notes(path: Path, cameras: Sequence[Camera], T_I_C: F64) -> list[str
             notes.append(
                 f"{path}: camera {row}: the centre {cu:.6g}, {cv:.6g} is outside the image"
             )
-        if max(fu / fv, fv / fu) > _ODD_ASPECT:
+        if fu < _LEAST_FOCAL * camera.width_px:
+            notes.append(
+                f"{path}: camera {row}: the focal length is {fu:.6g}: is it in pixels of {camera.width_px} x "
+                f"{camera.height_px}?"
+            )
+        elif max(fu / fv, fv / fu) > _ODD_ASPECT:
             notes.append(
                 f"{path}: camera {row}: focal lengths {fu:.6g} and {fv:.6g} differ: is the order fu fv cu cv?"
+            )
+        if abs(camera.time_offset_ns) > _ODD_SHIFT_NS:
+            notes.append(
+                f"{path}: camera {row}: the time shift is {camera.time_offset_ns * 1e-9:.4g} s: is it in "
+                "seconds?"
             )
         distance_m = float(np.linalg.norm(np.clip(T[4:], -1e9, 1e9)))
         if distance_m > _ODD_DISTANCE_M:

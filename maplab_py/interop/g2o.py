@@ -17,7 +17,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.input_files import TooLarge, inflate, read_bytes
+from maplab_py.input_files import TooLarge, decode_foreign, inflate, read_bytes
 from maplab_py.interop.information_matrices import positive_definite
 from maplab_py.interop.odometry_chain import chained_poses
 from maplab_py.interop.text_table import format_rows
@@ -108,7 +108,7 @@ def _text(path: Path) -> str:
         content = read_bytes(path, _MAX_BYTES, remedy=remedy, error=MapError)
         if content.startswith(_GZIP):
             content = bytes(inflate(content, _MAX_BYTES, wbits=_GZIP_WINDOW)[0])
-        return content.decode("utf-8")
+        return decode_foreign(content)
     except TooLarge as error:
         raise MapError(f"{path}: unpacks to {error}; {remedy}") from error
     except (EOFError, zlib.error) as error:
@@ -198,10 +198,11 @@ def _ids(lines: list[tuple[int, list[str]]], count: int | None, path: Path) -> U
 
 
 def _check_numbers(number: int, words: list[str], path: Path) -> None:
-    try:
-        [float(word) for word in words]
-    except ValueError as error:
-        raise MapError(f"{path}:{number}: {error}") from None
+    for word in words:
+        try:
+            float(word)
+        except ValueError:
+            raise MapError(f"{path}:{number}: '{word}' is not a number") from None
 
 
 def _pose(values: F64) -> F64:

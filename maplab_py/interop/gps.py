@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.input_files import read_bytes
+from maplab_py.input_files import decode_foreign, read_bytes
 from maplab_py.interop.stamps import FIXES
 from maplab_py.interop.text_table import TextTable, parse_text_table
 
@@ -38,6 +38,10 @@ _SENTENCE = re.compile(
     re.IGNORECASE,
 )
 _NMEA = re.compile(r"^.{0,80}[$!][A-Z]{2}[A-Z]{3},", re.IGNORECASE | re.MULTILINE)
+_HEMISPHERE = re.compile(
+    r"(?<![\w.+-])(\d+\.?\d*)(\s*[,;\s]?\s*)([NSEW])(?=\s*([,;\s]|$))", re.MULTILINE
+)
+"""Degrees and their hemisphere, as in "47.1,S" and "8.5W"."""
 _FIXES = ("GGA", "GNS")
 _LEAST_FIELDS = {"GGA": 14, "GNS": 12, "RMC": 9, "ZDA": 4}
 """Fields of a whole sentence, which is told by them where nothing has a check sum."""
@@ -79,14 +83,18 @@ def read_gps(path: Path, date: str = "", time_unit: str = "") -> GpsTrack:
     """
     try:
         content = read_bytes(path, _MAX_BYTES, remedy="split it into parts", error=MapError)
-        text = content.decode("utf-8-sig")
+        text = decode_foreign(content)
     except OSError as error:
         raise MapError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         text = content.decode("latin-1")  # receivers mix sentences with binary messages
         if not _SENTENCE.search(text):
-            raise MapError(f"cannot read {path}: it is not UTF-8 text") from error
+            raise MapError(f"cannot read {path}: it is not text") from error
         return _from_nmea(text, str(path), date)
+    if text.lstrip().startswith("<"):
+        raise MapError(
+            f"{path}: is XML, as GPX or KML: convert it to CSV with time, latitude, longitude and altitude"
+        )
     if _NMEA.search(text):
         return _from_nmea(text, str(path), date)
     return _from_csv(text, str(path), time_unit)
@@ -171,6 +179,7 @@ def _check_order(times_ns: I64, fixes: F64, kept: I64, source: str, places: list
 
 
 def _from_csv(text: str, source: str, time_unit: str) -> GpsTrack:
+    text = _HEMISPHERE.sub(_signed, text)
     table = parse_text_table(text, source, FIXES, unit=time_unit, allow_nan=True)
     reasons = np.full(len(table.times_ns), "", dtype=_REASON)
     if table.names:
@@ -182,6 +191,13 @@ def _from_csv(text: str, source: str, time_unit: str) -> GpsTrack:
     places = _columns(table)
     fixes = np.append(table.values[:, places[:2]], table.columns(places[2:], "length"), axis=1)
     return gps_track(table.times_ns, fixes, source, reasons, table.line_numbers)
+
+
+def _signed(match: re.Match[str]) -> str:
+    """Return degrees with the sign of their hemisphere, whose letter stays if it is a cell of its own."""
+    degrees, gap, letter, after = match.groups()
+    is_cell = gap and (gap.strip() or after not in (",", ";"))
+    return "-" * (letter in "SW") + degrees + (gap + letter) * bool(is_cell)
 
 
 def _columns(table: TextTable) -> list[int]:

@@ -30,8 +30,6 @@ _CAMERA_BITS = (8, 10, 12, 14, 16)
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _PNG_BIT_DEPTH = 24  # place of the byte in the file
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_TAIL = 64
-"""Bytes at the end of a file in which the end marker must be; some writers pad."""
 _JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _OTHER_FORMATS = {
     b"RIFF": "WebP",
@@ -219,7 +217,7 @@ def encoded_size(name: str, data: bytes, form: str = "") -> tuple[int, int]:
         return int(width), int(height)
     if data.startswith(_JPEG):
         size = _jpeg_size(data)
-        if size is None or _JPEG_END not in data[-_TAIL:]:
+        if size is None:
             raise MapError(f"{name}: the image is truncated; {REMEDY}")
         return size
     if not data:
@@ -291,7 +289,10 @@ def _check_png(data: bytes, name: str) -> None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height from the frame header, None when it is not there."""
+    """Return width and height from the frame header, None when it or the end marker behind it is not there.
+
+    More may follow the end: padding, or the video of a telephone's motion photo.
+    """
     place = 2
     while place + 9 <= len(data) and data[place] == 0xFF:
         marker = data[place + 1]
@@ -300,6 +301,6 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             continue
         if marker in _JPEG_FRAME_MARKERS:
             height, width = struct.unpack(">HH", data[place + 5 : place + 9])
-            return int(width), int(height)
+            return (int(width), int(height)) if data.rfind(_JPEG_END, place) > 0 else None
         place += 2 + int(struct.unpack(">H", data[place + 2 : place + 4])[0])
     return None

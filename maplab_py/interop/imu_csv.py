@@ -19,10 +19,13 @@ _HEADER = (
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
 )
 _NAME = re.compile(
-    r"(?:.*?\.)??(?:(?P<accel>a|acc|accel|accelerometer|acceleration|linear[_ ]?acc(?:el(?:eration)?)?|alpha)"
+    r"(?:.*?\.)??(?:(?P<accel>a|acc|accel|accelerometer|acceleration|alpha"
+    r"|lin(?:ear)?[_ ]?acc(?:el(?:eration)?)?)"
     r"|(?P<gyro>w|g|gyr|gyro|gyroscope|omega|ang(?:ular)?[_ ]?(?:vel(?:ocity)?|rate)))"
     r"(?:_[a-z0-9_]*?)?[_. ]?(?P<axis>[xyz])"
 )
+_GRAVITY_MPS2, _SLOW_RADPS = (7.0, 13.0), 4.0
+"""Means of accelerations with gravity, and of rates that are none."""
 _ORDER = [f"{sensor}{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
 
 
@@ -60,9 +63,11 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
             f"{path}:{line}: the time stamp does not come after that of the row above: sort the rows or "
             "remove this one"
         )
-    return ImuRecording(
-        table.times_ns, np.concatenate(values, axis=1), table.line_numbers, table.note
-    )
+    note = table.note
+    if not table.places(_meaning) and places[0] == 0:
+        first = "columns without names: accelerations come first, as gravity shows"
+        note = "; ".join(filter(None, (note, f"{path}: {first}")))
+    return ImuRecording(table.times_ns, np.concatenate(values, axis=1), table.line_numbers, note)
 
 
 def _places(table: TextTable) -> list[int]:
@@ -71,11 +76,7 @@ def _places(table: TextTable) -> list[int]:
     Raises:
         MapError: Names or number of the columns do not tell them.
     """
-    places: dict[str, int] = {}
-    for place, name in enumerate(table.names):
-        if (match := _NAME.fullmatch(name)) is not None:
-            sensor = "accel" if match["accel"] else "gyro"
-            places.setdefault(sensor + match["axis"], place)
+    places = table.places(_meaning)
     if all(name in places for name in _ORDER):
         return [places[name] for name in _ORDER]
     width = table.values.shape[1]
@@ -86,7 +87,17 @@ def _places(table: TextTable) -> list[int]:
             f"w_x, w_y, w_z, a_x, a_y, a_z in the header; "
             + (f"it has {', '.join(axes)}" if axes else f"not {width + 1}")
         )
-    return [3, 4, 5, 0, 1, 2]
+    first, last = (float(np.mean(np.linalg.norm(v, axis=1))) for v in np.hsplit(table.values, 2))
+    is_accel_first = _GRAVITY_MPS2[0] < first < _GRAVITY_MPS2[1] and last < _SLOW_RADPS
+    return [0, 1, 2, 3, 4, 5] if is_accel_first else [3, 4, 5, 0, 1, 2]
+
+
+def _meaning(name: str) -> str:
+    """Return sensor and axis that a name means, as "gyrox"; empty for others."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return ""
+    return ("accel" if match["accel"] else "gyro") + match["axis"]
 
 
 def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = False) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.input_files import read_text
+from maplab_py.input_files import read_foreign_text
 from maplab_py.options import option
 
 UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
@@ -80,11 +80,10 @@ class Stamps:
 
 def header_unit(name: str) -> str:
     """Return the unit that a column's name tells, as in "timestamp [ns]" or "time_s"; else nothing."""
-    for part in (
-        *re.findall(r"[\[(]([^\])]*)[\])]", name),
-        re.split(r"[^a-zµμ]+", name.lower())[-1],
-    ):
-        unit = _WORDS.get(part.strip().lower())
+    for part in (*re.findall(r"[\[(]([^\])]*)[\])]", name), name):
+        words = re.split(r"[^a-zµμ]+", part.strip().lower())
+        is_of_time = part is name or re.search("time|stamp", words[0])
+        unit = _WORDS.get(words[-1] if is_of_time else part.strip().lower())
         if unit:
             return unit
     return ""
@@ -147,12 +146,7 @@ def read_stamps(path: Path, kind: StampKind, *, unit: str = "", custom: str = "s
     Raises:
         MapError: The file cannot be read or is empty, or as `parse_stamps`.
     """
-    try:
-        remedy = "split it into parts"
-        text = read_text(path, _MAX_BYTES, remedy=remedy, error=MapError, encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
+    text = read_foreign_text(path, _MAX_BYTES)
     rows = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     header = next((line for _, line in rows if line.startswith(("#", "%"))), "")
     rows = [(number, line) for number, line in rows if line and line[0] not in "#%"]

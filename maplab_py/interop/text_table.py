@@ -6,7 +6,7 @@ import dataclasses
 import datetime as dt
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,23 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.input_files import LARGEST, read_text
+from maplab_py.input_files import LARGEST, read_foreign_text
 from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
 
 _MAX_BYTES = 500_000_000
-_SPLIT = "split it into parts"
 _ROWS_AT_ONCE = 1 << 15
 _DEG, _G = np.pi / 180.0, 9.80665
 _AXIS, _AXES = re.compile(r"(^|[^a-z])[a-z]{0,2}[wxyz]\W*(\[.*)?$"), 3
+_QUANTITY = re.compile(r"(^|[_. ])[apqtvwgo]?[wxyz]$")
+_UNITS_IN_NAMES = {
+    **dict.fromkeys(("rad_s", "rad_per_s", "radps"), "rad/s"),
+    **dict.fromkeys(("deg_s", "deg_per_s", "degps", "dps"), "deg/s"),
+    **dict.fromkeys(("m_s2", "m_s_2", "m_per_s2", "mps2", "ms2"), "m/s2"),
+    **dict.fromkeys(("m_s", "m_per_s", "mps"), "m/s"),
+    **{unit: unit for unit in ("g", "mg", "mm", "cm", "km", "ft", "m", "deg", "rad")},
+}
+_UNIT_IN_NAME = re.compile(rf"(.*?[^_ ])[_ ]({'|'.join(_UNITS_IN_NAMES)})")
+_MINUS = "\N{MINUS SIGN}"
 _ID = re.compile(r"(^|[-_. ])id$")
 _SECONDS, _NANOSECONDS = re.compile(r"(.*\.)?secs?"), re.compile(r"(.*\.)?(nano|n)secs?")
 _TIME_NAME = re.compile(r"time|stamp|^t$|^t_|sec|^ns$|^utc$")
@@ -84,6 +93,24 @@ class TextTable:
         """Names of the columns of values; () where the header does not name each."""
         return self.header[1:] if len(self.header) == self.values.shape[1] + 1 else ()
 
+    def places(self, meaning: Callable[[str], str]) -> dict[str, int]:
+        """Return the place among the values of each quantity that a name means; "" means none.
+
+        Raises:
+            MapError: Two columns mean the same.
+        """
+        places: dict[str, int] = {}
+        for place, name in enumerate(self.names):
+            quantity = meaning(name)
+            if quantity and quantity in places:
+                raise MapError(
+                    f"{self.source}: the columns '{self.names[places[quantity]]}' and '{name}' mean the same:"
+                    " rename one of them"
+                )
+            if quantity:
+                places[quantity] = place
+        return places
+
     def columns(self, places: Sequence[int], quantity: str) -> F64:
         """Return columns of values (N, k) in SI units.
 
@@ -129,11 +156,7 @@ def read_text_table(
         MapError: The file cannot be read, is empty, the unit of the stamps is open, or a line is not a
             row of numbers like the first one; names file and line.
     """
-    try:
-        text = read_text(path, _MAX_BYTES, remedy=_SPLIT, error=MapError, encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
+    text = read_foreign_text(path, _MAX_BYTES)
     return parse_text_table(text, str(path), kind, unit=unit, span_ns=span_ns)
 
 
@@ -152,15 +175,16 @@ def parse_text_table(
     """
     if '"' in text:
         text = text.replace('"', "")  # cells of tables have no commas of their own
+    text = text.replace(_MINUS, "-")
     lines, numbers, others, has_dates = _data_lines(text)
     if not lines:
         raise MapError(
             f"{source}: there are no rows that begin with a time stamp: wants a number, or a date as "
             "2024-05-06T07:08:09.5"
         )
+    if _has_decimal_commas(lines[0]):
+        lines = [line.replace(",", ".") for line in lines]
     if ";" in lines[0]:
-        if "," in lines[0]:
-            lines = [line.replace(",", ".") for line in lines]  # decimal commas
         lines, others = ([line.replace(";", ",") for line in part] for part in (lines, others))
     has_commas = "," in lines[0]
     header, units, time_name, rows = _named_cells(others, lines, source)
@@ -183,7 +207,7 @@ def parse_text_table(
             f"{source}:{numbers[row]}: {widths[row]} columns, the first row has {widths[0]}: correct or "
             "remove the row"
         )
-    kept = _numeric(header, rows)
+    kept = _numeric(header, rows, f"{source}:{numbers[0]}")
     if len(kept) < len(rows[0]):
         header, units = (tuple(part[k] for k in kept) for part in (header, units))
         rows = [[row[k] for k in kept] for row in rows]
@@ -299,9 +323,11 @@ def _named_cells(
     # as in "# time stamps in microseconds"
     about = [line for line in others if re.search(r"time|stamp", line.lower())]
     telling = [name for name in (*(words[0] for words in timed), *about) if header_unit(name)]
-    names = (re.sub(r"[\[(].*?[\])]", "", word).strip(" \t\"'").lower() for word in chosen)
-    header, rows = tuple(names), [cells(line) for line in lines]
-    units = tuple("".join(re.findall(r"[\[(](.*?)[\])]", word)[:1]).strip() for word in chosen)
+    named_units = [_name_and_unit(word) for word in chosen]
+    header, units = (tuple(pair[k] for pair in named_units) for k in (0, 1))
+    if header and is_time_name(chosen[0].lower()) and not is_time_name(header[0]):
+        header = ("timestamp", *header[1:])  # as in "frame_id (timestamp ns)"
+    rows = [cells(line) for line in lines]
     is_table = "," in lines[0] or _axes(chosen) >= _AXES  # else it may be prose
     place = _time_place(header) if fitting and not timed and is_table else 0
     if place:  # the stamp comes first
@@ -316,6 +342,30 @@ def _named_cells(
     return header, units, telling[0] if telling else "", rows
 
 
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether commas are those of decimals: semicolons or blanks separate the cells."""
+    if ";" in line:
+        return "," in line
+    words = line.split()
+    return (
+        len(words) > 1
+        and "," in line
+        and "." not in line
+        and all(re.fullmatch(r"[^,]*|[^,]*\d,\d[^,]*", word) for word in words)
+    )
+
+
+def _name_and_unit(word: str) -> tuple[str, str]:
+    """Return name and unit of a column, as in "x [m]", "gyro_x_deg_s", "/imu/angular_velocity/x"."""
+    unit = "".join(re.findall(r"[\[(](.*?)[\])]", word)[:1]).strip()
+    name = re.sub(r"[\[(].*?[\])]", "", word).strip(" \t\"'").lower()
+    if name.startswith("/"):
+        name = name[1:].replace("/", ".")
+    if not unit and (match := _UNIT_IN_NAME.fullmatch(name)) is not None:
+        name, unit = match[1], _UNITS_IN_NAMES[match[2]]
+    return name, unit
+
+
 def _axes(words: list[str]) -> int:
     """Return how many words are names of axes, as in tx, q_w, position.x."""
     return sum(_AXIS.search(word.strip().lower()) is not None for word in words)
@@ -327,13 +377,27 @@ def _time_place(header: tuple[str, ...]) -> int:
     return places[0] if len(places) == 1 else 0
 
 
-def _numeric(header: tuple[str, ...], rows: list[list[str]]) -> list[int]:
-    """Return the columns without those that names and first cells say to be text."""
+def _numeric(header: tuple[str, ...], rows: list[list[str]], where: str) -> list[int]:
+    """Return the columns without those that names and first cells say to be text.
+
+    Raises:
+        MapError: There is text, and not each column has a name.
+    """
     if len(header) != len(rows[0]):
+        texts = [cell for cell in rows[0] if cell and not _is_number(cell)]
+        if texts:
+            raise MapError(
+                f"{where}: '{texts[0]}' is no number: a column of text is left out where a header names each "
+                f"of the {len(rows[0])} columns"
+            )
         return list(range(len(rows[0])))
     first = [next((row[k] for row in rows if row[k]), "") for k in range(len(header))]
     named = enumerate(zip(header, first, strict=True))
-    return [k for k, (name, cell) in named if k == 0 or (_is_number(cell) and not _ID.search(name))]
+    return [
+        k
+        for k, (name, cell) in named
+        if k == 0 or _QUANTITY.search(name) or (_is_number(cell) and not _ID.search(name))
+    ]
 
 
 def is_time_name(name: str) -> bool:

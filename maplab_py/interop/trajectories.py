@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.input_files import LARGEST, read_text
+from maplab_py.input_files import LARGEST, read_foreign_text
 from maplab_py.interop.stamps import POSES, read_stamps
 from maplab_py.interop.text_table import (
     TextTable,
@@ -35,6 +35,7 @@ them half of what the body moves from row to row."""
 _UNIT_TOLERANCE = 0.02
 """Largest deviation of a quaternion's norm from 1; accepts files with three digits."""
 _KINDS = {
+    "o": "q", "ori": "q", "rot": "q",
     "p": "p", "t": "p", "pos": "p", "position": "p", "translation": "p", "": "p",
     "q": "q", "quat": "q", "quaternion": "q", "orientation": "q", "rotation": "q",
     "v": "v", "vel": "v", "velocity": "v",
@@ -43,12 +44,14 @@ _KINDS = {
 }  # fmt: skip
 _NAME = re.compile(
     r"(?:.*?\.)??(gyro bias|acc(?:el)? bias|orientation quaternion|position|pos|quaternion|quat|orientation"
-    r"|rotation|translation|velocity|vel|b_?[wga]|[ptqv])?(?:_[a-z0-9_]*?)?[_. ]?([wxyz])"
+    r"|rotation|ori|rot|translation|velocity|vel|b_?[wga]|[ptqvo])?(?:_[a-z0-9_]*?)?[_. ]?([wxyz])"
 )
-_TURN = re.compile(r"^q|quat|orient|rotation")
+_TURN = re.compile(r"^q|quat|orient|rotation|^rot_?[xyz]")
 _EUROC_ORDER = ("px", "py", "pz", "qw", "qx", "qy", "qz")
 _EUROC_STATE = ("vx", "vy", "vz", *(f"b_g{i}" for i in "xyz"), *(f"b_a{i}" for i in "xyz"))
-_VERTEX_TABLE, _IN_M = "p_m_ix", ("q_m_i{}", "q_mi_{}")
+_KITTI_NUMBERS, _KITTI_HINT = 12, ", or KITTI's matrices with --times_file"
+_VERTEX_TABLE, _LOCALIZED_IN_M = "p_m_ix", "p_mi_x"
+_IN_M = ("q_m_i{}", "q_mi_{}")
 LOCALIZED = "is_localized"
 """Column of rovioli's poses in a map: 0 where the frame was not localised and has no pose."""
 _TUM_ORDER = ("px", "py", "pz", "qx", "qy", "qz", "qw")
@@ -113,6 +116,11 @@ def read_trajectory(
     if LOCALIZED in table.header:
         table = table.take(table.values[:, table.header.index(LOCALIZED) - 1] > 0.0)
     trajectory = trajectory_of_table(table, keep_repeated=keep_repeated)[0]
+    if table.has_commas and not table.names and table.unit != "ns" and trajectory.has_orientation:
+        note = f"{path}: columns without names are read as t, x, y, z, qx, qy, qz, qw: a header names others"
+        trajectory = dataclasses.replace(
+            trajectory, note="; ".join(filter(None, (table.note, note)))
+        )
     if needs_orientation and not trajectory.has_orientation:
         raise MapError(
             f"{path}: has positions without orientations, which are needed here: give qx, qy, qz and qw, too"
@@ -198,7 +206,7 @@ def read_kitti(path: Path, times_file: Path, time_unit: str = "") -> Trajectory:
     Raises:
         MapError: A file cannot be read, a line is no pose or time stamp, or their numbers differ.
     """
-    matrices = _numbers(path, 12, "a pose of KITTI (3 x 4 numbers)").reshape(-1, 3, 4)
+    matrices = _numbers(path, _KITTI_NUMBERS, "a pose of KITTI (3 x 4 numbers)").reshape(-1, 3, 4)
     stamps = read_stamps(times_file, POSES, unit=time_unit)
     times_ns = stamps.times_ns
     if len(times_ns) != len(matrices):
@@ -220,12 +228,7 @@ def read_kitti(path: Path, times_file: Path, time_unit: str = "") -> Trajectory:
 
 def _numbers(path: Path, width: int, what: str) -> F64:
     """Return the rows (N, width) of a file of numbers without stamps."""
-    try:
-        text = read_text(path, _MAX_BYTES, remedy="split it into parts", error=MapError)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
-    rows = [line.split() for line in text.splitlines()]
+    rows = [line.split() for line in read_foreign_text(path, _MAX_BYTES).splitlines()]
     wrong = [number for number, row in enumerate(rows, 1) if row and len(row) != width]
     if wrong:
         raise MapError(f"{path}:{wrong[0]}: {what} is wanted")
@@ -276,7 +279,7 @@ def _columns(table: TextTable) -> dict[str, int]:
     """
     width = table.values.shape[1]
     names = _named_columns(table)
-    if not names:
+    if not names and not (table.names and table.has_commas):
         order: tuple[str, ...] = ()
         if table.has_commas and table.unit == "ns" and width >= 7:
             order = _EUROC_ORDER + (_EUROC_STATE if width >= 16 else ())
@@ -290,23 +293,40 @@ def _columns(table: TextTable) -> dict[str, int]:
         raise MapError(
             f"{table.source}: no trajectory: there is no column for {', '.join(missing)}; TUM (t x y z qx "
             "qy qz qw), EuRoC (t, p, q wxyz), positions (t x y z) or a header with such names is expected"
+            + _KITTI_HINT
+            * (width == _KITTI_NUMBERS - 1)
         )
     return names
 
 
 def _named_columns(table: TextTable) -> dict[str, int]:
-    """Return the columns that the header names; nothing without one."""
-    names: dict[str, int] = {}
-    for place, name in enumerate(table.names):
-        match = _NAME.fullmatch(name)
-        if match is not None:
-            prefix = (match[1] or "").replace("orientation quaternion", "q")
-            names.setdefault(_KINDS[prefix] + match[2], place)
+    """Return the columns that the header names; nothing without one.
+
+    Names that tell the quantity come before those of an axis alone, as position.x before linear.x.
+
+    Raises:
+        MapError: Two columns have the same meaning, or the first is no time stamp.
+    """
+    if {_VERTEX_TABLE, _LOCALIZED_IN_M} & set(table.header):  # own tables: poses in G come first
+        meanings = [_meaning(name) for name in table.names]
+        names = {meaning: meanings.index(meaning) for meaning in meanings if meaning}
+    else:
+        names = table.places(lambda name: _meaning(name, is_explicit=True))
+        if "px" not in names:
+            names = {**table.places(_meaning), **names}
     if names and not is_time_name(table.header[0]):
         raise MapError(
             f"{table.source}: the first column must be the time stamp, not '{table.header[0]}'"
         )
     return names
+
+
+def _meaning(name: str, *, is_explicit: bool = False) -> str:
+    """Return the quantity that a name means, as "px"; empty for others, and for axes alone if asked."""
+    match = _NAME.fullmatch(name)
+    if match is None or (is_explicit and not match[1]):
+        return ""
+    return _KINDS[(match[1] or "").replace("orientation quaternion", "q")] + match[2]
 
 
 def _optional(table: TextTable, names: dict[str, int], kind: str, quantity: str) -> F64 | None:

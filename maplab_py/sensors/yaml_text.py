@@ -123,8 +123,10 @@ def parse_yaml(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> An
     except _TooLarge as error:
         raise MapError(f"{source}: {error}; {RAISE_THE_BOUND}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise MapError(f"{source}: not valid YAML: {' '.join(lines)}") from error
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        where = source if mark is None else f"{source}:{mark.line + 1}"
+        reason = problem or " ".join(str(error).split())
+        raise MapError(f"{where}: not valid YAML: {reason}") from error
     finally:
         if loader is not None:
             loader.dispose()

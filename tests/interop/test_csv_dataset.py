@@ -198,7 +198,7 @@ def test_planar_poses_and_edges_lie_in_the_plane(tmp_path):
     ("text", "message"),
     [
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0\n", "1: VERTEX_SE3:QUAT has 7 numbers, not 8"),
-        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 x\n", "1: could not convert"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 x\n", "1: 'x' is not a number"),
         ("VERTEX_XY 0 0 0\n", "1: 'VERTEX_XY' is not among"),
         ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 0 0 0 0\n", "pose 0 occurs twice"),
         (f"VERTEX_SE2 0 0 0 0\nEDGE_SE3:QUAT 0 7 0 0 0 0 0 0 1 {IDENTITY}\n", "pose 7"),

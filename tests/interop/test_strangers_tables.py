@@ -45,10 +45,22 @@ def written(tmp_path: Path, header: str, row: str, *, encoding: str = "utf-8") -
         ("timestamp;x;y;z;qx;qy;qz;qw", "{t};{row},0;0,0;0;0,1;0,2;0,3;" + f"{TURN[3]}".replace(".", ",")),
         ("# frame timestamp tx ty tz qx qy qz qw", "{index} {s}.{ns:09d} " + POSE.replace(",", " ")),
         ("sec,nanosec,x [mm],y,z,qx,qy,qz,qw", "{s},{ns},{row}000" + POSE[5:]),
+        ("# frame_id (timestamp ns), translation_x, translation_y, translation_z, quaternion_x, "
+         "quaternion_y, quaternion_z, quaternion_w, scale", "{t}, " + POSE + ",1"),
+        ("t [ns],x_mm,y_mm,z_mm,ox,oy,oz,ow", "{t},{row}000" + POSE[5:]),
+        ("t;posX;posY;posZ;rotX;rotY;rotZ;rotW", "{t};" + POSE.replace(",", ";")),
+        ("/time,/odom/pose/orientation/w,/odom/pose/orientation/x,/odom/pose/orientation/y,"
+         "/odom/pose/orientation/z,/odom/pose/position/x,/odom/pose/position/y,/odom/pose/position/z,"
+         "/odom/twist/linear/x", "{t}," + f"{TURN[3]},.1,.2,.3," + "{row},0,0,7"),
+        ("Zeit (°)\ttime\tx\ty\tz\tqx\tqy\tqz\tqw",
+         "{z}\t{s},{ns:09d}\t" + POSE.replace(",", "\t").replace(".", ",")),
+        ("t,x,y,z,qx,qy,qz,qw", "{t},{row},\u22120,0,0.1,0.2,0.3,0.9273618495495703"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
 def test_trajectories(tmp_path: Path, header: str, row: str, encoding: str) -> None:
+    if encoding == "latin-1" and not row.isascii():
+        row = row.replace("\u2212", "-")
     trajectory = read_trajectory(written(tmp_path, header, row, encoding=encoding))
     assert trajectory.times_ns.tolist() == [NOW + STEP * k for k in range(5)]
     np.testing.assert_allclose(trajectory.T_R_B[:, :4], [TURN] * 5, atol=1e-12)
@@ -77,11 +89,22 @@ def test_dates_are_exact(tmp_path: Path, stamp: str, first_ns: int) -> None:
         ("GPST,x,y,z,qx,qy,qz,qw", "2023/11/14 22:13:2{row}," + POSE, "leap seconds .*: write UTC"),
         ("t [ns],x [yd],y [yd],z [yd],qx,qy,qz,qw", "{t}," + POSE, r"'x' is in \[yd\].* unit of length"),
         ("t [ns],x,y,z,qx,qy,qz,qw", "{z}0000000," + POSE + "\n5,0,0,0,0,0,0,1", "sort the rows by time"),
+        ("Frame,Time [ns],X,Y,Z,W,X,Y,Z", "{row},{t},.1,.2,.3,.9,{row},0,0", "'x' and 'x' mean the same"),
+        ("t,lat,lon,alt", "{t},47,8,400", "there is no column for px"),
+        ("t,device,x,y,z,qx,qy,qz,qw,*more", "{t},ios," + POSE, "'ios' is no number: .* names each of the 9"),
+        ("", "1 0 0 {row} 0 1 0 0 0 0 1 0", "KITTI's matrices with --times_file"),
     ],
 )  # fmt: skip
 def test_trajectories_that_are_refused(tmp_path: Path, header: str, row: str, message: str) -> None:
     with pytest.raises(MapError, match=message):
         read_trajectory(written(tmp_path, header, row))
+
+
+def test_columns_without_names_are_noted_where_programs_differ(tmp_path: Path) -> None:
+    note = "columns without names are read as t, x, y, z, qx, qy, qz, qw"
+    assert note in read_trajectory(written(tmp_path, "", "{s}.{ns:09d}," + POSE)).note
+    blanks = POSE.replace(",", " ")
+    assert not read_trajectory(written(tmp_path, "", "{s}.{ns:09d} " + blanks)).note
 
 
 G, A, W = "0.1,0.2,0.3", "1,2,9.8", "{t},"
@@ -107,6 +130,13 @@ G, A, W = "0.1,0.2,0.3", "1,2,9.8", "{t},"
          "{t},{row},{t},imu,0,0,0,1," + f"{G},{A}"),
         ("t [ns],w_x [deg/s],w_y [deg/s],w_z [deg/s],a_x [m/s^2],a_y [m/s^2],a_z [m/s^2]",
          W + ",".join(f"{v / DEG:.17g}" for v in GYRO) + f",{A}"),
+        ("t,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s,acc_x_m_s2,acc_y_m_s2,acc_z_m_s2",
+         W + ",".join(f"{v / DEG:.17g}" for v in GYRO) + f",{A}"),
+        ("/t,/imu/linear_acceleration/x,/imu/linear_acceleration/y,/imu/linear_acceleration/z,"
+         "/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z", W + f"{A},{G}"),
+        ("# id timestamp ang_vel_x ang_vel_y ang_vel_z lin_acc_x lin_acc_y lin_acc_z",
+         "{row} {t} " + f"{G},{A}".replace(",", " ")),
+        ("", W + f"{G},{A}"),
         ("t [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [g],a_y [g],a_z [g]",
          W + f"{G}," + ",".join(f"{v / 9.80665:.17g}" for v in ACCEL)),
     ],
@@ -119,13 +149,23 @@ def test_imu_samples_are_those_that_columns_name(tmp_path: Path, header: str, ro
 @pytest.mark.parametrize(
     ("header", "message"),
     [
+        (
+            "t,w_x,w_y,w_z,linear_acceleration_x,a_y,a_z,a_x",
+            "_x' and 'a_x' mean the same",
+        ),
         ("t,mag_x,mag_y,mag_z,acc_x,acc_y,acc_z", "names as w_x.*: it has mag_x"),
         ("t,w_x [rpm],w_y,w_z,a_x,a_y,a_z", r"\[rpm\], which is not known as a unit of rate"),
     ],
 )
 def test_imu_columns_that_are_refused(tmp_path: Path, header: str, message: str) -> None:
     with pytest.raises(MapError, match=message.replace(": it", ".*it")):
-        read_imu_csv(written(tmp_path, header, W + f"{G},{A}"))
+        read_imu_csv(written(tmp_path, header, W + f"{G},{A}" + ",0" * (header.count(",") - 6)))
+
+
+def test_gravity_tells_which_columns_without_names_are_accelerations(tmp_path: Path) -> None:
+    samples = read_imu_csv(written(tmp_path, "", W + f"{A},{G}"))
+    np.testing.assert_array_equal(samples.accel_gyro, [ACCEL + GYRO] * 5)
+    assert "accelerations come first, as gravity shows" in samples.note
 
 
 @pytest.mark.parametrize(
@@ -153,6 +193,8 @@ def test_wheels(tmp_path: Path, header: str, row: str, x_m: float, yaw_rad: floa
         ("Time (s),Latitude (deg),Longitude (deg),Altitude (ft)", "170000000{row},47.1,8.5,1000", 304.8),
         ("%  UTC    latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)",
          "2023/11/14 22:13:2{row}.000   47.100   8.500   400.0   1   9   0.01", 400.0),
+        ("time,lat,N/S,lon,E/W,alt_ft", "170000000{row},47.1,N,8.5,E,1000", 304.8),
+        ("time,lat,lon,alt", "170000000{row},47.1N,8.5E,400", 400.0),
     ],
 )  # fmt: skip
 def test_fixes(tmp_path: Path, header: str, row: str, altitude_m: float) -> None:
@@ -160,3 +202,14 @@ def test_fixes(tmp_path: Path, header: str, row: str, altitude_m: float) -> None
     assert track.times_ns.tolist() == [(1_700_000_000 + k) * 10**9 for k in range(5)]
     assert (track.latitude_deg[0], track.longitude_deg[0]) == (47.1, 8.5)
     np.testing.assert_allclose(track.altitude_m, altitude_m, rtol=1e-15)
+
+
+@pytest.mark.parametrize("row", ["17{row},47.1,S,8.5,W,400", "17{row},47.1 S,,8.5W,,400"])
+def test_hemispheres(tmp_path: Path, row: str) -> None:
+    track = read_gps(written(tmp_path, "t [s],lat,ns,lon,ew,alt", row))
+    assert (track.latitude_deg[0], track.longitude_deg[0]) == (-47.1, -8.5)
+
+
+def test_gpx_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="is XML, as GPX or KML: convert it to CSV"):
+        read_gps(written(tmp_path, "<?xml version='1.0'?><gpx>", "<trkpt lat='47' lon='8'/>"))

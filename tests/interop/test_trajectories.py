@@ -172,7 +172,7 @@ def test_missing_and_binary_files(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"cannot read .*absent"):
         read_trajectory(tmp_path / "absent.txt")
     (tmp_path / "binary").write_bytes(b"\xff\x00\xfe")
-    with pytest.raises(MapError, match="not UTF-8"):
+    with pytest.raises(MapError, match="it is not text"):
         read_trajectory(tmp_path / "binary")
 
 

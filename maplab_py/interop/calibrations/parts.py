@@ -14,7 +14,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-from maplab_py.input_files import read_text
+from maplab_py.input_files import read_foreign_text
 from maplab_py.sensors import Camera, Imu
 from maplab_py.sensors.yaml_entry import Entry
 from maplab_py.sensors.yaml_text import parse_yaml
@@ -50,12 +50,7 @@ def read_calibration_text(path: Path) -> str:
     Raises:
         MapError: It cannot be read, is too large for a calibration, or is no text.
     """
-    try:
-        remedy = "it is no calibration"
-        return read_text(path, _MAX_BYTES, remedy=remedy, error=MapError, encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}") from error
+    return read_foreign_text(path, _MAX_BYTES, remedy="it is no calibration")
 
 
 def is_json(path: Path) -> bool:

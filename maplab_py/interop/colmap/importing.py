@@ -16,7 +16,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.input_files import read_text
+from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.features import with_features, with_images
 from maplab_py.interop.colmap.model import MODELS, ColmapModel, SensorType, SideFile, has_model
@@ -217,12 +217,7 @@ def read_times(file: Path, time_unit: str = "") -> dict[str, int]:
     Raises:
         MapError: The file cannot be read, a line is wrong, or the unit is open; names the line.
     """
-    try:
-        text = read_text(file, _MAX_FILE_BYTES, remedy="split it", error=MapError)
-    except UnicodeDecodeError:
-        raise MapError(f"{file}: is not text: name a file of image names and time stamps") from None
-    except OSError as error:
-        raise MapError(f"cannot read {file}: {error.strerror}") from error
+    text = read_foreign_text(file, _MAX_FILE_BYTES)
     stamps: dict[str, tuple[int, str]] = {}
     header = ""
     for number, line in enumerate(text.splitlines(), start=1):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.input_files import read_text
+from maplab_py.interop.recordings.bag_layouts import SQLITE
 from maplab_py.interop.recordings.clocks import Run
 
 if TYPE_CHECKING:
@@ -41,10 +42,12 @@ _IMU_LAYOUTS = tuple(
     (struct.Struct(f"{order}I").unpack_from, struct.Struct(f"{order}{_IMU_NUMBERS}d").unpack_from)
     for order in "><"
 )
-_SQLITE, _SQLITE_HEADER = b"SQLite format 3\x00", 100
+_SQLITE_HEADER = 100
 _METADATA = "metadata.yaml"
+_SHOWN = 40
+"""Bytes of a text that are shown where it stands for a bag."""
 _MAX_METADATA_BYTES = 50_000_000
-_STORAGE = re.compile(r"\.(db3|mcap)(\.zstd?)?")
+_STORAGE = re.compile(r".*\.(db3|mcap)(\.zstd?)?", re.IGNORECASE | re.DOTALL)
 
 
 IMU, ACCELEROMETER = -1, -2
@@ -77,7 +80,7 @@ def is_bag(path: Path) -> bool:
     """Tell whether a path is a ROS 1 bag, or a file or folder of a ROS 2 bag."""
     if path.is_dir():
         return (path / _METADATA).is_file() or bool(_storages_in(path))
-    return path.suffix == ".bag" or _is_storage(path)
+    return path.suffix.lower() == ".bag" or _is_storage(path)
 
 
 def check_bag(path: Path, flag: str) -> None:
@@ -200,17 +203,7 @@ def _storages_in(folder: Path) -> list[Path]:
 
 
 def _is_storage(path: Path) -> bool:
-    return (
-        path.is_file()
-        and _STORAGE.search(path.name) is not None
-        and path.suffix
-        in (
-            ".db3",
-            ".mcap",
-            ".zstd",
-            ".zst",
-        )
-    )
+    return path.is_file() and _STORAGE.fullmatch(path.name) is not None
 
 
 def _is_packed(path: Path) -> bool:
@@ -225,6 +218,11 @@ def _remedy(path: Path, reason: str) -> str:
         file = next((part for part in files if part.name in reason or len(files) == 1), file)
     if file.is_file() and not file.stat().st_size:
         return "the file is empty: copy it again"
+    if file.is_file():
+        with file.open("rb") as stream:
+            head = stream.readline(_SHOWN)
+        if re.fullmatch(rb"[\x20-\x7e]+\n?", head) and not head.startswith(b"#ROSBAG"):
+            return f"it is text, '{head.decode().strip()} ...': fetch the bag itself, as by `git lfs pull`"
     for words, remedy in _REMEDIES:
         if re.search(words, reason):
             return remedy.format(file=file)
@@ -296,7 +294,7 @@ def _check_databases(path: Path) -> None:
     for file in files:
         with file.open("rb") as stream:
             header = stream.read(_SQLITE_HEADER)
-        if len(header) < _SQLITE_HEADER or not header.startswith(_SQLITE):
+        if len(header) < _SQLITE_HEADER or not header.startswith(SQLITE):
             continue  # no database: the library knows what it is
         page_bytes, pages = struct.unpack_from(">H", header, 16)[0], _number(header, 28)
         page_bytes = 65536 if page_bytes == 1 else page_bytes

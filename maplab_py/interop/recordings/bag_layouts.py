@@ -1,4 +1,4 @@
-"""Messages of fixed size as bytes, many at a time: IMU samples, poses, odometry and transforms.
+"""Kinds of storage files; messages of fixed size as bytes, many at a time: IMU samples, poses, odometry, tf.
 
 Sources: ROS 1, wiki "Connection Header" and genmsg (little endian, unaligned); ROS 2, OMG DDS-XTypes 1.3,
 section 7.4.1 (plain CDR, numbers aligned to their size behind an encapsulation of four bytes).
@@ -6,6 +6,7 @@ section 7.4.1 (plain CDR, numbers aligned to their size behind an encapsulation 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,22 @@ from numpy.typing import ArrayLike, NDArray
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 
+SQLITE = b"SQLite format 3\x00"
+_HEADS = ((b"#ROSBAG V2.", "ros1"), (SQLITE, "sqlite3"), (b"\x89MCAP0\r\n", "mcap"))
+_ENDINGS = ((".mcap", "mcap"), (".db3", "sqlite3"), (".bag", "ros1"))
 _CDR_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _S_TO_NS = 1_000_000_000
 _UNKNOWN = -1.0
 """First entry of a covariance whose quantity is not measured (sensor_msgs/Imu)."""
+
+
+def storage_kind(path: Path) -> str:
+    """Return ros1, sqlite3 or mcap: the kind of a bag's file by its first bytes, else by its name."""
+    with path.open("rb") as stream:
+        head = stream.read(len(SQLITE))
+    by_content = (kind for start, kind in _HEADS if head.startswith(start))
+    by_name = (kind for ending, kind in _ENDINGS if ending in path.name.lower())
+    return next(by_content, "") or next(by_name, "")
 
 
 class MessageLayout:

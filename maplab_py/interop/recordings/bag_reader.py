@@ -33,6 +33,7 @@ from rosbags.typesys.store import Typestore
 
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError
+from maplab_py.interop.recordings.bag_layouts import storage_kind
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -60,7 +61,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path, files: Sequence[Path], metadata: Mapping[str, Any]) -> None:
-        """Name a bag; nothing is read yet.
+        """Name a bag; nothing is read but the beginning of its file.
 
         Args:
             path: Bag.
@@ -72,7 +73,7 @@ class BagReader:
         self._storages: list[Any] = []
         self._sources: dict[int, list[tuple[Any, Connection]]] = {}
         self._stores: dict[str, Typestore] = {}
-        self.is2 = path.suffix != ".bag"
+        self.is2 = path.is_dir() or storage_kind(path) != "ros1"
         self.connections: list[Connection] = []
 
     def __enter__(self) -> BagReader:
@@ -147,8 +148,9 @@ class BagReader:
         if self.is2:
             channels: dict[tuple[str, str], list[tuple[Any, Connection]]] = {}
             for file in self._files:
-                storage: Any = _McapFile(self._unpacked(file)) if ".mcap" in file.suffixes else None
-                storage = storage or _Database(self._unpacked(file))
+                unpacked = self._unpacked(file)
+                is_mcap = storage_kind(unpacked) == "mcap"
+                storage: Any = (_McapFile if is_mcap else _Database)(unpacked)
                 storage.open()
                 self._stack.callback(storage.close)
                 self._storages.append(storage)

@@ -17,6 +17,7 @@ from maplab_py.array_types import I64
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.recordings.bag_files import all_messages, message_types
+from maplab_py.interop.recordings.bag_layouts import storage_kind
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.progress import Progress
 
@@ -86,13 +87,11 @@ def format_of_path(path: Path, name: str = "") -> BagFormat:
 
 
 def format_of_bag(path: Path) -> BagFormat:
-    """Return the format of a bag that exists; it is told by its suffix, or those of its files."""
+    """Return the format of a bag that exists; that of a folder is told by the names of its files."""
     if path.is_dir():
-        has_mcap = any(".mcap" in file.suffixes for file in path.iterdir())
+        has_mcap = any(".mcap" in file.name.lower() for file in path.iterdir())
         return BagFormat.MCAP if has_mcap else BagFormat.SQLITE3
-    if path.suffix == ".bag":
-        return BagFormat.ROS1
-    return BagFormat.MCAP if ".mcap" in path.suffixes else BagFormat.SQLITE3
+    return BagFormat(storage_kind(path))
 
 
 def messages_of_topic(

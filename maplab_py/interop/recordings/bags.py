@@ -333,6 +333,7 @@ class BagRecording:
             stream.count,
             clock.first,
             self._reading.max_late_share,
+            "" if self._reading.use_arrival_time else "; --use_arrival_time takes those of arrival",
         )
 
     def _runs(self) -> list[list[Run]]:

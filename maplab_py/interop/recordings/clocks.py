@@ -17,6 +17,8 @@ _LARGEST_STEP_NS = 86_400_000_000_000
 """Stamps that lie further ahead are of another clock."""
 _RESTART_COUNT, _RESTART_NS = 5, 400_000_000
 """A run of so many stamps over such a time is a clock that has started again, not late messages."""
+_LATE_SHARE, _EVEN = 0.01, 3.0
+"""Rows out of order up to which a table counts as sorted; largest step of one that was not, in medians."""
 
 T = TypeVar("T")
 
@@ -141,8 +143,24 @@ def parts_of(stamps_ns: I64) -> tuple[list[I64], I64]:
     return kept, np.setdiff1d(rows, np.concatenate(kept))
 
 
-def check_dropped(name: str, dropped: int, count: int, first: Dropped | None, share: float) -> None:
-    """Check that no more items are left out than a share of all.
+def order_of_time(stamps_ns: I64) -> I64:
+    """Return the rows of a table in the order in which they are read: that of time, of an unsorted file.
+
+    A file is unsorted, and has no late rows and no clock that starts again, if sorting gives even steps.
+    """
+    rows, steps_ns = np.arange(len(stamps_ns)), np.diff(stamps_ns)
+    if np.count_nonzero(steps_ns < 0) <= _LATE_SHARE * len(stamps_ns):
+        return rows
+    order = np.argsort(stamps_ns, kind="stable")
+    sorted_ns = np.diff(stamps_ns[order])
+    is_even = sorted_ns.min() > 0 and sorted_ns.max() <= _EVEN * np.median(sorted_ns)
+    return np.asarray(order if is_even else rows)
+
+
+def check_dropped(
+    name: str, dropped: int, count: int, first: Dropped | None, share: float, remedy: str = ""
+) -> None:
+    """Check that no more items are left out than a share of all; `remedy` helps where stamps are wrong.
 
     Raises:
         MapError: There are more; names the first one and the flags that help.
@@ -157,6 +175,8 @@ def check_dropped(name: str, dropped: int, count: int, first: Dropped | None, sh
         raise MapError(
             f"{name}: {dropped} of {count} {reason}: skip them by --vio_rosbag_start_s and "
             f"--vio_rosbag_end_s, or raise --max_late_share={share:g}"
+            + remedy
+            * (first.before_ns is not None)
         )
 
 

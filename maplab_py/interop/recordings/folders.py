@@ -17,7 +17,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, MaplabError, UserError
-from maplab_py.input_files import read_text
+from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.recordings.clocks import (
@@ -27,6 +27,7 @@ from maplab_py.interop.recordings.clocks import (
     common_part_count,
     dropped_note,
     listed_rows,
+    order_of_time,
     parts_of,
     restart_error,
 )
@@ -40,12 +41,14 @@ from maplab_py.interop.recordings.protocol import (
     RecordedSensors,
 )
 from maplab_py.interop.stamps import IMAGES, parse_stamps
+from maplab_py.interop.text_table import is_time_name
 from maplab_py.sensors import Camera
 
 _MAX_BYTES = 500_000_000
 _LARGEST_BATCH = 1000
 _DEFAULT = ReadingOptions()
 _MOST_LINES = 10
+_IMAGE_NAME = re.compile(r"\.[a-z]{2,5}$", re.IGNORECASE)
 
 
 def image_root(path: Path) -> Path | None:
@@ -123,6 +126,9 @@ class FolderRecording:
                 f"{', '.join(others)}: not read: the cameras of the calibration ({len(self._numbers)}) are "
                 "counted from cam0 without gaps"
             )
+        imus = sorted(f.name for f in self._root.glob("imu[1-9]*") if f.is_dir())
+        if imus:
+            notes.append(f"{', '.join(imus)}: not read: the IMU is imu0")
         return tuple(notes)
 
     @cached_property
@@ -244,20 +250,28 @@ class FolderRecording:
 
 
 class _Table:
-    """Stamps of one sensor, divided where its clock starts again."""
+    """Stamps of one sensor, divided where its clock starts again.
+
+    Attributes:
+        order: Row of the file of each stamp.
+    """
 
     def __init__(
         self, path: Path, stamps_ns: I64, lines: I64, note: str, time_offset_ns: int = 0
     ) -> None:
-        self._path, self.name, self.note = path, path.parent.name, note
-        self.stamps_ns, self._lines = stamps_ns, lines
-        self.times_ns = stamps_ns + time_offset_ns
+        self._path, self.name = path, path.parent.name
+        self.order = order_of_time(stamps_ns)
+        is_sorted = bool(np.all(np.diff(self.order) == 1))
+        sorting = "" if is_sorted else f"{path}: rows are not in the order of time: they are sorted"
+        self.note = "; ".join(filter(None, (note, sorting)))
+        self.stamps_ns, self._lines = stamps_ns[self.order], lines[self.order]
+        self.times_ns = self.stamps_ns + time_offset_ns
         if len(stamps_ns) > 1 and not stamps_ns.any():
             raise MapError(
                 f"{path}: all time stamps are 0, as of a driver that sets none: write the times at which the "
                 "rows were recorded into the table"
             )
-        self.parts, self._dropped = parts_of(stamps_ns)
+        self.parts, self._dropped = parts_of(self.stamps_ns)
 
     @property
     def dropped_note(self) -> str:
@@ -351,7 +365,7 @@ class _ImuTable(_Table):
         table = read_imu_csv(path, reading.time_unit, in_order=False)
         lines = np.arange(len(table.times_ns)) if table.lines is None else table.lines
         super().__init__(path, table.times_ns, lines, table.note)
-        self.accel_gyro: F64 = table.accel_gyro
+        self.accel_gyro: F64 = table.accel_gyro[self.order]
 
 
 class _ImageTable(_Table):
@@ -369,11 +383,12 @@ class _ImageTable(_Table):
             )
         self._folder, self._camera = folder / "data", camera
         path = folder / "data.csv"
-        tokens, self._files, lines, header = _image_rows(path)
+        tokens, files, lines, header = _image_rows(path)
         stamps = parse_stamps(
             tokens, IMAGES, str(path), lines, unit=reading.time_unit, header=header
         )
         super().__init__(path, stamps.times_ns, lines, stamps.note, camera.time_offset_ns)
+        self._files = [files[row] for row in self.order.tolist()]
         try:
             present = set(os.listdir(self._folder))
         except OSError as error:
@@ -400,37 +415,52 @@ class _ImageTable(_Table):
 
 
 def _image_rows(path: Path) -> tuple[list[str], list[str], I64, str]:
-    """Return stamps, file names, lines and header of a table `stamp,file`.
+    """Return stamps, file names, lines and the header of the stamps of a table `stamp,file`.
 
-    Names lead to no path outside the folder.
+    Of further columns, or another order, the header names that of the stamps. Names lead to no path outside
+    the folder.
     """
-    try:
-        remedy = "split the recording"
-        text = read_text(path, _MAX_BYTES, remedy=remedy, error=MapError, encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise MapError(f"cannot read {path}: {reason}: copy the folder again") from error
     tokens: list[str] = []
     files: list[str] = []
     lines: list[int] = []
-    header = ""
+    columns: list[str] = []
+    text = read_foreign_text(path, _MAX_BYTES, remedy="split the recording")
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.replace('"', "").strip()
         if not content:
             continue
-        words = re.split(r"\s*[,\s]\s*", content, maxsplit=1)
-        if content.startswith("#") or (not tokens and not header and not content[0].isdigit()):
-            header = header or content.split(",")[0]
+        if content.startswith("#") or (
+            not tokens and not columns and not re.search(r"\d{2}", content)
+        ):
+            columns = columns or _cells(content.lstrip("# "), -1)
             continue
-        name = words[-1].removeprefix("./").removeprefix("data/")
-        if len(words) != 2 or "/" in name or not name:
+        words = _cells(content, max(len(columns), 2) - 1)
+        place = next((k for k, name in enumerate(columns) if is_time_name(name.lower())), 0)
+        names = [word for k, word in enumerate(words) if k != place and _IMAGE_NAME.search(word)]
+        if len(words) == 2 and (names or not re.search("[,;]", words[1 - place])):
+            names = [words[1 - place]]
+        name = _file_name(names[0], path.parent.name) if len(names) == 1 else ""
+        if len(words) != max(len(columns), 2) or not name:
             raise MapError(
                 f"{path}:{number}: a row must be a time stamp and the name of an image in data/, not "
                 f"'{content}'"
             )
-        tokens.append(words[0])
+        tokens.append(words[place])
         files.append(name)
         lines.append(number)
     if not tokens:
         raise MapError(f"{path}: the recording is empty: there are no images in the table")
+    header = next((name for name in columns if is_time_name(name.lower())), "".join(columns[:1]))
     return tokens, files, np.array(lines, dtype=np.int64), header
+
+
+def _cells(content: str, most_cuts: int) -> list[str]:
+    separator = next((character for character in ",;\t" if character in content), None)
+    return [cell.strip() for cell in content.split(separator, most_cuts)]
+
+
+def _file_name(word: str, sensor: str) -> str:
+    """Return the name of a file in data/ of a sensor's folder; empty if it is elsewhere."""
+    *folders, name = (part for part in re.split(r"[\\/]", word) if part != ".")
+    is_here = not folders or (folders[-1] == "data" and folders[-2:-1] in ([], [sensor]))
+    return name if is_here else ""

@@ -16,6 +16,7 @@ from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
 
 _MOST_LISTED = 3
+_ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 
 
 def open_recording(path: Path, options: SourceOptions | None = None) -> Recording:
@@ -60,6 +61,11 @@ def _hint(path: Path) -> str:
     """Return a clause on what the user may have meant."""
     if path.suffixes[-2:] == [".bag", ".active"]:
         return f"; it is a bag that was not closed: run `rosbag reindex {path}` and name it .bag"
+    if path.suffix.lower() in _ARCHIVES:
+        return "; it is an archive: unpack it first"
+    whole = next((p for p in path.absolute().parents if image_root(p) is not None), None)
+    if whole is not None:
+        return f"; it is a part of {whole}"
     if not path.is_dir():
         return ""
     below = [p for p in sorted(path.iterdir()) if image_root(p) is not None or is_bag(p)]

@@ -209,7 +209,7 @@ def _notes(
 
 
 def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterator[str]:
-    """Yield which images have no partner in camera 0, and how far away the nearest ones are."""
+    """Yield which images of camera 0 and another have no partner, and how far away the nearest ones are."""
     counts, unmatched = statistics.images, statistics.unmatched_images
     if len(counts) < 2 or not any(unmatched):
         return
@@ -219,17 +219,21 @@ def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterato
         if not len(reference) or not len(other):
             yield f"camera {row if len(reference) else 0} has no images"
             continue
-        apart_ns = nearest_apart_ns(reference, other)
-        apart = int(np.count_nonzero(apart_ns > options.nframe_sync_tolerance_ns))
-        if apart:
-            median_ms = (
-                float(np.median(apart_ns[apart_ns > options.nframe_sync_tolerance_ns])) * 1e-6
-            )
-            yield (
-                f"{apart} of {len(other)} images of camera {row} have no partner in camera 0; the nearest is "
-                f"{median_ms:.3g} ms away at the median: check the trigger, or raise "
-                "--vio_nframe_sync_tolerance_ns"
-            )
+        tolerance_ns = options.nframe_sync_tolerance_ns
+        far_ns = [
+            apart_ns[apart_ns > tolerance_ns]
+            for apart_ns in (nearest_apart_ns(reference, other), nearest_apart_ns(other, reference))
+        ]
+        if not any(map(len, far_ns)):
+            continue
+        is_first = len(far_ns[1]) > len(far_ns[0])
+        alone, partner, count = (0, row, len(reference)) if is_first else (row, 0, len(other))
+        apart_ns = far_ns[is_first]
+        yield (
+            f"{len(apart_ns)} of {count} images of camera {alone} have no partner in camera {partner}; the "
+            f"nearest is {float(np.median(apart_ns)) * 1e-6:.3g} ms away at the median: check the trigger, "
+            "or raise --vio_nframe_sync_tolerance_ns"
+        )
 
 
 def nearest_apart_ns(reference: I64, other: I64) -> I64:

@@ -232,6 +232,23 @@ def test_matrices_far_from_1_are_noted(matrix: str, note: str, tmp_path: Path) -
     assert not note or (note in result.notes[0] and result.notes[0].startswith(str(imu)))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "note"),
+    [
+        (
+            "60.0, 61.0",
+            "0.7, 0.9",
+            "camera 0: the focal length is 0.7: is it in pixels of 64 x 48?",
+        ),
+        ("rostopic", "timeshift_cam_imu: 5.3\n  rostopic", "camera 0: the time shift is 5.3 s"),
+    ],
+)
+def test_numbers_of_another_unit_are_noted(old: str, new: str, note: str, tmp_path: Path) -> None:
+    chain = written(tmp_path / "chain.yaml", CAMERA.replace(old, new))
+    (said,) = import_calibration(chain, written(tmp_path / "imu.yaml", IMU)).notes
+    assert note in said
+
+
 def test_noise_that_no_imu_has_is_noted_with_its_file(tmp_path: Path) -> None:
     chain = written(tmp_path / "chain.yaml", CAMERA)
     imu = written(tmp_path / "imu.yaml", IMU.replace("density: 0.001", "density: 57.3"))

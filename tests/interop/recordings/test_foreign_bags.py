@@ -173,6 +173,17 @@ def test_compressed_files(
         open_recording(path, calibrated)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", ["room.bag", "ROOM.BAG", "room.DB3", "room.mcap"])
+def test_files_with_other_endings(
+    tmp_path: Path, calibrated: SourceOptions, version: int, name: str
+) -> None:
+    path = write_bag(CONTENT, tmp_path / ("a.bag" if version == 1 else "a"), version=version)
+    file = path if version == 1 else path / "a.db3"
+    assert_reads(file.rename(tmp_path / name), calibrated)
+    assert bag_info(tmp_path / name).format == ("ros1" if version == 1 else "sqlite3")
+
+
 @pytest.mark.parametrize("has_metadata", [True, False])
 def test_messages_that_are_compressed_one_by_one(
     tmp_path: Path, calibrated: SourceOptions, has_metadata: bool
@@ -280,6 +291,9 @@ def test_each_failure_names_its_remedy(tmp_path: Path, calibrated: SourceOptions
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(MapError, match=r"`mcap recover \S*room.mcap -o whole.mcap`"):
         open_recording(mcap, calibrated)
+    file.write_text("version https://git-lfs.github.com/spec/v1\nsize 5\n")
+    with pytest.raises(MapError, match=r"it is text, 'version https://git-lfs.*': fetch the bag"):
+        open_recording(file, calibrated)
     shutil.rmtree(mcap)
     path = bag(tmp_path)
     (path / "room.db3").rename(path / "other.db3")
