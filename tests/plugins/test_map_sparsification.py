@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.console.session.session import Session
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_landmarks
 from tests.vimap.builders import walk_map
@@ -27,11 +27,6 @@ def test_a_dry_run_says_what_keyframing_then_does(session: Session) -> None:
     done = session.run("kfh", **flags)
     assert len(session.vi_map.vertices) == done.vertices_after == planned.vertices_after < 12
     assert check_consistency(session.vi_map).errors == ()
-
-
-def test_a_bad_threshold_is_refused(session: Session) -> None:
-    with pytest.raises(FlagError, match="kf_every_nth_vertex"):
-        session.run("kfh", kf_every_nth_vertex=0)
 
 
 def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ from maplab_py.algorithms.anchoring.options import AnchoringReport, MissionAlign
 from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.server import merging
 from maplab_py.server.alignments import OpenAlignments
 from maplab_py.server.merging import Merger, stretches_of
-from maplab_py.server.options import IncrementalOptions, MergingOptions, ServiceOptions
+from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.publishing import Display
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import SessionOptions
@@ -184,9 +184,3 @@ def test_a_deleted_map_is_not_shown() -> None:
     display.offer(None)
     Display(None, 0.0).offer(MAPS[0])
     assert seen == []
-
-
-@pytest.mark.parametrize("name", ["stop_when_idle_s", "visualization_interval_s"])
-def test_negative_times_are_refused(name: str) -> None:
-    with pytest.raises(FlagError, match=f"--serve_{name}=.*: must be at least 0"):
-        ServiceOptions(**{name: -1.0})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from maplab_py.console.session.session import Session
-from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.errors import MapError, UserError
 from maplab_py.frontend.data_source import open_source
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
@@ -146,11 +146,6 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
     assert len(joined.keypoints) == len(whole.keypoints)
     ids = joined.vertices.id
     assert len(np.unique(ids, axis=0)) == len(ids)
-
-
-def test_the_interval_must_be_positive() -> None:
-    with pytest.raises(FlagError, match="submap_interval_s=0"):
-        SubmapOutput(submap_interval_s=0.0)
 
 
 def test_vertices_of_a_mission_that_was_given_up_are_missing(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError
 from maplab_py.storage import native
 from maplab_py.storage.cache.column_file import mapped_bytes
-from maplab_py.storage.cache.options import CacheOptions
 from maplab_py.storage.native import LoadReport, MapCache, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
@@ -225,8 +224,3 @@ def test_commands_do_the_same_on_mapped_columns(
     assert len(list((tmp_path / "cache").glob("*.columns"))) == 1
     assert is_same(results[0], results[1])
     assert is_same(results[0], results[2])
-
-
-def test_the_size_of_the_cache_must_be_positive() -> None:
-    with pytest.raises(Exception, match="--map_cache_max_gb=0: must be above 0"):
-        CacheOptions(map_cache_max_gb=0.0)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import Distortion, Projection
@@ -395,12 +395,6 @@ def test_missions_in_the_panel(two_missions: VIMap) -> None:
 def test_an_empty_map_is_refused() -> None:
     with pytest.raises(UserError, match="'empty' has no vertices"):
         build_scene(Subject(VIMap(), "empty"))
-
-
-def test_options_refuse_nonsense() -> None:
-    for wrong in ({"max_points": 0}, {"scale": 0.0}, {"landmark_gray_level": 300}):
-        with pytest.raises(FlagError, match="--vis_"):
-            VisualizationOptions(**wrong)
 
 
 def test_landmarks_have_the_colour_of_the_camera_that_saw_them_first(

@@ -23,7 +23,7 @@ from maplab_py.algorithms.dense.options import DistanceOptions
 from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.algorithms.dense.triangle_tree import TriangleTree
 from maplab_py.array_types import F64, I32
-from maplab_py.errors import EstimationError, FlagError, MapError
+from maplab_py.errors import EstimationError, MapError
 from maplab_py.memory import NotEnoughMemory, memory_limited
 
 
@@ -294,10 +294,3 @@ def test_a_grid_without_a_surface_and_too_little_memory() -> None:
         pytest.raises(NotEnoughMemory, match="--dense_max_memory_gb"),
     ):
         field_of(grid, far)
-
-
-def test_wrong_options_are_refused() -> None:
-    with pytest.raises(FlagError, match="max_distance_m=0: must be above 0"):
-        DistanceOptions(max_distance_m=0.0)
-    with pytest.raises(FlagError, match="inner_radius"):
-        DistanceOptions(clear_sphere_inner_radius=2.0)

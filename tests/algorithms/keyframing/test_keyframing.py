@@ -10,7 +10,6 @@ import pytest
 
 from maplab_py.algorithms.keyframing.heuristic import Reason, choose_keyframes, keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.errors import FlagError
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.propagation import propagate
 from maplab_py.geometry import se3, so3
@@ -62,13 +61,6 @@ def test_other_missions_are_left_alone():
     m, _ = merge_maps(walk_map(), walk_map(seed=1))
     thin, _ = keyframe(m, KeyframingOptions(**LOOSE), missions=np.array([1]))
     assert np.bincount(thin.vertices.mission).tolist() == [12, 6]
-
-
-def test_bad_thresholds_are_refused():
-    with pytest.raises(FlagError, match="every_nth"):
-        KeyframingOptions(every_nth_vertex=0)
-    with pytest.raises(FlagError, match="distance"):
-        KeyframingOptions(distance_threshold_m=-1.0)
 
 
 def straight_map(step_m=0.25, turn_deg=0.0):

@@ -27,7 +27,6 @@ from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.errors import FlagError
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_landmarks, remove_observations, with_p_G
@@ -114,19 +113,6 @@ def test_observations_that_contradict_are_detached_and_reborn():
     frame_pairs = frame_pairs[:, repaired.keypoints.landmark >= 0]
     assert len(np.unique(frame_pairs, axis=1).T) == frame_pairs.shape[1]
     np.testing.assert_allclose(repaired.p_G[-1], m.p_G[b], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"min_observers": -1},
-        {"min_observation_angle_deg": 200.0},
-        {"min_distance_from_closest_observer": 50.0},
-    ],
-)
-def test_options_out_of_range_are_refused(values):
-    with pytest.raises(FlagError):
-        LandmarkQualityOptions(**values)
 
 
 DEFAULT = LandmarkQualityOptions()

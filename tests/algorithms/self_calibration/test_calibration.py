@@ -214,15 +214,6 @@ def test_the_spread_is_the_standard_error_of_the_mean_of_parts(
     np.testing.assert_allclose([one.sigma for one in report.parameters], expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("segments_per_group", 0), ("segment_keyframes", 1), ("prior_position_m", 0.0)],
-)
-def test_flags_without_meaning_are_named(field: str, value: Any) -> None:
-    with pytest.raises(UserError, match=f"--sc_{field}"):
-        dataclasses.replace(OPTIONS, **{field: value})
-
-
 STILL = {"shake_m": 0.0, "shake_rad": 0.0}
 
 

@@ -14,7 +14,7 @@ from maplab_py.algorithms.vi_optimization.local import optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import DataOptions, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.thinning import LeftOut, thinned
-from maplab_py.errors import EstimationError, FlagError
+from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario_file import load_scenario
@@ -298,16 +298,3 @@ def test_the_report_counts_what_was_left_out_and_the_result_stays_near():
     moved = np.linalg.norm(full.T_G_I[:, 4:] - vi_map.T_G_I[:, 4:], axis=1)
     apart = np.linalg.norm(full.T_G_I[:, 4:] - thin.T_G_I[:, 4:], axis=1)
     assert np.median(apart) < max(0.5 * np.median(moved), 0.02)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"max_observations_per_landmark": -1},
-        {"max_observations_per_landmark": 1},
-        {"max_covisible_frames": -3},
-    ],
-)
-def test_limits_out_of_range_are_refused(values):
-    with pytest.raises(FlagError, match="--ba_max"):
-        VIOptimizationOptions(**values)

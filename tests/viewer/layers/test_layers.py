@@ -171,14 +171,6 @@ def test_the_best_refused_closures_are_drawn(closed: VIMap) -> None:
     assert "1 by --vis_max_refused_closures" in layer.notes[0]
 
 
-@pytest.mark.parametrize(
-    "flags", [{"max_refused_closures": -1}, {"refused_closures_reason": "weather"}]
-)
-def test_bad_restrictions_are_refused(flags: dict[str, object]) -> None:
-    with pytest.raises(FlagError, match=f"--vis_{next(iter(flags))}"):
-        VisualizationOptions(**flags)  # type: ignore[arg-type]
-
-
 RAMP = tuple(colours.hex_codes(colours.SEQUENTIAL))
 
 
