@@ -39,7 +39,9 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     server = SimpleNamespace(initial_camera=SimpleNamespace(), get_clients=lambda: pages)
     cameras = Cameras(server)
     cameras.show_all(extent(1.0))
-    pages[7].camera.position = np.add(pages[7].camera.position, [0.5, 0.0, 0.0])  # its user turns it
+    pages[7].camera.position = np.add(
+        pages[7].camera.position, [0.5, 0.0, 0.0]
+    )  # its user turns it
     moved = pages[7].camera.position.copy()
     looks = []
     for radius_m in (1.02, 2.0, 2.2, 9.0, 2.0):
