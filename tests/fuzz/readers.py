@@ -54,7 +54,7 @@ from maplab_py.server.service import answers
 from maplab_py.storage.cache.column_file import UnusableColumns, read_columns, write_columns
 from maplab_py.storage.native import load_map, save_map
 from tests.fuzz.messages import message_seeds, read_message
-from tests.interop import test_pcd
+from tests.interop import test_clouds_and_meshes as clouds
 from tests.interop.calibrations import small_files, test_oddities
 from tests.interop.recordings.written import (
     make_content,
@@ -251,7 +251,7 @@ def _read_ply(folder: Path, data: bytes) -> None:
 
 
 def _pcd_seeds(folder: Path) -> list[bytes]:
-    return [test_pcd.binary(), test_pcd.ascii_text()]
+    return [clouds.binary(), clouds.ascii_text()]
 
 
 def _read_pcd(folder: Path, data: bytes) -> None:
