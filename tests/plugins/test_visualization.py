@@ -81,6 +81,7 @@ def test_the_viewer_ends_with_the_session_and_by_command(session: Session) -> No
     session.run("visualize")
     first = _viewer(session)
     assert session.marks["viewer"] == first.url
+    assert "was kept for" in session.run("viewer_keep", duration_s=0.2).text
     session.run("viewer_stop")
     assert first.is_stopped
     assert session.marks["viewer"] == ""

@@ -32,7 +32,7 @@ class DifferenceReport(Report):
     "visualize",
     "v",
     example="visualize --vis_color_landmarks_by_height",
-    see_also=("visualize_sequentially", "save_view", "export_view", "viewer_stop"),
+    see_also=("visualize_sequentially", "save_view", "export_view", "viewer_keep", "viewer_stop"),
     acts_outside=True,
     guards_effects=True,
 )

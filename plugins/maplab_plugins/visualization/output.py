@@ -1,12 +1,14 @@
-"""Commands that keep a view, and that end the viewer."""
+"""Commands that keep a view, and that keep or end the viewer."""
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Literal
 
 from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
+from maplab_py.cancellation import check_cancelled, ending_early
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 
 
@@ -92,6 +94,31 @@ def viewer_stop(context: CommandContext) -> Message:
     context.announce(NAME, "")
     context.announce(NAME, "")
     return Message(f"the viewer at {url} has stopped")
+
+
+@command(
+    "viewer_keep",
+    example="viewer_keep --duration_s=1",
+    needs_map=False,
+    see_also=("visualize", "rovioli"),
+    acts_outside=True,
+    guards_effects=True,
+)
+def viewer_keep(context: CommandContext, *, duration_s: float = 0.0) -> Message:
+    """Wait until Ctrl-C, so that the page of a script that would end here can be looked at.
+
+    Args:
+        duration_s: Time after which it ends by itself; 0 = only at Ctrl-C, or when the viewer stops.
+    """
+    viewer, start = running_viewer(context), time.monotonic()
+    context.terminal.note(f"{viewer.url} until Ctrl-C")
+    with ending_early() as is_to_end:
+        while not (is_to_end() or viewer.is_stopped):
+            if 0.0 < duration_s <= time.monotonic() - start:
+                break
+            check_cancelled()
+            time.sleep(0.1)
+    return Message(f"the viewer at {viewer.url} was kept for {time.monotonic() - start:.0f} s")
 
 
 def _check_target(file: Path, *, overwrite: bool) -> None:
