@@ -63,7 +63,7 @@ def studies() -> str:
             continue
         text = path.read_text(encoding="utf-8")
         title = text.splitlines()[0].lstrip("# ")
-        question = text.split("**Question.** ", 1)[1].split("\n\n", 1)[0]
+        question = text.split("**Question.** ", 1)[1].split("?", 1)[0] + "?"
         lines.append(f"- [{title}]({path.name}): {' '.join(question.split())}")
     return "\n".join(lines) + "\n"
 
