@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import mmap
 import os
 import struct
@@ -61,7 +62,7 @@ class _Place:
     @property
     def size(self) -> int:
         """Bytes of the column."""
-        return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=np.int64))
+        return int(np.dtype(self.dtype).itemsize * math.prod(self.shape))
 
 
 def write_columns(path: Path, vi_map: VIMap, facts: Mapping[str, Any]) -> None:
