@@ -94,7 +94,10 @@ def _point_type(header: dict[str, list[str]], source: str) -> np.dtype[np.void]:
 
 def _from_text(body: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
     widths = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
-    values = np.array(body.split(), dtype=np.float64)[: count * sum(widths)]
+    words = body.split()
+    if len(words) < count * sum(widths):
+        raise ValueError(f"{len(words)} of {count * sum(widths)} numbers")
+    values = np.array(words[: count * sum(widths)], dtype=np.float64)
     columns = values.reshape(count, sum(widths))
     table = np.zeros(count, dtype=dtype)
     first = 0

@@ -118,7 +118,7 @@ def choice(choices: tuple[str, ...]) -> FlagType:
         if text in choices:
             return text
         raise ValueError(
-            f"must be one of {', '.join(choices)}{did_you_mean(text.lower(), choices)}"
+            f"must be one of {', '.join(filter(None, choices))}{did_you_mean(text.lower(), choices)}"
         )
 
     return FlagType("choice", parse, lambda value: value in choices, choices)

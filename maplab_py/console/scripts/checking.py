@@ -89,12 +89,11 @@ class _Checker:
     def _check_files(self, call: Call) -> None:
         for name in call.command.reads:
             path = call.values.get(name)
-            if not isinstance(path, Path) or path.exists() or self._runs_shell:
+            if not isinstance(path, Path) or self._runs_shell:
                 continue
-            if not any(_is_related(path, other) for other in self._written):
-                raise UserError(
-                    f"{call.command.name}: --{name}={path}: there is no such file or folder"
-                )
+            fault = _fault(path)
+            if fault and not any(_is_related(path, other) for other in self._written):
+                raise UserError(f"{call.command.name}: --{name}={path}: {fault}")
         self._written += [value for value in call.values.values() if isinstance(value, Path)]
 
     def _follow(self, call: Call, words: Sequence[str]) -> None:
@@ -113,6 +112,14 @@ class _Checker:
         if call.keeps_flags:
             kept = [f"--{flag}={text}" for flag, text in call.given.items()]
             self._settings.assign(kept, Layer.SET, "--keep_gflags")
+
+
+def _fault(path: Path) -> str:
+    """Return why a path cannot be read, as without permission for its folder; empty if it is there."""
+    try:
+        return "" if path.exists() else "there is no such file or folder"
+    except OSError as error:
+        return error.strerror or "it cannot be read"
 
 
 def _is_related(path: Path, other: Path) -> bool:

@@ -221,11 +221,14 @@ def read_times(file: Path, time_unit: str = "") -> dict[str, int]:
     stamps: dict[str, tuple[int, str]] = {}
     header = ""
     for number, line in enumerate(text.splitlines(), start=1):
-        content = line.strip()
-        if not content or content.startswith("#"):
+        content = line.replace('"', "").strip()
+        match = re.fullmatch(
+            r"(.+?)[\s,;]+([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)", content
+        )
+        is_header = not (stamps or header or match) and re.search("time|stamp", content.lower())
+        if not content or content.startswith("#") or is_header:
             header = header or content
             continue
-        match = re.fullmatch(r"(.+?)[\s,]+([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)", content)
         if match is None:
             raise MapError(f"{file}:{number}: wants an image name and a time stamp")
         if match[1] in stamps:

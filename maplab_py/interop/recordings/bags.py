@@ -35,6 +35,7 @@ from maplab_py.interop.recordings.clocks import (
     Run,
     check_common_time,
     check_dropped,
+    check_part,
     common_part_count,
     dropped_note,
     first_stamp_ns,
@@ -363,10 +364,7 @@ class BagRecording:
         runs = self._runs()
         counts = {s.camera: len(run) for s, run in zip(self._streams, runs, strict=True)}
         count = max(counts.values())
-        if part > count:
-            raise UserError(
-                f"{self.name}: --recording_part={part}: the recording has {count} parts"
-            )
+        check_part(self.name, part, count)
         sensors = [counts[s.camera] for s in self._streams if s.camera < 0]
         cameras = [counts[s.camera] for s in self._streams if s.camera >= 0]
         self._is_apart = part > 1 and min(counts.values()) < count

@@ -11,7 +11,8 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
+from maplab_py.report import counted
 
 _LARGEST_STEP_NS = 86_400_000_000_000
 """Stamps that lie further ahead are of another clock."""
@@ -228,6 +229,18 @@ def check_common_time(
         f"{name}: {reason}: the IMU is from {imu_ns[0]} to {imu_ns[1]} ns, the images from {images_ns[0]} to "
         f"{images_ns[1]} ns: if only a clock is shifted, give --imu_to_camera_time_offset_ns ({proposal})"
     )
+
+
+def check_part(name: str, part: int, count: int) -> None:
+    """Check that a recording has a part.
+
+    Raises:
+        UserError: There is no such part.
+    """
+    if part > count:
+        raise UserError(
+            f"{name}: --recording_part={part}: the recording has {counted(count, 'part')}"
+        )
 
 
 def common_part_count(name: str, imu: int | None, cameras: Sequence[int]) -> int:

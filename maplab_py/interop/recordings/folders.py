@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.errors import MapError, MaplabError
 from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
@@ -24,6 +24,7 @@ from maplab_py.interop.recordings.clocks import (
     Dropped,
     check_common_time,
     check_dropped,
+    check_part,
     common_part_count,
     dropped_note,
     listed_rows,
@@ -151,10 +152,7 @@ class FolderRecording:
         """
         part = self._reading.recording_part
         count = max(len(table.parts) for table in self._tables)
-        if part > count:
-            raise UserError(
-                f"{self.name}: --recording_part={part}: the recording has {count} parts"
-            )
+        check_part(self.name, part, count)
         if part:
             imu = None if self._imu is None else len(self._imu.parts)
             common_part_count(self.name, imu, [len(camera.parts) for camera in self._cameras])

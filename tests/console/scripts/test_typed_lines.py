@@ -338,6 +338,17 @@ def test_a_fault_anywhere_is_named_and_nothing_runs(
     assert FAULTS[fault] in line
 
 
+def test_a_folder_without_permission_is_named(
+    session: Session, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    def refuse(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    assert Runner(session, ConsoleTerminal()).run_script("load locked/map") == Status.USER_ERROR
+    assert "--map_folder=locked/map: Permission denied" in capsys.readouterr().err
+
+
 def test_all_faults_of_a_script_are_named_with_their_lines(session: Session) -> None:
     text = "map_stats\n# a remark\n  optivi; kfh --x=1\nlc --lc_min_inlier_count=many"
     problems = check_commands(text, session)

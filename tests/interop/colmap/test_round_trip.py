@@ -361,6 +361,8 @@ def test_a_file_of_stamps(tmp_path: Path) -> None:
     file = tmp_path / "times.txt"
     file.write_text("# name, time [ms]\nImage 1.png, 1000.5\nb.png 1033.5\n")
     assert read_times(file) == {"Image 1.png": 1_000_500_000, "b.png": 1_033_500_000}
+    file.write_text('image;timestamp [ms]\n"Image 1.png";1000.5\n"b.png";"1033.5"\n')
+    assert read_times(file) == {"Image 1.png": 1_000_500_000, "b.png": 1_033_500_000}
     file.write_text("a.png later\n")
     with pytest.raises(MapError, match=":1: wants an image name and a time stamp"):
         read_times(file)
