@@ -51,6 +51,7 @@ class Subject:
     shows_observers: bool = False
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
     only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
+    note: str = ""  # a line above the layers
 
     def replace(self, **changes: object) -> Subject:
         """Return the subject with some of it exchanged."""
@@ -117,7 +118,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     if subject.localized is not None:
         extent = _widen(extent, subject.localized.p_G - drawing.origin_G)
     notes = [note for layer in layers if not layer.choices for note in layer.notes]
-    notes += unreadable + problems
+    notes = [*filter(None, [subject.note]), *notes, *unreadable, *problems]
     if subject.other is not None:
         extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
         where = "beside it" if subject.side_by_side else "in grey"

@@ -33,8 +33,11 @@ if TYPE_CHECKING:
     from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.server.submap_sources import SubmapWriter
     from maplab_py.viewer.display.viewer import Viewer
+    from maplab_py.vimap import VIMap
 
 _DEFAULT_KEY = "rovioli"
+_SECONDS_TO_DRAW = 20.0
+"""Time that the viewer gets to draw the finished map."""
 
 
 @command(
@@ -93,8 +96,9 @@ def rovioli(
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
     observers: list[Observer] = []
-    if rovioli_visualize_map:
-        observers.append(_observer(context, key, map_publish_interval_s))
+    pictures = _pictures(context, key, map_publish_interval_s) if rovioli_visualize_map else None
+    if pictures is not None:
+        observers.append(pictures)
     is_live, writer = data.type in TRANSPORTS, None
     if submaps.submap_spool is not None:
         # runs of hours: the map is at the server, and what is there need not stay in memory
@@ -129,6 +133,8 @@ def rovioli(
         _tell_end(context, finished, mapping.statistics.elapsed_s)
     is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
     _keep_map(context, key, finished, is_at_server=is_at_server)
+    if pictures is not None and finished.vi_map is not None:
+        pictures.after_run(finished.vi_map, finished.report.map_folder)
     return finished.report
 
 
@@ -252,8 +258,18 @@ class _Pictures:
                     run = LocalizedRun(localization.p_G, live.p_G_I, live.rays_G)
                 self._viewer.follow(Subject(vi_map, self._title, localized=run))
 
+    def after_run(self, vi_map: VIMap, folder: Path | None) -> None:
+        """Show the finished map, and how to come back to it; wait, for the program may end now."""
+        from maplab_py.viewer.building import Subject
 
-def _observer(context: CommandContext, title: str, interval_s: float) -> Observer:
+        if self._viewer.is_stopped:
+            return
+        note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
+        self._viewer.follow(Subject(vi_map, self._title, note=note))
+        self._viewer.wait(_SECONDS_TO_DRAW)
+
+
+def _pictures(context: CommandContext, title: str, interval_s: float) -> _Pictures:
     from maplab_plugins.visualization.following import ViewerOptions, ensure_viewer
 
     viewer = ensure_viewer(context, ViewerOptions())

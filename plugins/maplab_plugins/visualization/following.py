@@ -79,7 +79,7 @@ class Following:
         if entry.vi_map is subject.vi_map or not len(entry.vi_map.vertices):
             return
         if entry.key == subject.title:
-            following = subject.replace(vi_map=entry.vi_map)
+            following = subject.replace(vi_map=entry.vi_map, note="")
         else:
             following = Subject(entry.vi_map, entry.key, subject.options)
         self.viewer.follow(following)
