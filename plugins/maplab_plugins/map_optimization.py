@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def optimize_visual_inertial(
     context: CommandContext,
     *,
-    options: VIOptimizationOptions = VIOptimizationOptions(),
+    options: VIOptimizationOptions = VIOptimizationOptions(calibration="auto"),
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> VIOptimizationReport:
     """Optimise poses, velocities, biases and landmarks from images and inertial measurements."""

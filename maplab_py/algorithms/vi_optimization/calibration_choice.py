@@ -50,7 +50,7 @@ _GROUPS = (
     _Group("fix_ncamera_time_offset", TIMING, 0, 1, 0.003, 1.0, "ms", 1e-3, "image delay", "image delay"),
     _Group("fix_ncamera_line_delay", TIMING, 1, 2, 0.005, 5.0, "us", 1e-6, "line delay", "line delay"),
     _Group(
-        "fix_ncamera_extrinsics_rotation", EXTRINSICS, 3, 6, 0.01, 0.3, "deg", np.pi / 180.0,
+        "fix_ncamera_extrinsics_rotation", EXTRINSICS, 3, 6, 0.01, 0.5, "deg", np.pi / 180.0,
         "rotation on the IMU", "rotation",
     ),
     _Group("fix_ncamera_intrinsics", INTRINSICS, 0, 99, 0.011, 0.6, "%", 0.01, "focal length", " fu"),
@@ -198,7 +198,7 @@ def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> 
             parts += _describe_values(group, report.calibration)
     return (
         f"the residuals contradict the calibration, so this was estimated: {', '.join(parts)} "
-        "(without --ba_calibration=auto it stays)"
+        "(--ba_calibration=fixed keeps it)"
     )
 
 

@@ -397,6 +397,7 @@ def test_a_run_that_is_lost_is_mended_or_noted() -> None:
         in note
         for note in notes
     )
+    assert any("optimised with the calibration of the cameras free" in note for note in notes)
     refusing = RunOptions(odometry=dataclasses.replace(OdometryOptions(), apply_calibration=False))
     lost = run_checked(lambda read: Mapping(read, refusing), wrong)
     assert lost.statistics.estimated_frames < 0.5 * lost.statistics.frames

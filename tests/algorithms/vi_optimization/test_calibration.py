@@ -217,7 +217,7 @@ def test_a_fault_is_freed_named_and_mended(
     kept, _ = optimize(start, FIXED)
     truth = data.truth
     assert words in report.note
-    assert "--ba_calibration=auto" in report.note
+    assert "--ba_calibration=fixed" in report.note
     assert any(block in row.parameter for row in report.calibration)
     assert all(np.isfinite(row.sigma) and row.sigma > 0.0 for row in report.calibration)
     of_truth_m = evaluate_map(wanted, truth).ate_m
