@@ -29,6 +29,7 @@ from maplab_py.interop.colmap.model import (
 )
 from maplab_py.sensors import Camera
 
+_ROUNDING = 1e-9
 _ANNOUNCED = re.compile(r"# Number of \w+: (\d+)")
 _HEADER_BYTES = 4096
 _NEEDED = ("cameras", "images", "points3D")
@@ -115,7 +116,13 @@ def _read_text(folder: Path) -> ColmapModel:
                 (work / TEXT / path.name).symlink_to(path.resolve())
         names, poses = _text_images(folder / "images.txt", work / TEXT / "images.txt")
         run_job("write_binary", work, folder)
-        model = read_binary(work / BINARY)
+        try:
+            model = read_binary(work / BINARY)
+        except MapError as error:  # of the file that was converted
+            reason = (
+                str(error).replace(str(work / BINARY), str(folder)).replace(".bin: ", ".txt: ", 1)
+            )
+            raise MapError(reason) from None
     images = model.images
     ids = images.id.tolist()
     T_C_W = np.array([poses[number] for number in ids]).reshape(-1, 7)
@@ -166,6 +173,8 @@ def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]
                     raise MapError(f"{path}:{number}: the pose of image {image} is none; {REMEDY}")
                 names[image] = name
                 poses[image] = np.concatenate([values[[1, 2, 3, 0]] / length, values[4:]])
+                if abs(length - 1.0) > _ROUNDING:  # COLMAP takes quaternions of any length
+                    words[1:5] = map(repr, (values[:4] / length).tolist())
                 record = " ".join(words[:9]) + f" {image}\n" + next(stream, "\n")
                 target.write(record.encode())
     except OSError as error:

@@ -91,6 +91,25 @@ def test_lines_that_are_no_image_are_named(copy: Path, line: str, reason: str) -
         import_colmap(copy, ORDER)
 
 
+def test_a_fault_of_the_converted_copy_names_the_text_file(copy: Path) -> None:
+    path = copy / "cameras.txt"
+    lines = path.read_text().splitlines()
+    words = lines[-1].split()
+    path.write_text("\n".join([*lines[:-1], " ".join([*words[:2], "0", *words[3:]]), ""]))
+    with pytest.raises(
+        MapError, match=rf"^{path}: is damaged: the images of camera \d+ have no pixels"
+    ):
+        read_model(copy)
+
+
+def test_quaternions_of_any_length_are_read(copy: Path) -> None:
+    for name in ("rigs", "frames"):
+        (copy / f"{name}.txt").unlink()
+    before = read_model(copy).images.T_C_W
+    edit_images(copy, lambda w: [w[0], *(str(2.0 * float(q)) for q in w[1:5]), *w[5:]])
+    np.testing.assert_allclose(read_model(copy).images.T_C_W, before, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", ["cameras", "points3D", "frames", "rigs"])
 def test_no_text_of_the_library_reaches_the_user(copy: Path, kind: str) -> None:
     path = copy / f"{kind}.txt"
