@@ -11,7 +11,6 @@ import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
-from functools import partial
 from multiprocessing.process import BaseProcess
 
 import numpy as np
@@ -62,10 +61,7 @@ def jobs() -> dict[str, Callable[[], None]]:
         "descriptor search": _compile_search,
         "feature tracking": tracker.compile_kernels,
         "descriptors of numbers": _compile_numbers,
-        **{
-            f"absolute pose by {name}": partial(absolute_pose.compile_kernels, name)
-            for name in absolute_pose.HYPOTHESES
-        },
+        "absolute pose": absolute_pose.compile_kernels,
         "relaxation": _relax_circle,
         "message scan": _scan_message,
         "dense maps": _compile_dense,

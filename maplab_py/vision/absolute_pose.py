@@ -1,9 +1,8 @@
 """Absolute pose of a camera rig from matches of keypoints with points, many queries at once.
 
 Two matches and the gravity direction determine yaw and position (a quadratic), so that few samples
-suffice even at a high outlier ratio. Without gravity, three matches determine the pose (P3P, or
-generalised P3P for rigs with several camera centres). Every improved hypothesis is refined with all
-six degrees of freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
+suffice even at a high outlier ratio. Every improved hypothesis is refined with all six degrees of
+freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
 """
 
 from __future__ import annotations
@@ -15,9 +14,6 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3, symmetric
-
-HYPOTHESES = ("gravity", "three_point")
-"""Minimal solvers and their sample sizes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,7 +52,6 @@ def solve_poses(
     seed: int = 0,
     max_iterations: int = 200,
     tilt_sigma_rad: float = 0.02,
-    hypotheses: str = "gravity",
 ) -> PoseSolutions:
     """Estimate the pose of every query. Deterministic in the seed, for any number of threads.
 
@@ -65,7 +60,6 @@ def solve_poses(
         seed: Seed of the random samples.
         max_iterations: Maximum number of samples per query; a high inlier ratio needs fewer.
         tilt_sigma_rad: Standard deviation of the given roll and pitch.
-        hypotheses: One of HYPOTHESES: "gravity", or "three_point", which ignores the given yaw.
     """
     count, matches = len(problems.key), len(problems.keypoint)
     of_match = np.repeat(np.arange(count), np.diff(problems.start))
@@ -83,7 +77,6 @@ def solve_poses(
         seed=seed,
         max_iterations=max_iterations,
         tilt_sigma_rad=tilt_sigma_rad,
-        hypotheses=hypotheses,
     )
     is_first = np.ones(matches, dtype=np.bool_)
     is_first[1:] = (of_match[1:] != of_match[:-1]) | (
@@ -147,7 +140,6 @@ def search_level(
     seed: int = 0,
     max_iterations: int = 200,
     tilt_sigma_rad: float = 0.02,
-    hypotheses: str = "gravity",
 ) -> LevelSolutions:
     """Estimate poses as `solve_poses` does, for queries already rotated to W."""
     from maplab_py.vision.pose_kernels import (
@@ -157,7 +149,7 @@ def search_level(
         search_poses,
     )
 
-    count, uses_gravity = len(problems.key), hypotheses == "gravity"
+    count = len(problems.key)
     matches = MatchColumns(
         problems.start,
         _mixed_seeds(problems.key, seed),
@@ -175,8 +167,7 @@ def search_level(
         inlier_count=np.empty(count, dtype=np.int64),
         is_inlier=np.zeros(len(problems.keypoint), dtype=np.bool_),
     )
-    settings = SearchSettings(max_iterations, 1.0 / tilt_sigma_rad if uses_gravity else 0.0)
-    search_poses(None if uses_gravity else True, matches, settings, poses)
+    search_poses(matches, SearchSettings(max_iterations, 1.0 / tilt_sigma_rad), poses)
     return LevelSolutions(*poses)
 
 
@@ -205,8 +196,8 @@ def _mixed_seeds(key: I64, seed: int) -> NDArray[np.uint64]:
         return np.asarray(z ^ (z >> np.uint64(31)))
 
 
-def compile_kernels(hypotheses: str) -> None:
-    """Compile the search by one kind of hypotheses on one query."""
+def compile_kernels() -> None:
+    """Compile the search on one query."""
     points = 8
     point = np.random.default_rng(0).uniform(1.0, 5.0, (points, 3))
     problems = PoseProblems(
@@ -219,4 +210,4 @@ def compile_kernels(hypotheses: str) -> None:
         keypoint=np.arange(points),
         tolerance=np.full(points, 0.01),
     )
-    solve_poses(problems, hypotheses=hypotheses, max_iterations=2)
+    solve_poses(problems, max_iterations=2)

@@ -1,8 +1,8 @@
 """Compiled kernels of the absolute pose search: hypotheses, scoring, refinement.
 
 W is the query's body frame turned so that its z axis points up; M is the gravity-aligned frame of
-the points. Hypotheses are T_M_W: from two matches yaw and position, from three matches all of it.
-The refinement frees roll and pitch, held by a prior.
+the points. Hypotheses are T_M_W: yaw and position from two matches. The refinement frees roll and
+pitch, held by a prior.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.compilation import compiled, prange
-from maplab_py.vision.minimal_solvers import MIN_DEPTH_M, three_point, two_point
 from maplab_py.vision.random_numbers import random_below
 
+_MIN_DEPTH_M = 0.05
 _CONFIDENCE = 0.999
 _LOOSE = 3.0
 """Hypotheses are scored with as many times the tolerance: their tilt is only as good as given."""
@@ -70,7 +70,7 @@ def _score(R, t, origin, ray, point, keypoint, inverse_sigma, best_match):  # ty
             cy = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z - origin[j, 1]
             cz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z - origin[j, 2]
             along = cx * ray[j, 0] + cy * ray[j, 1] + cz * ray[j, 2]
-            if along > MIN_DEPTH_M:
+            if along > _MIN_DEPTH_M:
                 # tan^2 of the angle to the ray
                 square = (cx * cx + cy * cy + cz * cz - along * along) / (along * along)
                 error = square * inverse_sigma[j] * inverse_sigma[j]
@@ -246,18 +246,58 @@ def _polish(  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _draw(state, sample, three, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
-    """Fill in the poses of a random sample; `three` None leaves the three-point solver uncompiled."""
+def _two_point(o1, f1, X1, o2, f2, X2, yaw, position):  # type: ignore[no-untyped-def]
+    """Fill in up to two solutions of Rz(yaw) (o_i + depth_i f_i) + position = X_i; return how many.
+
+    The z components make the depths a line, depth(s) = base + s u; the horizontal distance of
+    the two points then is a quadratic in s.
+    """
+    n = np.sqrt(f1[2] * f1[2] + f2[2] * f2[2])
+    if n < 1e-3:
+        return 0
+    c = (X1[2] - X2[2] - o1[2] + o2[2]) / (n * n)
+    base1, base2 = c * f1[2], -c * f2[2]
+    u1, u2 = f2[2] / n, f1[2] / n
+    ax = o1[0] - o2[0] + base1 * f1[0] - base2 * f2[0]
+    ay = o1[1] - o2[1] + base1 * f1[1] - base2 * f2[1]
+    bx, by = u1 * f1[0] - u2 * f2[0], u1 * f1[1] - u2 * f2[1]
+    dx, dy = X1[0] - X2[0], X1[1] - X2[1]
+    qa = bx * bx + by * by
+    qb = ax * bx + ay * by
+    qc = ax * ax + ay * ay - dx * dx - dy * dy
+    discriminant = qb * qb - qa * qc
+    if qa < 1e-12 or discriminant < 0.0:
+        return 0
+    root = np.sqrt(discriminant)
+    count = 0
+    for sign in (-1.0, 1.0):
+        s = (-qb + sign * root) / qa
+        depth1, depth2 = base1 + s * u1, base2 + s * u2
+        if depth1 < _MIN_DEPTH_M or depth2 < _MIN_DEPTH_M:
+            continue
+        vx, vy = ax + s * bx, ay + s * by
+        phi = np.arctan2(dy, dx) - np.arctan2(vy, vx)
+        cos, sin = np.cos(phi), np.sin(phi)
+        px, py = o1[0] + depth1 * f1[0], o1[1] + depth1 * f1[1]
+        yaw[count] = phi
+        position[count, 0] = X1[0] - (cos * px - sin * py)
+        position[count, 1] = X1[1] - (sin * px + cos * py)
+        position[count, 2] = X1[2] - (o1[2] + depth1 * f1[2])
+        count += 1
+    return count
+
+
+@compiled()
+def _draw(state, sample, k, o, f, X, R, t):  # type: ignore[no-untyped-def]
+    """Fill in up to two poses of a random sample of two matches; return how many."""
     for i in range(len(sample)):
         sample[i] = random_below(state, len(k))
         for j in range(i):
             if k[sample[j]] == k[sample[i]]:
                 return 0
-    if three is not None:
-        return three_point(o[sample], f[sample], X[sample], R, t)
     a, b = sample[0], sample[1]
     yaw = np.empty(2)
-    count = two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, t)
+    count = _two_point(o[a], f[a], X[a], o[b], f[b], X[b], yaw, t)
     for s in range(count):
         cos, sin = np.cos(yaw[s]), np.sin(yaw[s])
         R[s, 0, 0], R[s, 0, 1], R[s, 0, 2] = cos, -sin, 0.0
@@ -267,7 +307,7 @@ def _draw(state, sample, three, k, o, f, X, R, t):  # type: ignore[no-untyped-de
 
 
 @compiled()
-def _search_pose(i, three, matches, settings, poses):  # type: ignore[no-untyped-def]
+def _search_pose(i, matches, settings, poses):  # type: ignore[no-untyped-def]
     """Search the pose of one problem."""
     a, b = matches.start[i], matches.start[i + 1]
     o, f, X = matches.origin_W[a:b], matches.ray_W[a:b], matches.point_M[a:b]
@@ -287,13 +327,13 @@ def _search_pose(i, three, matches, settings, poses):  # type: ignore[no-untyped
     used = np.zeros(count, dtype=np.bool_)
     best_cost, best_inliers = float(keypoints), 0
     best_loose = best_cost
-    R_guess, t_guess = np.empty((8, 3, 3)), np.empty((8, 3))
+    R_guess, t_guess = np.empty((2, 3, 3)), np.empty((2, 3))
     R, t = np.empty((3, 3)), np.empty(3)
     needed, done = max_iterations, 0
-    sample = np.empty(2 if three is None else 3, dtype=np.int64)
+    sample = np.empty(2, dtype=np.int64)
     while done < needed and keypoints >= 3:
         done += 1
-        for s in range(_draw(state, sample, three, k, o, f, X, R_guess, t_guess)):
+        for s in range(_draw(state, sample, k, o, f, X, R_guess, t_guess)):
             _copy_pose(R_guess[s], t_guess[s], R, t)
             cost, inliers = _score(R, t, o, f, X, k, w_loose, used)
             if cost >= best_loose or inliers < 3:
@@ -325,10 +365,7 @@ def _search_pose(i, three, matches, settings, poses):  # type: ignore[no-untyped
 
 
 @compiled(parallel=True)
-def search_poses(three, matches, settings, poses):  # type: ignore[no-untyped-def]
-    """Search the pose of every problem.
-
-    `three` None: from two matches and gravity. True: from three matches.
-    """
+def search_poses(matches, settings, poses):  # type: ignore[no-untyped-def]
+    """Search the pose of every problem."""
     for problem in prange(len(matches.start) - 1):
-        _search_pose(np.int64(problem), three, matches, settings, poses)
+        _search_pose(np.int64(problem), matches, settings, poses)

@@ -39,6 +39,21 @@ def test_pose_among_wrong_matches_with_noise_and_tilted_gravity(outliers):
     assert found.is_inlier.sum() > 0.9 * np.count_nonzero(~wrong)
 
 
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("flatness", [1.0, 0.0])
+def test_pose_of_rigs_and_of_points_in_a_plane(flatness, cameras):
+    problems, truth, wrong = pose_problems(
+        40, 80, outliers=0.5, noise_rad=0.001, tilt_rad=0.005, seed=11,
+        cameras=cameras, flatness=flatness,
+    )  # fmt: skip
+    found = solve_poses(problems, max_iterations=300)
+    position, turn = errors(found.T_M_I, truth)
+    assert position.max() < 0.05
+    assert turn.max() < 0.01
+    right = found.is_inlier & ~wrong
+    assert right.sum() > 0.9 * np.count_nonzero(~wrong)
+
+
 def test_covariance_matches_the_scatter():
     sigma = 0.001
     problems, truth, _ = pose_problems(400, 60, outliers=0.0, noise_rad=sigma, tilt_rad=0.0, seed=3)

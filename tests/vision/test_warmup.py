@@ -10,7 +10,6 @@ from maplab_py.vision import (
     search_kernels,
     track_union,
 )
-from maplab_py.vision.absolute_pose import HYPOTHESES
 from maplab_py.vision.features import corner_kernels
 from maplab_py.vision.tracking import tracker, two_point_kernels
 from maplab_py.warmup import jobs
@@ -19,7 +18,7 @@ from tests.vision.tracking.rendered import pose, stereo
 
 def compile_usual_kernels():
     jobs()["descriptor search"]()
-    jobs()[f"absolute pose by {HYPOTHESES[0]}"]()
+    jobs()["absolute pose"]()
 
 
 def test_warmup_compiles_every_kernel_that_place_recognition_calls():

@@ -113,7 +113,6 @@ def detect(
         tolerance_px=options.ransac_pixel_sigma,
         seed=options.seed,
         max_iterations=options.num_ransac_iters,
-        hypotheses=options.pose_hypotheses,
     )
     closures, contests = _closures(
         vi_map, features, candidates, search, options, trust_base_frames, choice
@@ -234,7 +233,6 @@ def search_poses(
     tolerance_px: float,
     seed: int,
     max_iterations: int,
-    hypotheses: str,
 ) -> PoseSearch:
     """Estimate each candidate's pose T_M_I, where M is the frame of the place's mission.
 
@@ -249,9 +247,7 @@ def search_poses(
         problems, landmark, bits = _problems(
             vi_map, features, matches, candidates, slice(begin, end), tolerance_px
         )
-        solutions = solve_poses(
-            problems, seed=seed, max_iterations=max_iterations, hypotheses=hypotheses
-        )
+        solutions = solve_poses(problems, seed=seed, max_iterations=max_iterations)
         parts.append(_inliers(problems, solutions, landmark, bits))
     return _joined(parts)
 

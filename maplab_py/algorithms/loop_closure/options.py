@@ -70,9 +70,6 @@ class LoopClosureOptions(FeatureTypeOptions):
     """Largest reprojection error of an inlier"""
     num_ransac_iters: int = 300
     """Largest number of samples of matches per query vertex"""
-    pose_hypotheses: str = option("gravity", choices=("gravity", "three_point"))
-    """Minimal solver: gravity (two matches and the query's gravity direction) or three_point (three matches:
-    P3P, generalised for rigs of several cameras)"""
     min_inlier_count: int = 12
     """Keypoints that must agree with the pose"""
     min_inlier_ratio: float = 0.1
