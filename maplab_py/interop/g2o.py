@@ -18,10 +18,113 @@ from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import TooLarge, decode_foreign, inflate, read_bytes
-from maplab_py.interop.information_matrices import positive_definite
-from maplab_py.interop.odometry_chain import chained_poses
 from maplab_py.interop.text_table import format_rows
 from maplab_py.output_files import write_text
+
+
+def chained_poses(id: U64, first: I64, second: I64, T_A_B: F64) -> F64:
+    """Return poses T_G_V (V, 7) along a spanning forest of the edges, odometry before other edges.
+
+    The first pose of every connected part is the identity.
+
+    Args:
+        id: Ids (V,), ascending; an edge between subsequent ids is odometry.
+        first: Row of A (E,).
+        second: Row of B (E,).
+        T_A_B: Measured relative poses (E, 7).
+    """
+    parent, edge, is_forward = _spanning_forest(id, first, second)
+    root = len(id)  # a further node above the first pose of every part
+    step = se3.identity(root + 1)
+    linked = np.flatnonzero(edge >= 0)
+    measured = T_A_B[edge[linked]]
+    forward = is_forward[linked, None]
+    step[linked] = np.where(forward, measured, se3.inverse(measured))
+    above = np.append(parent, root)
+    while np.any(above != root):  # twice as far up in every round
+        step = se3.compose(step[above], step)
+        above = above[above]
+    return np.asarray(step[:root])
+
+
+def _spanning_forest(id: U64, first: I64, second: I64) -> tuple[I64, I64, np.ndarray]:
+    """Return for every pose its parent, the edge that joins them (-1 = root), and its direction.
+
+    A root's parent is V. Forward edges run from the parent to the pose.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import (
+        breadth_first_order,
+        connected_components,
+        minimum_spanning_tree,
+    )
+
+    count = len(id)
+    proper = np.flatnonzero(first != second)
+    low = np.minimum(first[proper], second[proper])
+    high = np.maximum(first[proper], second[proper])
+    key, weight = low * count + high, np.where(id[high] - id[low] == 1, 1.0, 2.0)
+    key, earliest = np.unique(key, return_index=True)
+    edges, weight = proper[earliest], weight[earliest]
+    ends = (key // count, key % count)
+    graph = coo_array((weight, ends), shape=(count + 1, count + 1)).tocsr()
+    _, part = connected_components(graph[:count, :count], directed=False)
+    roots = np.unique(part, return_index=True)[1]
+    tree = minimum_spanning_tree(graph).tocoo()
+    rooted = coo_array(
+        (
+            np.ones(len(tree.data) + len(roots)),
+            (np.append(tree.row, np.full(len(roots), count)), np.append(tree.col, roots)),
+        ),
+        shape=(count + 1, count + 1),
+    ).tocsr()
+    _, parent = breadth_first_order(rooted, count, directed=False)
+    parent = parent[:count].astype(np.int64)
+    rows = np.arange(count)
+    wanted = np.minimum(rows, parent) * count + np.maximum(rows, parent)
+    edge = np.full(count, -1, dtype=np.int64)
+    linked = parent < count
+    edge[linked] = edges[np.searchsorted(key, wanted[linked])]
+    return parent, edge, np.asarray(second[edge] == rows)
+
+
+_SMALLEST_RATIO = 1e-9
+"""Smallest eigenvalue of a repaired matrix over the largest: the direction then tells almost nothing."""
+
+
+def positive_definite(information: F64) -> tuple[F64, int]:
+    """Raise the eigenvalues of matrices (N, 6, 6) that are not positive definite.
+
+    Matrices that have a Cholesky factor are returned bit for bit. In the others eigenvalues below
+    1e-9 of the largest are raised to that; a matrix without a positive eigenvalue, or with entries
+    that are not finite, cannot be repaired and stays.
+
+    Returns:
+        The matrices, and how many of them were changed.
+    """
+    finite = np.isfinite(information).all(axis=(1, 2))
+    suspects = np.flatnonzero(finite)
+    value = np.linalg.eigvalsh(information[suspects])
+    # what is safely positive needs no further look
+    suspects = suspects[value[:, 0] <= _SMALLEST_RATIO * np.maximum(value[:, -1], 0.0)]
+    rows = np.array([row for row in suspects.tolist() if not _has_factor(information[row])], int)
+    value, vector = np.linalg.eigh(information[rows])
+    can_repair = value[:, -1] > 0.0
+    rows, value, vector = rows[can_repair], value[can_repair], vector[can_repair]
+    value = np.maximum(value, _SMALLEST_RATIO * value[:, -1:])
+    result = information.copy()
+    result[rows] = (vector * value[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    result[rows] = 0.5 * (result[rows] + np.swapaxes(result[rows], 1, 2))
+    return result, len(rows)
+
+
+def _has_factor(matrix: F64) -> bool:
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
 
 _POSE, _PLANAR_POSE = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 _EDGE, _PLANAR_EDGE = "EDGE_SE3:QUAT", "EDGE_SE2"

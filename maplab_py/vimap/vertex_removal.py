@@ -7,13 +7,140 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import I64, Mask
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap.edge_joining import join_imu_edges, join_transformation_edges
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap.ids import as_keys, to_hex
 from maplab_py.vimap.selection import as_mask, keep_rows
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap.tables import ImuEdges, TransformationEdges
 from maplab_py.vimap.vi_map import VIMap
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Chains:
+    """Edges along the graph between kept neighbours: chain i is edges[start[i] : start[i + 1]]."""
+
+    edges: I64
+    start: I64
+    to_vertex: I64
+    passed: Mask  # (E,) edges that stay as they are: both ends kept, not along the graph
+    broken: int  # pairs of kept neighbours with some, but not all links
+
+
+def join_imu_edges(vi_map: VIMap, vertex_kept: Mask) -> tuple[VIMap, int]:
+    """Replace IMU edges by one edge between every two kept neighbours; also return the number lost.
+
+    The sample at an inner boundary belongs to both edges and is kept once.
+    """
+    table = vi_map.imu_edges
+    every = np.arange(len(table))
+    chains = _chains(vi_map, table, every, vertex_kept)
+    passed = np.flatnonzero(chains.passed)
+    edges = np.concatenate([chains.edges, passed])
+    counts = np.concatenate([np.diff(chains.start), np.ones(len(passed), dtype=np.int64)])
+    start = starts_of_counts(counts)
+    rows = ragged_rows(vi_map.sample_start, edges)
+    of_edge = np.repeat(np.arange(len(edges)), table.sample_count[edges])
+    of_chain = np.repeat(np.arange(len(counts)), counts)[of_edge]
+    time = vi_map.imu_samples.timestamp_ns[rows]
+    known = np.zeros(len(rows), dtype=np.bool_)
+    known[1:] = (
+        (of_chain[1:] == of_chain[:-1]) & (of_edge[1:] != of_edge[:-1]) & (time[1:] <= time[:-1])
+    )
+    joined = table.take(edges[start[:-1]]).replace(
+        to_vertex=np.concatenate([chains.to_vertex, table.to_vertex[passed]]),
+        sample_count=np.bincount(of_chain[~known], minlength=len(counts)),
+    )
+    samples = vi_map.imu_samples.take(rows[~known])
+    return vi_map.replace(imu_edges=joined, imu_samples=samples), chains.broken
+
+
+def join_transformation_edges(vi_map: VIMap, vertex_kept: Mask) -> tuple[VIMap, int]:
+    """Compose relative-pose edges of one kind and sensor between kept neighbours.
+
+    Returns:
+        The map and the number of pairs of neighbours that lost their edge.
+    """
+    table = vi_map.transformation_edges
+    if len(table) == 0:
+        return vi_map, 0
+    broken = 0
+    parts = []
+    keys = np.stack([table.kind.astype(np.uint64), *table.sensor_id.T], axis=1)
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    for index in range(int(group.max()) + 1):
+        chains = _chains(vi_map, table, np.flatnonzero(group == index), vertex_kept)
+        broken += chains.broken
+        parts += [_composed(table, chains), table.take(chains.passed)]
+    joined = TransformationEdges.concatenate(parts)
+    joined = joined.take(np.lexsort((as_keys(joined.id).argsort().argsort(), joined.from_vertex)))
+    return vi_map.replace(transformation_edges=joined), broken
+
+
+def _chains(
+    vi_map: VIMap, table: ImuEdges | TransformationEdges, rows: I64, vertex_kept: Mask
+) -> _Chains:
+    """Find the edges `rows` of `table` that lie between kept neighbours of a mission."""
+    count = len(vi_map.vertices)
+    mission = vi_map.vertices.mission
+    origin, end = table.from_vertex[rows], table.to_vertex[rows]
+    is_link = (end == origin + 1) & (mission[end] == mission[origin])
+    link = np.full(count, -1, dtype=np.int64)  # edge from vertex i to vertex i + 1
+    link[origin[is_link][::-1]] = rows[is_link][::-1]
+    chosen = np.zeros(len(table), dtype=np.bool_)
+    chosen[link[link >= 0]] = True
+    passed = np.zeros(len(table), dtype=np.bool_)
+    passed[rows] = vertex_kept[origin] & vertex_kept[end]
+    passed &= ~chosen
+
+    kept = np.flatnonzero(vertex_kept)
+    pair = mission[kept[1:]] == mission[kept[:-1]]
+    first, last = kept[:-1][pair], kept[1:][pair]
+    linked = starts_of_counts(link >= 0)
+    links = linked[last] - linked[first]
+    whole = links == last - first
+    broken = int(np.count_nonzero(~whole & (links > 0)))
+    first, last = first[whole], last[whole]
+    start = starts_of_counts(last - first)
+    inner = np.arange(start[-1]) + np.repeat(first - start[:-1], last - first)
+    return _Chains(link[inner], start, last, passed, broken)
+
+
+def _composed(table: TransformationEdges, chains: _Chains) -> TransformationEdges:
+    """Compose the edges of each chain; all chains advance by one edge per round."""
+    first = chains.edges[chains.start[:-1]]
+    T, covariance = table.T_A_B[first].copy(), table.covariance[first].copy()
+    length = np.diff(chains.start)
+    for step in range(1, int(length.max(initial=0))):
+        longer = np.flatnonzero(length > step)
+        edge = chains.edges[chains.start[:-1][longer] + step]
+        covariance[longer] = composed_covariance(
+            T[longer], covariance[longer], table.T_A_B[edge], table.covariance[edge]
+        )
+        T[longer] = se3.compose(T[longer], table.T_A_B[edge])
+    return table.take(first).replace(T_A_B=T, covariance=covariance, to_vertex=chains.to_vertex)
+
+
+def composed_covariance(T_A_B: F64, cov_A_B: F64, T_B_C: F64, cov_B_C: F64) -> F64:
+    """Return the covariance (N, 6, 6) of T_A_B T_B_C, position first, perturbed on the right.
+
+    p_AC = p_AB + R_AB p_BC and R_AC = R_AB R_BC give
+    dp = dp_1 + R_AB dp_2 - R_AB [p_BC]x dtheta_1,  dtheta = R_BC^T dtheta_1 + dtheta_2.
+    """
+    R_A_B, R_B_C = so3.to_matrix(T_A_B[:, :4]), so3.to_matrix(T_B_C[:, :4])
+    first = np.zeros((len(T_A_B), 6, 6))
+    first[:, :3, :3] = np.eye(3)
+    first[:, :3, 3:] = -R_A_B @ so3.skew(T_B_C[:, 4:])
+    first[:, 3:, 3:] = R_B_C.transpose(0, 2, 1)
+    second = np.zeros((len(T_A_B), 6, 6))
+    second[:, :3, :3] = R_A_B
+    second[:, 3:, 3:] = np.eye(3)
+    total = first @ cov_A_B @ first.transpose(0, 2, 1) + second @ cov_B_C @ second.transpose(
+        0, 2, 1
+    )
+    return np.asarray(0.5 * (total + total.transpose(0, 2, 1)))
 
 
 @dataclasses.dataclass(frozen=True)

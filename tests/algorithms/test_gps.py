@@ -14,7 +14,7 @@ import pytest
 from maplab_py.algorithms.external_poses.gps import origin_of
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
 from maplab_py.algorithms.external_poses.trajectories import as_mission
-from maplab_py.algorithms.vi_optimization.absolute_outliers import absolute_outliers
+from maplab_py.algorithms.vi_optimization.factor_terms import absolute_outliers
 from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.console.session.session import Session

@@ -9,7 +9,7 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.kernels.connected_parts import connected_parts
-from maplab_py.estimation.linear import selected_inverse, supernodal
+from maplab_py.estimation.linear import supernodal, supernodal_solver
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3
@@ -28,7 +28,7 @@ def test_a_relaxation_compiles_nothing_after_the_warmup():
         kernels.linearize,
         kernels.moved,
         supernodal.factorise,
-        selected_inverse.invert_panels,
+        supernodal_solver.invert_panels,
     )
     before = [list(kernel.signatures) for kernel in used]
     assert all(before)

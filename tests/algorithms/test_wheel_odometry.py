@@ -27,9 +27,9 @@ from maplab_py.simulation.session import wheel_velocities, write_wheel_velocitie
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edge_joining import join_transformation_edges
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.vertex_removal import join_transformation_edges
 from tests.support.scene import Scene
 from tests.vimap.builders import IMU_ID, STEP_NS, walk_map
 

@@ -11,8 +11,8 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.mesh_files import read_mesh, write_mesh
-from maplab_py.interop.pcd import parse_pcd
 from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
+from maplab_py.interop.resources.point_clouds import parse_pcd
 from tests.support.own_process import in_own_process
 
 HEAD = b"ply\nformat %s 1.0\ncomment by hand\nelement vertex 3\n"

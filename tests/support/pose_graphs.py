@@ -11,8 +11,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.g2o import PoseGraph
-from maplab_py.interop.odometry_chain import chained_poses
+from maplab_py.interop.g2o import PoseGraph, chained_poses
 
 _SIGMA = np.repeat([0.05, 0.02], 3)
 """Standard deviations of a measurement, position [m] and orientation [rad]."""

@@ -10,8 +10,8 @@ from maplab_py.vision import (
     search_kernels,
     track_union,
 )
-from maplab_py.vision.features import corner_kernels
-from maplab_py.vision.tracking import tracker, two_point_kernels
+from maplab_py.vision.features import detection
+from maplab_py.vision.tracking import motion, tracker
 from maplab_py.warmup import jobs
 from tests.vision.tracking.rendered import pose, stereo
 
@@ -63,11 +63,11 @@ def test_a_search_on_a_map_compiles_nothing_more():
 def test_tracking_compiles_nothing_after_the_warmup():
     tracker.compile_kernels()
     kernels = (
-        corner_kernels.corner_strengths,
-        corner_kernels.occupy_all,
-        corner_kernels.select_corners,
-        two_point_kernels.search_turn,
-        two_point_kernels.search_two_point,
+        detection.corner_strengths,
+        detection.occupy_all,
+        detection.select_corners,
+        motion.search_turn,
+        motion.search_two_point,
     )
     before = [list(kernel.signatures) for kernel in kernels]
     assert all(before)

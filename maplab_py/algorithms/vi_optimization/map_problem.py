@@ -27,7 +27,6 @@ from maplab_py.algorithms.vi_optimization.data_selection import (
     retriangulated,
     select,
 )
-from maplab_py.algorithms.vi_optimization.extensions import extension_terms
 from maplab_py.algorithms.vi_optimization.factor_terms import (
     MapFactors,
     factor_terms,
@@ -40,7 +39,11 @@ from maplab_py.algorithms.vi_optimization.fixed_states import (
     hold_unconstrained,
 )
 from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
-from maplab_py.algorithms.vi_optimization.options import FixedStates, VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization.options import (
+    DataOptions,
+    FixedStates,
+    VIOptimizationOptions,
+)
 from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
 from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
@@ -65,10 +68,40 @@ from maplab_py.estimation.terms.cameras import (
     camera_blocks,
     pixel_delay_s,
 )
+from maplab_py.estimation.terms.extension import REGISTERED, ExpressionTerm, ResidualRows
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
+
+
+def extension_terms(
+    vi_map: VIMap, selection: Selection, options: DataOptions, progress: Progress
+) -> list[ExpressionTerm]:
+    """Return the terms of measurements at the selected vertices.
+
+    Raises:
+        UserError: There is no residual of that name, or its rows do not fit.
+    """
+    terms = []
+    for name in filter(None, (part.strip() for part in options.residuals.split(","))):
+        if name not in REGISTERED:
+            known = ", ".join(sorted(REGISTERED)) or "none"
+            raise UserError(
+                f"--ba_residuals: no plugin has a residual '{name}'; there are: {known}"
+            )
+        definition = REGISTERED[name]
+        rows = definition.rows_of(vi_map)
+        vertices = selection.rows(rows.vertices)
+        inside = (vertices >= 0).all(axis=1)
+        if not inside.any():
+            continue
+        sigma = np.asarray(rows.sigma, dtype=np.float64)
+        if sigma.ndim == 2:
+            sigma = sigma[inside]
+        chosen = ResidualRows(vertices[inside], rows.data[inside], sigma)
+        terms.append(ExpressionTerm(definition, definition.kernel(progress), chosen))
+    return terms
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,14 +9,11 @@ from __future__ import annotations
 import dataclasses
 from enum import Enum
 
+import numpy as np
+
 from maplab_py.array_types import F64, I64
+from maplab_py.compilation import compiled
 from maplab_py.errors import FlagError
-from maplab_py.estimation.linear.minimum_degree import (
-    exact_minimum_degree,
-    exact_minimum_degree_of_groups,
-    minimum_degree,
-    minimum_degree_of_groups,
-)
 from maplab_py.estimation.linear.nested_dissection import (
     dissect_by_metis,
     dissect_by_position,
@@ -24,6 +21,114 @@ from maplab_py.estimation.linear.nested_dissection import (
 )
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.quotient_graph import QuotientGraph, indistinguishable_nodes
+
+# Eliminating a node connects all its neighbours; eliminating nodes of few neighbours first keeps the
+# factor sparse (Liu 1985, multiple minimum degree). SuperLU inside scipy has that algorithm. An
+# INCOMPLETE factorisation that drops every off-diagonal entry makes it hand out the order without
+# paying for the fill of a factorisation whose numbers nobody needs.
+
+_SMALL = 2000
+"""Groups up to which neighbourhoods as rows of bits cost less than SuperLU's detour."""
+
+
+def minimum_degree(pattern: BlockPattern) -> I64:
+    """Return the order (num_nodes,): entry k is the node that is eliminated as number k."""
+    graph = QuotientGraph.of(pattern)
+    return graph.order_of_nodes(minimum_degree_of_groups(graph))
+
+
+def exact_minimum_degree(pattern: BlockPattern) -> I64:
+    """Return the order (num_nodes,) of exact minimum degree; see `exact_minimum_degree_of_groups`."""
+    graph = QuotientGraph.without_groups(pattern)
+    return graph.order_of_nodes(exact_minimum_degree_of_groups(graph))
+
+
+def exact_minimum_degree_of_groups(graph: QuotientGraph) -> I64:
+    """Return the order (groups,) of exact minimum degree; of many groups, that of SuperLU.
+
+    For graphs that are solved in a few iterations: a tenth of the time where groups are few.
+    """
+    if len(graph) > _SMALL:
+        return minimum_degree_of_groups(graph)
+    return np.asarray(_eliminate(graph.rows, graph.cols, len(graph)), dtype=np.int64)
+
+
+def minimum_degree_of_groups(graph: QuotientGraph) -> I64:
+    """Return the order (groups,) by SuperLU's multiple minimum degree."""
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import spilu
+
+    if len(graph.rows) == 0:
+        return np.arange(len(graph))
+    start, neighbours = graph.adjacency(has_diagonal=True)
+    column = np.repeat(np.arange(len(graph), dtype=np.int32), np.diff(start))
+    # the diagonal must dominate by far
+    entries = np.where(neighbours == column, 1e6 * (len(graph.rows) + 1.0), 1.0)
+    del column
+    matrix = csc_array((entries, neighbours, start), shape=(len(graph), len(graph)))
+    factors = spilu(
+        matrix,
+        drop_tol=1.0,
+        fill_factor=1.0,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return np.argsort(factors.perm_c).astype(np.int64)
+
+
+@compiled()
+def _eliminate(rows, cols, num_nodes):  # type: ignore[no-untyped-def]
+    """Eliminate the node of fewest neighbours again and again, the first of equal ones.
+
+    The neighbours of each node are bits of a row.
+    """
+    words = (num_nodes + 63) // 64
+    bits = np.zeros((num_nodes, words), np.uint64)
+    bit = np.uint64(1)
+    for block in range(len(rows)):
+        row, col = rows[block], cols[block]
+        if row != col:
+            bits[row, col >> 6] |= bit << np.uint64(col & 63)
+            bits[col, row >> 6] |= bit << np.uint64(row & 63)
+    degree = np.empty(num_nodes, np.int64)
+    for node in range(num_nodes):
+        degree[node] = _count(bits[node])
+    order = np.empty(num_nodes, np.int64)
+    for place in range(num_nodes):
+        best = np.argmin(degree)
+        order[place] = best
+        degree[best] = num_nodes + 1
+        for word in range(words):
+            left = bits[best, word]
+            while left != 0:
+                lowest = left & (~left + bit)
+                node = word * 64 + _count_word(lowest - bit)
+                left ^= lowest
+                for k in range(words):
+                    bits[node, k] |= bits[best, k]
+                bits[node, node >> 6] &= ~(bit << np.uint64(node & 63))
+                bits[node, best >> 6] &= ~(bit << np.uint64(best & 63))
+                degree[node] = _count(bits[node])
+    return order
+
+
+@compiled(forceinline=True)
+def _count_word(x):  # type: ignore[no-untyped-def]
+    """Return how many bits of a word are set."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled(forceinline=True)
+def _count(row):  # type: ignore[no-untyped-def]
+    total = 0
+    for word in row:
+        total += _count_word(word)
+    return total
+
 
 __all__ = [
     "AUTOMATIC",

@@ -36,7 +36,7 @@ def open_transport(
 
         transport = Ros1(network)
     elif is_server:
-        from maplab_py.interop.live.foxglove_server import FoxgloveServer
+        from maplab_py.interop.live.foxglove import FoxgloveServer
 
         transport = FoxgloveServer(network)
     else:

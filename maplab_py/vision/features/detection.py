@@ -7,20 +7,193 @@ Lucas-Kanade, not the response of the segment test: it tells corners from edges.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.vision.features.corner_kernels import (
-    Selection,
-    make_selection,
-    occupy_all,
-    select_corners,
-    strengths,
-    strongest_places,
-)
+from maplab_py.compilation import compiled
 from maplab_py.vision.features.options import FeatureOptions
+
+WINDOW_HALF_PX = 3
+"""Half the side of the window in which a corner's gradients count."""
+_CLIMB_PX = 3
+"""Farthest that a corner is moved to the strongest place near it, in each direction."""
+
+
+class Selection(NamedTuple):
+    """Constraints on a choice of corners; changed by `select_corners`."""
+
+    free: U8  # (H, W) not zero where a corner may be
+    cell_count: I64  # (rows, columns) keypoints of each cell
+    cell_limit: int
+    limit: int  # most new corners
+    radius_px: float
+
+
+@compiled()
+def corner_strengths(image, uv, strength):  # type: ignore[no-untyped-def]
+    """Fill in the smaller eigenvalue of the mean outer product of gradients about each corner.
+
+    Source: J. Shi, C. Tomasi, Good Features to Track, CVPR 1994. Corners too near to the border
+    get 0.
+
+    Args:
+        image: Grey values (H, W).
+        uv: Whole pixels (N, 2).
+        strength: Filled in (N,), [grey^2 / px^2].
+    """
+    height, width = image.shape
+    reach = WINDOW_HALF_PX + 1
+    samples = (2 * WINDOW_HALF_PX + 1) ** 2
+    for n in range(len(uv)):
+        u, v = uv[n, 0], uv[n, 1]
+        strength[n] = 0.0
+        if u < reach or v < reach or u >= width - reach or v >= height - reach:
+            continue
+        xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
+        for row in range(v - WINDOW_HALF_PX, v + WINDOW_HALF_PX + 1):
+            for column in range(u - WINDOW_HALF_PX, u + WINDOW_HALF_PX + 1):
+                dx = np.int64(image[row, column + 1]) - np.int64(image[row, column - 1])
+                dy = np.int64(image[row + 1, column]) - np.int64(image[row - 1, column])
+                xx += dx * dx
+                xy += dx * dy
+                yy += dy * dy
+        mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        # central differences span two pixels
+        strength[n] = (mean - np.sqrt(half * half + float(xy) * xy)) / (4.0 * samples)
+
+
+@compiled()
+def climb_to_corners(image, uv, place):  # type: ignore[no-untyped-def]
+    """Fill in the local maximum of the corner strength in windows of 3 x 3 pixels, near each corner.
+
+    Corners near to the border stay where they are.
+
+    Args:
+        image: Grey values (H, W).
+        uv: Whole pixels (N, 2).
+        place: Filled in (N, 2), interpolated by parabolas.
+    """
+    height, width = image.shape
+    reach = _CLIMB_PX + 3
+    near = np.empty((3, 3))
+    for n in range(len(uv)):
+        u, v = uv[n, 0], uv[n, 1]
+        place[n, 0], place[n, 1] = u, v
+        if u < reach or v < reach or u >= width - reach or v >= height - reach:
+            continue
+        for _ in range(_CLIMB_PX):
+            best_u, best_v = u, v
+            strongest = _strength_3(image, u, v)
+            for dv in range(-1, 2):
+                for du in range(-1, 2):
+                    strength = _strength_3(image, u + du, v + dv)
+                    if strength > strongest:
+                        strongest, best_u, best_v = strength, u + du, v + dv
+            if best_u == u and best_v == v:
+                break
+            u, v = best_u, best_v
+        for dv in range(-1, 2):
+            for du in range(-1, 2):
+                near[dv + 1, du + 1] = _strength_3(image, u + du, v + dv)
+        place[n, 0] = u + _summit(near[1, 0], near[1, 1], near[1, 2])
+        place[n, 1] = v + _summit(near[0, 1], near[1, 1], near[2, 1])
+
+
+@compiled()
+def _strength_3(image, u, v):  # type: ignore[no-untyped-def]
+    """Return the smaller eigenvalue of the sum of outer products of Sobel gradients over 3 x 3 pixels."""
+    xx, xy, yy = np.int64(0), np.int64(0), np.int64(0)
+    for row in range(v - 1, v + 2):
+        for column in range(u - 1, u + 2):
+            dx, dy = np.int64(0), np.int64(0)
+            for k in range(-1, 2):
+                weight = 2 - abs(k)
+                right, left = image[row + k, column + 1], image[row + k, column - 1]
+                below, above = image[row + 1, column + k], image[row - 1, column + k]
+                dx += weight * (np.int64(right) - np.int64(left))
+                dy += weight * (np.int64(below) - np.int64(above))
+            xx += dx * dx
+            xy += dx * dy
+            yy += dy * dy
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    return mean - np.sqrt(half * half + float(xy) * xy)
+
+
+@compiled()
+def _summit(before, here, after):  # type: ignore[no-untyped-def]
+    """Return where the parabola through values at -1, 0, 1 is largest, within half a step."""
+    curvature = 2.0 * here - before - after
+    if not curvature > 0.0:
+        return 0.0
+    return min(max(0.5 * (after - before) / curvature, -0.5), 0.5)
+
+
+@compiled()
+def occupy(free, u, v, radius_px):  # type: ignore[no-untyped-def]
+    """Set the disc about a pixel to zero."""
+    height, width = free.shape
+    reach = int(radius_px)
+    for row in range(max(v - reach, 0), min(v + reach + 1, height)):
+        for column in range(max(u - reach, 0), min(u + reach + 1, width)):
+            if (row - v) ** 2 + (column - u) ** 2 <= radius_px * radius_px:
+                free[row, column] = 0
+
+
+@compiled()
+def occupy_all(selection, uv):  # type: ignore[no-untyped-def]
+    """Count keypoints uv (K, 2), whole pixels, that exist already; others keep away from them."""
+    height, width = selection.free.shape
+    rows, columns = selection.cell_count.shape
+    for k in range(len(uv)):
+        u, v = uv[k, 0], uv[k, 1]
+        occupy(selection.free, u, v, selection.radius_px)
+        if 0 <= u < width and 0 <= v < height:
+            selection.cell_count[v * rows // height, u * columns // width] += 1
+
+
+@compiled()
+def select_corners(selection, uv, order, is_selected):  # type: ignore[no-untyped-def]
+    """Mark corners, in the given order, that lie in free places of cells that have room."""
+    height, width = selection.free.shape
+    rows, columns = selection.cell_count.shape
+    count = 0
+    for n in order:
+        if count >= selection.limit:
+            break
+        u, v = uv[n, 0], uv[n, 1]
+        row, column = v * rows // height, u * columns // width
+        if selection.free[v, u] == 0 or selection.cell_count[row, column] >= selection.cell_limit:
+            continue
+        is_selected[n] = True
+        selection.cell_count[row, column] += 1
+        occupy(selection.free, u, v, selection.radius_px)
+        count += 1
+    return count
+
+
+def make_selection(
+    free: U8, cells: tuple[int, int], cell_limit: int, radius_px: float
+) -> Selection:
+    """Return an empty choice in a copy of the free places."""
+    count: I64 = np.zeros(cells, dtype=np.int64)
+    return Selection(free.copy(), count, cell_limit, 0, radius_px)
+
+
+def strengths(image: U8, uv: I64) -> F64:
+    """Return the strengths (N,) of corners at whole pixels (N, 2); see `corner_strengths`."""
+    strength = np.empty(len(uv))
+    corner_strengths(image, uv, strength)
+    return strength
+
+
+def strongest_places(image: U8, uv: I64) -> F64:
+    """Return the strongest places (N, 2) near corners at whole pixels (N, 2); see `climb_to_corners`."""
+    place = np.empty((len(uv), 2))
+    climb_to_corners(image, uv, place)
+    return place
+
 
 _MIN_STRENGTH = 4.0
 """Weakest corner [grey^2 / px^2]: gradients of 2 grey values per pixel in every direction."""

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance, largest_sigma
-from maplab_py.algorithms.vi_optimization.data_selection import select
+from maplab_py.algorithms.vi_optimization.data_selection import LeftOut, select, thinned
 from maplab_py.algorithms.vi_optimization.local import optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import DataOptions, VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.thinning import LeftOut, thinned
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.simulation.evaluation import evaluate_map

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.scripts.arguments import parse_arguments
+from maplab_py.console.main import parse_arguments
 from maplab_py.console.scripts.batch import (
     FOLDER_TEMPLATE,
     Batch,

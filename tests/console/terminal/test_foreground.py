@@ -28,8 +28,7 @@ from maplab_py.console.terminal.foreground import (
     in_waiting_thread,
     run_in_foreground,
 )
-from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.console.terminal.progress import SECONDS_BEFORE_BAR, TerminalProgress
+from maplab_py.console.terminal.output import SECONDS_BEFORE_BAR, ConsoleTerminal, TerminalProgress
 from maplab_py.console.terminal.protocol import SilentTerminal
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.plugin import CommandContext, Message, write_text

@@ -17,9 +17,13 @@ from maplab_py.estimation.linear.conjugate_gradients import (
     Operator,
     conjugate_gradients,
 )
-from maplab_py.estimation.linear.minimum_degree import minimum_degree, minimum_degree_of_groups
 from maplab_py.estimation.linear.nested_dissection import dissect_by_position, has_metis
-from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
+from maplab_py.estimation.linear.ordering import (
+    Ordering,
+    OrderingKind,
+    minimum_degree,
+    minimum_degree_of_groups,
+)
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.quotient_graph import QuotientGraph

@@ -13,7 +13,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.submap_plan import cut_into_submaps
+from maplab_py.estimation.linear.submap_solver import cut_into_submaps
 from maplab_py.estimation.linear.symbolic import analyse
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.marginals import Marginals

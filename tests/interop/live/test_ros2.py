@@ -14,7 +14,7 @@ from maplab_py.interop.live import ros2
 from maplab_py.interop.live.opening import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.receiving import TopicCounts
-from maplab_py.interop.live.ros2_types import dds_type_name, ros_type_name
+from maplab_py.interop.live.ros2 import dds_type_name, ros_type_name
 from maplab_py.interop.live.transport import Topic, wait_for_topics
 from tests.interop.live.support import IMU, imu_message
 from tests.support.own_process import in_own_process
@@ -138,7 +138,7 @@ def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_declared_types_have_the_fields_of_the_messages() -> None:
-    from maplab_py.interop.live.ros2_types import dds_type, type_hash
+    from maplab_py.interop.live.ros2 import dds_type, type_hash
 
     odometry = dds_type("nav_msgs/msg/Odometry")
     names = list(odometry.__annotations__)

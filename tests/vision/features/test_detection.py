@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import U8
-from maplab_py.vision.features.corner_kernels import strengths
-from maplab_py.vision.features.detection import GridDetector
+from maplab_py.vision.features.detection import GridDetector, strengths
 from maplab_py.vision.features.options import FeatureOptions
 
 NONE = np.zeros((0, 2))

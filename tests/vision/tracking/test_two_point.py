@@ -9,8 +9,7 @@ import pytest
 
 from maplab_py.array_types import F64, Mask
 from maplab_py.geometry import so3
-from maplab_py.vision.tracking.motion import two_point_motion
-from maplab_py.vision.tracking.two_point_kernels import TwoPointLimits
+from maplab_py.vision.tracking.motion import TwoPointLimits, two_point_motion
 
 LIMITS = TwoPointLimits(
     threshold=np.deg2rad(0.5), gate=2.0 / 458.0, turn_sigma=5e-3, max_iterations=200
