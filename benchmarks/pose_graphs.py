@@ -23,11 +23,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maplab_py.algorithms.relaxation.graph_files import optimize_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.interop.g2o import PoseGraph, read_g2o, write_g2o
 from tests.support.data import shared_data
-from tests.support.pose_graphs import SIMULATED
+from tests.support.pose_graphs import SIMULATED, optimize_graph
 
 NAMES = ("parking-garage", "smallGrid3D", "intel", "robot_a", "robot_b", "ordered", "unordered")
 _TOLERANCES = (

@@ -13,8 +13,8 @@ from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.submaps import append_submaps
 from tests.algorithms.loop_closure.test_real_maps import ground_truth_poses, load
+from tests.support.submaps import append_submaps
 
 WRONG_M, WRONG_DEG = 0.3, 3.0
 MIN_TIME_S = 10.0

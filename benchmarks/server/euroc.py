@@ -13,8 +13,8 @@ from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_new_ids
 from maplab_py.vimap.excerpts import cut_by_time
-from maplab_py.vimap.submaps import append_submaps
 from tests.support.data import shared_data
+from tests.support.submaps import append_submaps
 
 O_TRUTH, C_TRUTH = "ground_truth/V1_01_easy.csv", "euroc_imu/V101.gt.csv"
 SUBMAPS = 8

@@ -11,14 +11,6 @@ from numpy.typing import ArrayLike
 
 from maplab_py.array_types import F64
 
-_SMALL_ANGLE_RAD = 1e-4
-"""Below this angle the Taylor series (error < 1e-17 relative) replace the closed forms."""
-
-
-def identity(*batch: int) -> F64:
-    """Return identity elements (*batch, 4)."""
-    return np.zeros((*batch, 4))
-
 
 def wrap(angle: ArrayLike) -> F64:
     """Bring angles [rad] into [-pi, pi]."""
@@ -52,51 +44,6 @@ def transform(T_A_B: ArrayLike, p_B: ArrayLike) -> F64:
     """Take points (..., 3) from B to A."""
     T = np.asarray(T_A_B, dtype=np.float64)
     return np.asarray(rotate(T[..., 3], p_B) + T[..., :3])
-
-
-def _v_coefficients(angle: F64) -> tuple[F64, F64]:
-    """Return sin(a)/a and (1 - cos(a))/a, the entries of SE(2)'s V matrix."""
-    small = np.abs(angle) < _SMALL_ANGLE_RAD
-    safe = np.where(small, 1.0, angle)
-    sine = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    # 1 - cos(a) = 2 sin(a/2)^2 does not cancel
-    cosine = np.where(small, angle / 2.0 - angle**3 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
-    return np.asarray(sine), np.asarray(cosine)
-
-
-def exp(tangent: ArrayLike) -> F64:
-    """Map tangent vectors (..., 4) = [v (3), yaw rate] to elements (..., 4).
-
-    Source: Sola et al., A micro Lie theory, 2018, eq. (156)-(158), with z as a factor of its own.
-    """
-    d = np.asarray(tangent, dtype=np.float64)
-    a, b = _v_coefficients(d[..., 3])
-    x = a * d[..., 0] - b * d[..., 1]
-    y = b * d[..., 0] + a * d[..., 1]
-    return np.stack([x, y, d[..., 2], wrap(d[..., 3])], axis=-1)
-
-
-def log(T_A_B: ArrayLike) -> F64:
-    """Map elements (..., 4) to tangent vectors (..., 4) with a yaw in [-pi, pi]."""
-    T = np.asarray(T_A_B, dtype=np.float64)
-    angle = wrap(T[..., 3])
-    a, b = _v_coefficients(angle)
-    scale = 1.0 / (a**2 + b**2)
-    x = scale * (a * T[..., 0] + b * T[..., 1])
-    y = scale * (a * T[..., 1] - b * T[..., 0])
-    return np.stack([x, y, T[..., 2], angle], axis=-1)
-
-
-def retract(T_A_B: ArrayLike, delta: ArrayLike) -> F64:
-    """Apply [dp (3), dyaw]: p <- p + dp, yaw <- yaw + dyaw."""
-    T, d = np.asarray(T_A_B, dtype=np.float64), np.asarray(delta, dtype=np.float64)
-    return np.concatenate([T[..., :3] + d[..., :3], wrap(T[..., 3:] + d[..., 3:])], axis=-1)
-
-
-def local(T_A_B: ArrayLike, T_A_C: ArrayLike) -> F64:
-    """Return the vectors (..., 4) with retract(T_A_B, delta) = T_A_C."""
-    a, b = np.asarray(T_A_B, dtype=np.float64), np.asarray(T_A_C, dtype=np.float64)
-    return np.concatenate([b[..., :3] - a[..., :3], wrap(b[..., 3:] - a[..., 3:])], axis=-1)
 
 
 def yaw_of(q_A_B: ArrayLike) -> F64:

@@ -80,20 +80,6 @@ def read_sensors(path: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSet:
     return parse_sensors(text, str(path), max_bytes)
 
 
-def read_legacy_sensors(ncamera_path: Path, imu_path: Path) -> SensorSet:
-    """Read maplab 1.x' pair of files; the rig's body frame is the IMU's.
-
-    Raises:
-        MapError: A file cannot be read, or does not hold exactly one sensor of its kind.
-    """
-    rigs, imus = read_sensors(ncamera_path), read_sensors(imu_path)
-    rig, imu = _only(rigs, CameraRig, ncamera_path), _only(imus, Imu, imu_path)
-    if rig.id == imu.id:
-        raise MapError(f"{imu_path}: id {imu.id} is also that of the cameras in {ncamera_path}")
-    mounts = {sensor.id: Extrinsics(imu.id, se3.identity()) for sensor in (imu, rig)}
-    return SensorSet({imu.id: imu, rig.id: rig}, mounts, {**imus.extra, **rigs.extra})
-
-
 def parse_sensors(text: str, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSet:
     """Read the text of a sensors.yaml; `source` is its name in error messages.
 
@@ -183,13 +169,6 @@ def sensor_entry(sensor: Sensor) -> dict[str, Any]:
 
 
 # -- reading ------------------------------------------------------------------------------------
-
-
-def _only(sensor_set: SensorSet, kind: type[Any], path: Path) -> Any:
-    matching = [sensor for sensor in sensor_set.sensors.values() if isinstance(sensor, kind)]
-    if len(matching) != 1:
-        raise MapError(f"{path}: one {kind.__name__} is expected, {len(matching)} found")
-    return matching[0]
 
 
 def _parse_sensor(value: Any, source: str) -> Sensor:

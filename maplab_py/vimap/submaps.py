@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,22 +37,6 @@ class AppendReport(Report):
     observations_united: int = 0  # keypoints of shared vertices that had a landmark in both
     largest_shift_m: float = 0.0  # applied to align a submap's boundary vertex with the map's
     largest_yaw_deg: float = 0.0
-
-
-def append_submaps(submaps: Sequence[VIMap]) -> tuple[VIMap, AppendReport]:
-    """Join submaps in the order of the time of their first vertex.
-
-    Raises:
-        MapError: No submap is given, or neighbours do not share a vertex.
-    """
-    if not submaps:
-        raise MapError("there is no submap to append")
-    in_time = sorted(submaps, key=_first_time)
-    joined, total = in_time[0], AppendReport(submaps=1)
-    for submap in in_time[1:]:
-        joined, report = append_submap(joined, submap)
-        total = _sum(total, report)
-    return joined, total
 
 
 def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
@@ -102,20 +85,6 @@ def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
         largest_yaw_deg=float(np.rad2deg(yaw_rad)),
     )
     return joined, report
-
-
-def _first_time(submap: VIMap) -> int:
-    if len(submap.vertices) == 0:
-        raise MapError("a submap without vertices cannot be appended")
-    return int(submap.vertices.timestamp_ns.min())
-
-
-def _sum(a: AppendReport, b: AppendReport) -> AppendReport:
-    values = {}
-    for field in dataclasses.fields(AppendReport):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        values[field.name] = max(x, y) if field.name.startswith("largest") else x + y
-    return AppendReport(**values)
 
 
 def _matching_missions(base: VIMap, submap: VIMap) -> I64:

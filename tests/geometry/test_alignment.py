@@ -65,13 +65,13 @@ def test_yaw_and_position(rng: np.random.Generator) -> None:
     T = np.array([4.0, -3.0, 2.0, 2.5])
     p = rng.normal(size=(10, 3))
     found = align_yaw_position(yaw.transform(T, p), p)
-    assert np.allclose(yaw.local(T, yaw.from_pose(found)), 0.0, atol=1e-13)
+    assert np.allclose(yaw.from_pose(found), T, atol=1e-13)
     assert found[:2].tolist() == [0.0, 0.0]
     p_A = yaw.transform(T, p) + rng.normal(size=(10, 3)) * 0.3
     best = yaw.from_pose(align_yaw_position(p_A, p))
     cost = np.sum((p_A - yaw.transform(best, p)) ** 2)
     for delta in np.concatenate([np.eye(4), -np.eye(4)]) * 1e-4:
-        assert np.sum((p_A - yaw.transform(yaw.retract(best, delta), p)) ** 2) > cost
+        assert np.sum((p_A - yaw.transform(best + delta, p)) ** 2) > cost
 
 
 def test_two_points_are_enough_for_yaw() -> None:
@@ -125,20 +125,21 @@ def test_apply_similarity_scales_positions_only(rng: np.random.Generator) -> Non
 elements = st.tuples(
     *(st.floats(-5.0, 5.0) for _ in range(3)), st.floats(-np.pi + 1e-9, np.pi - 1e-9)
 ).map(np.array)
-SMALL = [0.0, 1e-300, 1e-12, 0.99e-4, 1.01e-4, 1e-3, np.pi - 1e-9]
+IDENTITY = np.zeros(4)
 
 
 def near(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-12) -> bool:
-    return bool(np.max(np.abs(yaw.local(a, b)), initial=0.0) < tolerance)
+    apart = np.concatenate([b[:3] - a[:3], yaw.wrap(b[3:] - a[3:])])
+    return bool(np.max(np.abs(apart)) < tolerance)
 
 
 @given(elements, elements, elements)
 def test_group_axioms(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
     left = yaw.compose(yaw.compose(a, b), c)
     assert near(left, yaw.compose(a, yaw.compose(b, c)))
-    assert near(yaw.compose(a, yaw.inverse(a)), yaw.identity())
-    assert near(yaw.compose(yaw.inverse(a), a), yaw.identity())
-    assert near(yaw.compose(a, yaw.identity()), a)
+    assert near(yaw.compose(a, yaw.inverse(a)), IDENTITY)
+    assert near(yaw.compose(yaw.inverse(a), a), IDENTITY)
+    assert near(yaw.compose(a, IDENTITY), a)
 
 
 @given(elements, elements)
@@ -147,28 +148,6 @@ def test_poses_are_a_subgroup(a: np.ndarray, b: np.ndarray) -> None:
     assert near(yaw.from_pose(composed), yaw.compose(a, b))
     p = b[:3]
     assert np.allclose(yaw.transform(a, p), se3.transform(yaw.to_pose(a), p), atol=1e-13)
-
-
-@given(elements)
-def test_log_inverts_exp(tangent: np.ndarray) -> None:
-    assert np.allclose(yaw.log(yaw.exp(tangent)), tangent, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", SMALL + [-a for a in SMALL])
-def test_exp_near_zero_and_pi(angle: float) -> None:
-    tangent = np.array([1.0, -2.0, 0.5, angle])
-    steps = 1024
-    element = yaw.identity()
-    part = yaw.exp(tangent / steps)
-    for _ in range(steps):
-        element = yaw.compose(element, part)
-    assert near(yaw.exp(tangent), element, 1e-11)
-    assert np.allclose(yaw.log(yaw.exp(tangent)), tangent, atol=1e-13)
-
-
-@given(elements, elements)
-def test_local_inverts_retract(a: np.ndarray, delta: np.ndarray) -> None:
-    assert np.allclose(yaw.local(a, yaw.retract(a, delta)), delta, atol=1e-12)
 
 
 def test_yaw_is_that_of_the_nearest_rotation_about_z() -> None:
@@ -186,15 +165,13 @@ def test_angles_wrap() -> None:
     assert yaw.wrap(3 * np.pi / 2) == pytest.approx(-np.pi / 2)
     near_pi = np.array([0.0, 0.0, 0.0, 3.0])
     assert yaw.compose(near_pi, near_pi)[3] == pytest.approx(6.0 - 2 * np.pi)
-    assert yaw.local([0, 0, 0, 3.1], [0, 0, 0, -3.1])[3] == pytest.approx(2 * np.pi - 6.2)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3), (0,)])
 def test_batch_shapes(shape: tuple[int, ...]) -> None:
     a = np.random.default_rng(1).normal(size=(*shape, 4))
-    for result in (yaw.exp(a), yaw.log(a), yaw.inverse(a), yaw.compose(a, np.zeros(4))):
+    for result in (yaw.inverse(a), yaw.compose(a, np.zeros(4))):
         assert result.shape == a.shape
     assert yaw.to_pose(a).shape == (*shape, 7)
     assert yaw.from_pose(yaw.to_pose(a)).shape == a.shape
     assert yaw.transform(a, np.ones(3)).shape == (*shape, 3)
-    assert yaw.identity(*shape).shape == a.shape

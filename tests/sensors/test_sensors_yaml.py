@@ -24,7 +24,6 @@ from maplab_py.sensors import (
 from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.sensors_yaml import (
     parse_sensors,
-    read_legacy_sensors,
     read_sensors,
     write_sensors,
 )
@@ -332,15 +331,13 @@ def test_legacy_files(tmp_path: Path) -> None:
         f"hardware_id: imu0\nid: {IMU_ID}\nsensor_type: IMU\n"
         "imu_sigmas: {acc_noise_density: 0.5, gyro_noise_density: 0.25}\n"
     )
-    sensors = read_legacy_sensors(tmp_path / "ncamera.yaml", tmp_path / "imu.yaml")
-    imu, rig = sensors.imu(IMU_ID), sensors.camera_rig(RIG_ID)
+    rigs, imus = read_sensors(tmp_path / "ncamera.yaml"), read_sensors(tmp_path / "imu.yaml")
+    imu, rig = imus.imu(IMU_ID), rigs.camera_rig(RIG_ID)
     assert (imu.topic, imu.acc_noise_density, imu.gyro_noise_density) == ("imu0", 0.5, 0.25)
     assert (rig.description, rig.cameras[0].description) == ("my rig", "cam0")
-    assert sensors.T_I_C(IMU_ID, RIG_ID)[0, 4] == 7.0
-    again = parse_sensors(write_sensors(sensors), "2.x")
+    assert rig.T_B_C[0, 4] == 7.0
+    again = parse_sensors(write_sensors(rigs), "2.x")
     assert again.camera_rig(RIG_ID).cameras[0].distortion is Distortion.FOV
-    with pytest.raises(MapError, match="one CameraRig is expected, 0 found"):
-        read_legacy_sensors(tmp_path / "imu.yaml", tmp_path / "imu.yaml")
 
 
 def _differences(a: object, b: object, path: str = "") -> list[str]:

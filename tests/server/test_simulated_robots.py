@@ -27,9 +27,9 @@ from maplab_py.storage.resources.store import existing_files
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.submaps import append_submaps
 from tests.frontend.simulated import REST_FIRST, replayed
 from tests.server.support import ROBOTS, Servers, session
+from tests.support.submaps import append_submaps
 
 _POINT_CLOUD = 16
 

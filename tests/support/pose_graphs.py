@@ -5,13 +5,22 @@ Poses are chained along the odometry, as they are in the public files of a torus
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
+from maplab_py.algorithms.relaxation.graph_files import is_odometry
+from maplab_py.algorithms.relaxation.options import RelaxationOptions
+from maplab_py.algorithms.relaxation.robust import optimize_robustly
 from maplab_py.array_types import F64, I64
+from maplab_py.errors import MapError
+from maplab_py.estimation.kernels.connected_parts import connected_parts
+from maplab_py.estimation.symbolic.sources import PoseError
+from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph, chained_poses
+from maplab_py.progress import SILENT, Progress
 
 _SIGMA = np.repeat([0.05, 0.02], 3)
 """Standard deviations of a measurement, position [m] and orientation [rad]."""
@@ -92,3 +101,60 @@ SIMULATED: dict[str, Callable[[], PoseGraph]] = {
     "grid": lambda: grid(12, seed=5),
 }
 """Graphs of the benchmark by name."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OptimizedGraph:
+    """Poses of a graph, and what became of its edges."""
+
+    T_G_V: F64  # (V, 7)
+    weight: F64  # (E,) 1 = trusted, 0 = switched off
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
+def optimize_graph(
+    graph: PoseGraph, options: RelaxationOptions, *, progress: Progress = SILENT
+) -> OptimizedGraph:
+    """Optimise a pose graph with its own objective, sum |Log(T_measured^-1 T_A_B)|^2.
+
+    Fixed poses stay, or the first one of each connected part where none is fixed. With robustness
+    all edges but odometry may be switched off.
+
+    Raises:
+        EstimationError: The poses are not determined, or not finite.
+    """
+    edges = _edges(graph)
+    is_plain = options.robustness == "none"
+    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else is_odometry(graph)
+    if np.all(chain):
+        options = dataclasses.replace(options, robustness="none")
+    is_free = np.ones(len(graph.id), dtype=np.bool_)
+    is_free[_anchors(graph)] = False
+    trajectory, loops = edges.take(np.flatnonzero(chain)), edges.take(np.flatnonzero(~chain))
+    solution = optimize_robustly(
+        graph.T_G_V, is_free, trajectory, loops, TiltPriors.none(), options, progress
+    )
+    weight = np.ones(len(edges))
+    weight[~chain] = solution.weight
+    return OptimizedGraph(
+        solution.T_G_I, weight, solution.cost_before, solution.cost_after, solution.iterations
+    )
+
+
+def _edges(graph: PoseGraph) -> RelativePoses:
+    try:
+        W = np.swapaxes(np.linalg.cholesky(graph.information), 1, 2)
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(graph.information)[:, 0]
+        row = int(np.argmin(smallest))
+        names = f"{graph.id[graph.first[row]]} - {graph.id[graph.second[row]]}"
+        raise MapError(f"the information of edge {names} is not positive definite") from None
+    return RelativePoses(graph.first, graph.second, graph.T_A_B, W, PoseError.LOGARITHM)
+
+
+def _anchors(graph: PoseGraph) -> I64:
+    """Return the poses that stay."""
+    part = connected_parts(len(graph.id), graph.first, graph.second)
+    return np.union1d(graph.fixed, part[~np.isin(part, part[graph.fixed])])

@@ -36,11 +36,11 @@ from maplab_py.vimap.edits import (
     remove_vertices,
 )
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.submaps import append_submaps
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import DescriptorLayout, FrameField
 from tests.support import descriptor_blocks as by_hand
 from tests.support.data import shared_data
+from tests.support.submaps import append_submaps
 from tests.vimap.builders import walk_map
 
 SUBMAP = "maplab_maps/euroc_v1_01/euroc_v1_01_submap_{}"

@@ -18,11 +18,11 @@ from maplab_py.vimap.edits import merge_landmarks, with_p_G
 from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
 from maplab_py.vimap.keypoint_removal import remove_keypoints
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.submaps import append_submaps
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.vertex_removal import composed_covariance, remove_vertices_counted
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.simulation.small import simulated
+from tests.support.submaps import append_submaps
 from tests.vimap.builders import SAMPLES, walk_map
 
 

@@ -12,8 +12,9 @@ from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import merge_landmarks, remove_vertices, transform_mission, with_new_ids
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.queries import mission_clusters
-from maplab_py.vimap.submaps import append_submap, append_submaps
+from maplab_py.vimap.submaps import append_submap
 from tests.support.data import shared_data
+from tests.support.submaps import append_submaps
 from tests.vimap.builders import RIG_ID, sensors, walk_map
 
 

@@ -9,21 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.relaxation.map_edges import (
-    has_odometry_backbone,
-    loop_edges,
-    trajectory_edges,
-)
+from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.robust import optimize_robustly
-from maplab_py.array_types import F64, I64, U64, Mask
+from maplab_py.array_types import F64, U64, Mask
 from maplab_py.errors import MapError
-from maplab_py.estimation.kernels.connected_parts import connected_parts
-from maplab_py.estimation.symbolic.sources import PoseError
-from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph
-from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import (
     Backbone,
     BaseFrames,
@@ -73,63 +64,6 @@ def _turned(graph: PoseGraph, rows: Mask) -> PoseGraph:
     return dataclasses.replace(
         graph, first=first, second=second, T_A_B=T_A_B, information=information
     )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class OptimizedGraph:
-    """Poses of a graph, and what became of its edges."""
-
-    T_G_V: F64  # (V, 7)
-    weight: F64  # (E,) 1 = trusted, 0 = switched off
-    cost_before: float
-    cost_after: float
-    iterations: int
-
-
-def optimize_graph(
-    graph: PoseGraph, options: RelaxationOptions, *, progress: Progress = SILENT
-) -> OptimizedGraph:
-    """Optimise a pose graph with its own objective, sum |Log(T_measured^-1 T_A_B)|^2.
-
-    Fixed poses stay, or the first one of each connected part where none is fixed. With robustness
-    all edges but odometry may be switched off.
-
-    Raises:
-        EstimationError: The poses are not determined, or not finite.
-    """
-    edges = _edges(graph)
-    is_plain = options.robustness == "none"
-    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else is_odometry(graph)
-    if np.all(chain):
-        options = dataclasses.replace(options, robustness="none")
-    is_free = np.ones(len(graph.id), dtype=np.bool_)
-    is_free[_anchors(graph)] = False
-    trajectory, loops = edges.take(np.flatnonzero(chain)), edges.take(np.flatnonzero(~chain))
-    solution = optimize_robustly(
-        graph.T_G_V, is_free, trajectory, loops, TiltPriors.none(), options, progress
-    )
-    weight = np.ones(len(edges))
-    weight[~chain] = solution.weight
-    return OptimizedGraph(
-        solution.T_G_I, weight, solution.cost_before, solution.cost_after, solution.iterations
-    )
-
-
-def _edges(graph: PoseGraph) -> RelativePoses:
-    try:
-        W = np.swapaxes(np.linalg.cholesky(graph.information), 1, 2)
-    except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(graph.information)[:, 0]
-        row = int(np.argmin(smallest))
-        names = f"{graph.id[graph.first[row]]} - {graph.id[graph.second[row]]}"
-        raise MapError(f"the information of edge {names} is not positive definite") from None
-    return RelativePoses(graph.first, graph.second, graph.T_A_B, W, PoseError.LOGARITHM)
-
-
-def _anchors(graph: PoseGraph) -> I64:
-    """Return the poses that stay."""
-    part = connected_parts(len(graph.id), graph.first, graph.second)
-    return np.union1d(graph.fixed, part[~np.isin(part, part[graph.fixed])])
 
 
 def map_of_graph(graph: PoseGraph) -> VIMap:
@@ -196,9 +130,9 @@ def _split_covariance(covariance: NDArray[Any], T_A_B: F64, *, back: bool = Fals
 def graph_of_map(vi_map: VIMap, options: RelaxationOptions) -> PoseGraph:
     """Return the pose graph that `relax` works on: trajectories with their drift, loop closures."""
     closures = vi_map.loop_closure_edges
-    as_given = has_odometry_backbone(vi_map)[closures.from_vertex]
-    loops = loop_edges(closures, options, as_given=as_given)
-    parts = trajectory_edges(vi_map, options).followed_by(loops)
+    as_given = map_edges.has_odometry_backbone(vi_map)[closures.from_vertex]
+    loops = map_edges.loop_edges(closures, options, as_given=as_given)
+    parts = map_edges.trajectory_edges(vi_map, options).followed_by(loops)
     W = parts.sqrt_information
     covariance = np.linalg.inv(np.swapaxes(W, 1, 2) @ W)
     back = _split_covariance(covariance, parts.T_A_B, back=True)

@@ -7,7 +7,6 @@ from maplab_py.options import Options, option
 
 CONTENTS = ("poses", "path", "odometry", "tf", "imu", "images", "depth", "clouds")
 FORMATS = ("ros1", "sqlite3", "mcap")
-_HIGHEST_RATE_HZ = 1e9
 
 
 class PoseToBagOptions(Options, prefix="rosbag_plugin_pose_to_bag_"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
 import subprocess
@@ -38,8 +37,6 @@ HEADLESS_FLAGS = (
 _CONNECT_S = 60.0
 _SETTLE_S = 0.7
 _RENDER_S = 60.0
-
-logger = logging.getLogger(__name__)
 
 
 def find_browser() -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -19,12 +18,7 @@ from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import add_part
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.facts import facts
-from maplab_py.viewer.layers.cameras import (
-    camera_centres,
-    frustum_lines,
-    mission_cameras,
-    observer_rays,
-)
+from maplab_py.viewer.layers import cameras
 from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.resource_clouds import VertexImages
@@ -38,8 +32,6 @@ ImageOf = Callable[[int], "U8 | None"]
 
 _MAX_FRUSTA = 16
 """More cameras of one landmark's observers would hide it."""
-
-logger = logging.getLogger(__name__)
 
 
 def no_image(row: int) -> None:  # noqa: ARG001
@@ -98,7 +90,7 @@ class Selection:
         if picked.entity is Entity.VERTEX:
             self._mark_vertex(drawing, picked.row)
         elif picked.entity is Entity.LANDMARK:
-            start, end, vertices = observer_rays(drawing, picked.row)
+            start, end, vertices = cameras.observer_rays(drawing, picked.row)
             self._add("rays", make_segments(start, end, colours.PICKED, vertices, 1.0))
             observers = np.unique(vertices)
             every = -(-len(observers) // _MAX_FRUSTA)
@@ -126,7 +118,7 @@ class Selection:
         keypoints = ragged_rows(vi_map.keypoint_start, frames)
         landmark = vi_map.keypoints.landmark[keypoints]
         seen = (landmark >= 0) & (vi_map.landmarks.quality[landmark] != 1)
-        centres, _ = camera_centres(drawing, keypoints[seen])
+        centres, _ = cameras.camera_centres(drawing, keypoints[seen])
         rows = landmark[seen].astype(np.int64)
         rays = make_segments(centres, drawing.p_landmarks[rows], colours.PICKED, rows, 0.6)
         self._add("rays", rays)
@@ -136,9 +128,11 @@ class Selection:
     ) -> None:
         missions = drawing.vi_map.vertices.mission[vertices]
         lines = [
-            frustum_lines(drawing, vertices[missions == mission], camera, size * drawing.unit_m)
+            cameras.frustum_lines(
+                drawing, vertices[missions == mission], camera, size * drawing.unit_m
+            )
             for mission in np.unique(missions).tolist()
-            for camera in mission_cameras(drawing.vi_map, mission)
+            for camera in cameras.mission_cameras(drawing.vi_map, mission)
         ]
         if lines:
             ends = np.concatenate(lines)

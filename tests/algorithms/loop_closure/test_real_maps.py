@@ -11,9 +11,9 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.submaps import append_submaps
 from tests.algorithms.loop_closure.against_truth import score, sessions
 from tests.support.data import shared_data
+from tests.support.submaps import append_submaps
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,6 @@ from maplab_py.algorithms.relaxation.graph_files import (
     graph_of_map,
     is_odometry,
     map_of_graph,
-    optimize_graph,
 )
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
@@ -23,7 +22,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import read_g2o
 from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
-from tests.support.pose_graphs import torus
+from tests.support.pose_graphs import optimize_graph, torus
 
 PLAIN = RelaxationOptions(robustness="none", num_iterations=100)
 # final values of GTSAM's Levenberg-Marquardt from the file's poses, twice its error; tolerances 0:
