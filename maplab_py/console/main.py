@@ -24,15 +24,9 @@ from maplab_py.console.session.paths import user_aliases, user_flagfile
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.settings import Layer
 from maplab_py.console.session.status import Status
+from maplab_py.console.terminal import streams
 from maplab_py.console.terminal.foreground import abandoned_commands_run
 from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.console.terminal.streams import (
-    PIPE_STATUS,
-    OutputError,
-    PipeClosed,
-    open_closed_streams,
-    writing_output,
-)
 from maplab_py.errors import FlagError, MaplabError, UserError
 from maplab_py.pipeline.options import PipelineOptions
 
@@ -154,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             taken, and the process ends here if an abandoned command still runs.
     """
     end_with_parent()
-    open_closed_streams()
+    streams.open_closed_streams()
     status = _main(sys.argv[1:] if argv is None else argv)
     if argv is None and abandoned_commands_run():
         with contextlib.suppress(OSError, ValueError):
@@ -183,9 +177,9 @@ def _main(argv: Sequence[str]) -> int:
         return int(Status.FAILED)
     except KeyboardInterrupt:
         return int(Status.CANCELLED)
-    except PipeClosed:
-        return PIPE_STATUS
-    except OutputError as error:
+    except streams.PipeClosed:
+        return streams.PIPE_STATUS
+    except streams.OutputError as error:
         terminal.error(str(error))
         return int(Status.FAILED)
 
@@ -197,7 +191,7 @@ def _print_about(arguments: Arguments) -> int:
         text = f"maplab-py {version('maplab-py')}"
     else:
         text = USAGE
-    with writing_output():
+    with streams.writing_output():
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
     return int(Status.OK)

@@ -16,14 +16,8 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.calibrations import euroc, single_cameras
 from maplab_py.interop.calibrations.basalt import read_basalt
-from maplab_py.interop.calibrations.euroc import (
-    is_kimera_folder,
-    read_camera_file,
-    read_folder,
-    read_imu_file,
-    read_kimera_folder,
-)
 from maplab_py.interop.calibrations.kalibr import (
     is_camera_chain,
     read_camera_chain,
@@ -40,13 +34,6 @@ from maplab_py.interop.calibrations.parts import (
     with_imu,
 )
 from maplab_py.interop.calibrations.realsense import is_realsense, read_realsense
-from maplab_py.interop.calibrations.single_cameras import (
-    is_camera_info,
-    is_dso_camera,
-    read_camera_info,
-    read_dm_vio,
-    read_dso_camera,
-)
 from maplab_py.interop.calibrations.vins import is_vins, read_vins
 from maplab_py.interop.colmap.reading import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
@@ -343,8 +330,8 @@ def _read(path: Path) -> Parts | SensorSet:
         return Parts("COLMAP", cameras, T_B_C, why_not_on_imu=why)
     if path.is_dir():
         return _read_folder(path)
-    if is_dso_camera(path):
-        return read_dso_camera(path)
+    if single_cameras.is_dso_camera(path):
+        return single_cameras.read_dso_camera(path)
     _refuse_other_texts(path)
     if is_json(path):
         return _read_json(path)
@@ -355,7 +342,7 @@ def _read(path: Path) -> Parts | SensorSet:
     if "relative_config_imucam" in entry:
         return _read_openvins(entry, path.parent)
     if is_camera_chain(entry) and "cam0" in entry and "intrinsics" not in entry.child("cam0"):
-        return read_dm_vio(entry, path)
+        return single_cameras.read_dm_vio(entry, path)
     if is_vins(entry):
         return read_vins(entry, path.parent)
     for is_format, read in _FORMATS:
@@ -393,9 +380,9 @@ def _read_json(path: Path) -> Parts:
 def _read_folder(path: Path) -> Parts:
     if (path / _OPENVINS).exists():
         return _read_openvins(read_entry(path / _OPENVINS), path)
-    if is_kimera_folder(path):
-        return read_kimera_folder(path)
-    return read_folder(path / "mav0" if (path / "mav0").is_dir() else path)
+    if euroc.is_kimera_folder(path):
+        return euroc.read_kimera_folder(path)
+    return euroc.read_folder(path / "mav0" if (path / "mav0").is_dir() else path)
 
 
 def _read_openvins(entry: Entry, folder: Path) -> Parts:
@@ -450,12 +437,12 @@ _REFUSED_JSON = {
 }
 _FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] = (
     (is_camera_chain, read_camera_chain),
-    (lambda entry: _has_imu_noise(entry) and "T_BS" in entry, read_imu_file),
+    (lambda entry: _has_imu_noise(entry) and "T_BS" in entry, euroc.read_imu_file),
     (lambda entry: _has_imu_noise(entry) or "imu0" in entry, read_kalibr_imu),
-    (lambda entry: "T_BS" in entry, read_camera_file),
+    (lambda entry: "T_BS" in entry, euroc.read_camera_file),
     (is_orb_slam, read_orb_slam),
     (is_okvis, read_okvis),
     (is_svo, read_svo),
-    (is_camera_info, read_camera_info),
+    (single_cameras.is_camera_info, single_cameras.read_camera_info),
 )
 """Signature of a kind of file, and its reader."""

@@ -13,15 +13,7 @@ import numpy as np
 
 from maplab_py.errors import UserError
 from maplab_py.interop.gps import NO_FIX, GpsTrack, gps_track, read_gps
-from maplab_py.interop.recordings.bag_files import (
-    all_messages,
-    check_bag,
-    header_stamp_ns,
-    is_bag,
-    listed_topics,
-    opened_bag,
-    topic_types,
-)
+from maplab_py.interop.recordings import bag_files
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 _FIX_FROM = 0
@@ -34,7 +26,7 @@ def read_fixes(path: Path, date: str = "", topic: str = "", time_unit: str = "")
     Raises:
         UserError: A topic is given for a file that is no bag.
     """
-    if is_bag(path):
+    if bag_files.is_bag(path):
         return read_gps_bag(path, topic)
     if topic:
         raise UserError(f"{path} is no bag: leave out --gps_topic={topic}")
@@ -48,19 +40,19 @@ def read_gps_bag(path: Path, topic: str = "") -> GpsTrack:
         UserError: It is no bag, or the topic does not exist or has something else.
         MapError: The bag or a message is damaged, there are no fixes, or stamps go back.
     """
-    check_bag(path, "--gps_file")
+    bag_files.check_bag(path, "--gps_file")
     rows: list[tuple[float, float, float]] = []
     stamps: list[int] = []
     reasons: list[str] = []
-    with opened_bag(path) as reader:
-        name = _chosen(path, topic_types(reader), topic)
+    with bag_files.opened_bag(path) as reader:
+        name = _chosen(path, bag_files.topic_types(reader), topic)
         connections = [c for c in reader.connections if c.topic == name]
-        for connection, _, data in all_messages(path, reader, connections):
+        for connection, _, data in bag_files.all_messages(path, reader, connections):
             message: Any = reader.deserialize(data, connection.msgtype)
             status = int(message.status.status)
             reasons.append(f"{NO_FIX} (status {status})" if status < _FIX_FROM else "")
             rows.append((message.latitude, message.longitude, message.altitude))
-            stamps.append(header_stamp_ns(data, is_ros_2=reader.is2))
+            stamps.append(bag_files.header_stamp_ns(data, is_ros_2=reader.is2))
     fixes = np.array(rows, dtype=np.float64).reshape(-1, 3)
     return gps_track(
         np.array(stamps, dtype=np.int64), fixes, f"{path}: {name}", np.array(reasons, dtype=np.str_)
@@ -75,11 +67,11 @@ def _chosen(path: Path, types: dict[str, str], topic: str) -> str:
     if topic:
         what = f"is of type {types[topic]}" if topic in types else "is not in it"
         raise UserError(
-            f"{path}: the topic --gps_topic={topic} {what}; topics: {listed_topics(types)}"
+            f"{path}: the topic --gps_topic={topic} {what}; topics: {bag_files.listed_topics(types)}"
         )
     if not fixes:
         raise UserError(
-            f"{path}: no topic has sensor_msgs/NavSatFix; topics: {listed_topics(types)}"
+            f"{path}: no topic has sensor_msgs/NavSatFix; topics: {bag_files.listed_topics(types)}"
         )
     raise UserError(
         f"{path}: several topics have fixes: choose with --gps_topic: {', '.join(fixes)}"

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from maplab_py.errors import Cancelled, UserError
+from maplab_py.pipeline import records
 from maplab_py.pipeline.engines import Engine, engine_of
 from maplab_py.pipeline.fingerprint import folder_hash, program_version
 from maplab_py.pipeline.messages import Ending, Order, Outcome
@@ -21,16 +22,6 @@ from maplab_py.pipeline.progress import (
     StageLine,
     StageState,
     Watcher,
-)
-from maplab_py.pipeline.records import (
-    Record,
-    Records,
-    Task,
-    change,
-    has_inputs,
-    names_of,
-    record_of,
-    task_on,
 )
 
 _AGAIN = (Ending.FAILED, Ending.LOST)
@@ -63,8 +54,8 @@ class _Progress:
 
     stage: Stage
     state: StageState
-    tasks: dict[str, Task] = dataclasses.field(default_factory=dict)
-    finished: list[Task] = dataclasses.field(default_factory=list)
+    tasks: dict[str, records.Task] = dataclasses.field(default_factory=dict)
+    finished: list[records.Task] = dataclasses.field(default_factory=list)
     is_complete: bool = False  # no task can be added any more
     expanded: set[str] = dataclasses.field(default_factory=set)  # tasks of the source, by title
 
@@ -95,11 +86,11 @@ class Driver:
         self._watcher = watcher
         stages = ordered(pipeline)
         self._stages = {s.name: _Progress(s, StageState(s.name)) for s in stages}
-        self._records = Records(settings.results)
+        self._records = records.Records(settings.results)
         self._version = program_version()
-        self._ready: deque[Task] = deque()
-        self._alone: deque[Task] = deque()  # took too much memory beside others
-        self._running: dict[str, Task] = {}
+        self._ready: deque[records.Task] = deque()
+        self._alone: deque[records.Task] = deque()  # took too much memory beside others
+        self._running: dict[str, records.Task] = {}
         self._attempts: dict[str, int] = {}
         self._inputs: dict[str, tuple[tuple[str, str], ...]] = {}
         self._hashes: dict[Path, str] = {}
@@ -158,7 +149,7 @@ class Driver:
                     self._ready.append(task)
         self._watcher.states([progress.state for progress in self._stages.values()])
 
-    def _new_tasks(self, progress: _Progress) -> list[Task]:
+    def _new_tasks(self, progress: _Progress) -> list[records.Task]:
         stage = progress.stage
         if stage.all:
             sources = [self._stages[name] for name in stage.all if name != MAPS]
@@ -169,7 +160,7 @@ class Driver:
             return [self._task(stage, stage.name, maps)]
         if stage.each == MAPS:
             progress.is_complete = True
-            pairs = zip(names_of(self.pipeline.maps), self.pipeline.maps, strict=True)
+            pairs = zip(records.names_of(self.pipeline.maps), self.pipeline.maps, strict=True)
             return [self._task(stage, name, [folder]) for name, folder in pairs]
         source = self._stages[stage.each]
         tasks = []
@@ -180,7 +171,7 @@ class Driver:
         progress.is_complete = source.has_ended
         return tasks
 
-    def _tasks_on_result(self, stage: Stage, parent: Task) -> list[Task]:
+    def _tasks_on_result(self, stage: Stage, parent: records.Task) -> list[records.Task]:
         maps = _maps_below(parent)
         if maps == [parent.result]:
             return [self._task(stage, parent.name, maps)]
@@ -199,20 +190,20 @@ class Driver:
         tasks = sorted(self._stages[name].finished, key=lambda task: task.name)
         return [folder for task in tasks for folder in _maps_below(task)]
 
-    def _task(self, stage: Stage, name: str, maps: list[Path]) -> Task:
+    def _task(self, stage: Stage, name: str, maps: list[Path]) -> records.Task:
         edits_input = self.pipeline.is_in_place
-        return task_on(stage, name, maps, self.settings.results, edits_input=edits_input)
+        return records.task_on(stage, name, maps, self.settings.results, edits_input=edits_input)
 
     # which tasks are finished
 
-    def _is_finished(self, task: Task) -> bool:
+    def _is_finished(self, task: records.Task) -> bool:
         """Tell whether an earlier run has finished a task with the same inputs, commands and flags."""
         inputs = tuple((str(folder), self._hash(folder)) for folder in task.inputs)
         self._inputs[task.title] = inputs
         record = self._records.read(task) if self.settings.options.resume else None
         if record is None:
             return False
-        changed = change(record, self._record(task))
+        changed = records.change(record, self._record(task))
         if changed and self.settings.options.redo_changed:
             return False
         if changed:
@@ -222,11 +213,11 @@ class Driver:
             )
         if task.edits_input:
             return inputs[0][1] == record.result
-        is_same = task.result.is_dir() and has_inputs(record, inputs)
+        is_same = task.result.is_dir() and records.has_inputs(record, inputs)
         return is_same and self._hash(task.result) == record.result
 
-    def _record(self, task: Task) -> Record:
-        return record_of(task, dict(self.settings.flags), self._version)
+    def _record(self, task: records.Task) -> records.Record:
+        return records.record_of(task, dict(self.settings.flags), self._version)
 
     def _hash(self, folder: Path) -> str:
         if folder not in self._hashes:
@@ -245,7 +236,7 @@ class Driver:
             self._submit(self._alone.popleft(), is_alone=True)
         return bool(self._running)
 
-    def _submit(self, task: Task, *, is_alone: bool) -> None:
+    def _submit(self, task: records.Task, *, is_alone: bool) -> None:
         options = self.settings.options
         hosts = 1 if is_alone else self._engine.slots_per_host()
         limit_gb = task.memory_gb or options.task_memory_gb or self._engine.share_gb()
@@ -312,7 +303,7 @@ class Driver:
             self._is_stopping = not self.settings.keep_going
         self._watcher.states([each.state for each in self._stages.values()])
 
-    def _finish(self, task: Task, outcome: Outcome, attempts: int) -> None:
+    def _finish(self, task: records.Task, outcome: Outcome, attempts: int) -> None:
         self._hashes.pop(task.result, None)
         record = dataclasses.replace(
             self._record(task),
@@ -326,7 +317,7 @@ class Driver:
         self._records.write(task, record)
 
 
-def _maps_below(task: Task) -> list[Path]:
+def _maps_below(task: records.Task) -> list[Path]:
     from maplab_py.storage.native import find_maps
 
     maps = find_maps(task.result)

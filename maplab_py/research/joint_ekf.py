@@ -25,11 +25,7 @@ from maplab_py.algorithms.self_calibration.estimation.parameters import paramete
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.uncertainty import Uncertainty, name_directions, spectrum
-from maplab_py.algorithms.vi_optimization.calibration_states import (
-    rig_cameras,
-    with_cameras,
-    with_imus,
-)
+from maplab_py.algorithms.vi_optimization import calibration_states
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
@@ -114,7 +110,7 @@ class JointFilter:
         self._edge_to = {int(to): row for row, to in enumerate(vi_map.imu_edges.to_vertex)}
         imu_id, rig_id = device_of(vi_map, missions)
         self._imu = vi_map.sensors.imu(imu_id)
-        self._rig = rig_cameras(vi_map, missions)
+        self._rig = calibration_states.rig_cameras(vi_map, missions)
         self._cameras = vi_map.sensors.camera_rig(rig_id).cameras
         blocks = [
             *camera_blocks(self._rig.cameras, self._rig.timing_s[:, 0]),
@@ -324,8 +320,8 @@ class JointFilter:
         """The map's sensors with the calibration."""
         zero = np.zeros((0, 3))
         states = States(np.zeros((0, 7)), zero, zero, zero, zero, self.blocks)
-        sensors = with_cameras(self._map.sensors, self._rig, states)
-        return with_imus(sensors, (self._imu,), states)
+        sensors = calibration_states.with_cameras(self._map.sensors, self._rig, states)
+        return calibration_states.with_imus(sensors, (self._imu,), states)
 
     def report(self) -> SelfCalibrationReport:
         """Return the report, without costs and iterations."""

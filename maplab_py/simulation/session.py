@@ -22,25 +22,10 @@ from maplab_py.simulation.scenario import OtherSensorOptions, Scenario
 from maplab_py.simulation.sensors import Device, baseframe
 from maplab_py.simulation.truth import Truth, session_truth
 from maplab_py.simulation.world import World
-from maplab_py.vimap import TransformationKind, VIMap
+from maplab_py.vimap import TransformationKind, VIMap, tables
 from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.table import starts_of_counts
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    BaseFrames,
-    FrameField,
-    Frames,
-    ImuEdges,
-    ImuSamples,
-    Keypoints,
-    Landmarks,
-    LoopClosureEdges,
-    Missions,
-    MissionSensor,
-    TransformationEdges,
-    Vertices,
-)
 
 _KEYPOINT_SCALE = 20.0
 _MIN_SIGMA_PX = 0.1
@@ -71,10 +56,10 @@ def _assemble(
     seeds: SessionSeeds,
 ) -> VIMap:
     vertices = len(recording.time_ns)
-    sensor_id = np.zeros((1, len(MissionSensor), 2), dtype=np.uint64)
-    sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
-    sensor_id[0, MissionSensor.NCAMERA] = from_hex(device.rig.id)
-    landmarks = Landmarks.filled(
+    sensor_id = np.zeros((1, len(tables.MissionSensor), 2), dtype=np.uint64)
+    sensor_id[0, tables.MissionSensor.IMU] = from_hex(device.imu_id)
+    sensor_id[0, tables.MissionSensor.NCAMERA] = from_hex(device.rig.id)
+    landmarks = tables.Landmarks.filled(
         len(initial.vertex),
         id=random_ids(len(initial.vertex), seeds.ids),
         vertex=initial.vertex,
@@ -87,11 +72,11 @@ def _assemble(
     mission_id, frame_id = random_ids(1, seeds.ids), random_ids(1, seeds.ids)
     return VIMap(
         sensors=device.sensor_set,
-        missions=Missions.filled(
+        missions=tables.Missions.filled(
             1, id=mission_id, baseframe=[0], root_vertex=[0], sensor_id=sensor_id
         ),
-        baseframes=BaseFrames.filled(1, id=frame_id, T_G_M=T_G_M[None]),
-        vertices=Vertices.filled(
+        baseframes=tables.BaseFrames.filled(1, id=frame_id, T_G_M=T_G_M[None]),
+        vertices=tables.Vertices.filled(
             vertices,
             id=random_ids(vertices, seeds.ids),
             mission=np.zeros(vertices, dtype=np.int32),
@@ -112,7 +97,9 @@ def _assemble(
     )
 
 
-def _imu_tables(recording: Recording, seeds: SessionSeeds) -> tuple[ImuEdges, ImuSamples]:
+def _imu_tables(
+    recording: Recording, seeds: SessionSeeds
+) -> tuple[tables.ImuEdges, tables.ImuSamples]:
     """Split the recording at the vertices; neighbouring edges share the boundary sample."""
     row = recording.imu_row
     count = np.diff(row) + 1
@@ -120,14 +107,14 @@ def _imu_tables(recording: Recording, seeds: SessionSeeds) -> tuple[ImuEdges, Im
     # edge e has the samples row[e] .. row[e + 1], both included
     first = np.repeat(row[:-1] - starts_of_counts(count)[:-1], count)
     rows = first + np.arange(int(count.sum()))
-    table = ImuEdges.filled(
+    table = tables.ImuEdges.filled(
         edges,
         id=random_ids(edges, seeds.ids),
         from_vertex=np.arange(edges),
         to_vertex=np.arange(1, edges + 1),
         sample_count=count,
     )
-    samples = ImuSamples.filled(
+    samples = tables.ImuSamples.filled(
         len(rows),
         timestamp_ns=recording.imu_time_ns[rows],
         accel_gyro=recording.imu.accel_gyro[rows],
@@ -141,16 +128,21 @@ def _image_tables(
     recording: Recording,
     landmark_of: I64,
     seeds: SessionSeeds,
-) -> tuple[Frames, Keypoints]:
+) -> tuple[tables.Frames, tables.Keypoints]:
     detections, cameras = recording.keypoints, len(device.rig.cameras)
     vertices = len(recording.time_ns)
     count = vertices * cameras
-    present = FrameField.SIGMA | FrameField.SCALE | FrameField.TRACK_ID | FrameField.LANDMARK_ID
+    present = (
+        tables.FrameField.SIGMA
+        | tables.FrameField.SCALE
+        | tables.FrameField.TRACK_ID
+        | tables.FrameField.LANDMARK_ID
+    )
     delays = np.array([camera.line_delay_s for camera in scenario.cameras])
     if delays.any():
-        present |= FrameField.TIME_OFFSET
+        present |= tables.FrameField.TIME_OFFSET
     keypoint_count = np.bincount(detections.frame, minlength=count)
-    frames = Frames.filled(
+    frames = tables.Frames.filled(
         count,
         id=random_ids(count, seeds.ids),
         vertex=np.repeat(np.arange(vertices), cameras),
@@ -165,7 +157,7 @@ def _image_tables(
         factor * sigma_of_octave(scenario.measurement, detections.octave), _MIN_SIGMA_PX
     )
     no_offset = np.zeros((len(detections.frame), 0), dtype=np.int32)
-    keypoints = Keypoints.filled(
+    keypoints = tables.Keypoints.filled(
         len(detections.frame),
         uv_px=detections.uv_px,
         sigma_px=sigma,
@@ -253,9 +245,9 @@ def _rays(device: Device, recording: Recording) -> tuple[F64, F64]:
 
 _SWITCH_VARIANCE = 1e-3
 _SENSOR_NAMES = {
-    MissionSensor.ABSOLUTE_6DOF: "ABSOLUTE_6DOF",
-    MissionSensor.ODOMETRY_6DOF: "ODOMETRY_6DOF",
-    MissionSensor.WHEEL_ODOMETRY: "WHEEL_ODOMETRY",
+    tables.MissionSensor.ABSOLUTE_6DOF: "ABSOLUTE_6DOF",
+    tables.MissionSensor.ODOMETRY_6DOF: "ODOMETRY_6DOF",
+    tables.MissionSensor.WHEEL_ODOMETRY: "WHEEL_ODOMETRY",
 }
 
 
@@ -276,39 +268,41 @@ def add_other_sensors(
     """
     T_G_I, time_ns = recording.motion.T_G_I, recording.time_ns
     wanted = {
-        MissionSensor.ABSOLUTE_6DOF: options.absolute_pose_every_s > 0.0,
-        MissionSensor.ODOMETRY_6DOF: options.odometry,
-        MissionSensor.WHEEL_ODOMETRY: options.wheel_odometry,
+        tables.MissionSensor.ABSOLUTE_6DOF: options.absolute_pose_every_s > 0.0,
+        tables.MissionSensor.ODOMETRY_6DOF: options.odometry,
+        tables.MissionSensor.WHEEL_ODOMETRY: options.wheel_odometry,
     }
     ids = dict(zip(wanted, random_ids(len(wanted), rng), strict=True))
     T_I_S = se3.make(so3.exp(options.sensor_turn_rad), np.asarray(options.sensor_position_m))
     edges = []
-    for kind in (MissionSensor.ABSOLUTE_6DOF, MissionSensor.ODOMETRY_6DOF):
+    for kind in (tables.MissionSensor.ABSOLUTE_6DOF, tables.MissionSensor.ODOMETRY_6DOF):
         if wanted[kind]:
             vi_map = _with_sensor(vi_map, kind, ids[kind], imu_id, T_I_S)
-    if wanted[MissionSensor.ABSOLUTE_6DOF]:
+    if wanted[tables.MissionSensor.ABSOLUTE_6DOF]:
         poses = _absolute_poses(
-            T_G_I, T_I_S, time_ns, ids[MissionSensor.ABSOLUTE_6DOF], options, rng
+            T_G_I, T_I_S, time_ns, ids[tables.MissionSensor.ABSOLUTE_6DOF], options, rng
         )
         vi_map = vi_map.replace(absolute_poses=poses)
-    if wanted[MissionSensor.ODOMETRY_6DOF]:
-        sensor = ids[MissionSensor.ODOMETRY_6DOF]
+    if wanted[tables.MissionSensor.ODOMETRY_6DOF]:
+        sensor = ids[tables.MissionSensor.ODOMETRY_6DOF]
         edges.append(_odometry(T_G_I, T_I_S, sensor, TransformationKind.ODOMETRY, options, rng))
-    if wanted[MissionSensor.WHEEL_ODOMETRY]:
-        kind, sensor = MissionSensor.WHEEL_ODOMETRY, ids[MissionSensor.WHEEL_ODOMETRY]
+    if wanted[tables.MissionSensor.WHEEL_ODOMETRY]:
+        kind, sensor = tables.MissionSensor.WHEEL_ODOMETRY, ids[tables.MissionSensor.WHEEL_ODOMETRY]
         T_I_W = wheel_mounting(options)
         vi_map = _with_sensor(vi_map, kind, sensor, imu_id, T_I_W)
         wheel = TransformationKind.WHEEL_ODOMETRY
         edges.append(_odometry(T_G_I, T_I_W, sensor, wheel, options, rng))
     if edges:
-        vi_map = vi_map.replace(transformation_edges=TransformationEdges.concatenate(edges))
+        vi_map = vi_map.replace(transformation_edges=tables.TransformationEdges.concatenate(edges))
     if options.loop_edges == 0:
         return vi_map, np.zeros(0, dtype=np.bool_)
     loops, is_true = _loop_edges(T_G_I, time_ns, options, rng)
     return vi_map.replace(loop_closure_edges=loops), is_true
 
 
-def _with_sensor(vi_map: VIMap, kind: MissionSensor, words: U64, imu_id: str, T_I_S: F64) -> VIMap:
+def _with_sensor(
+    vi_map: VIMap, kind: tables.MissionSensor, words: U64, imu_id: str, T_I_S: F64
+) -> VIMap:
     """Add a sensor to the map's sensors and its mission."""
     sensor_id, name = to_hex(words), _SENSOR_NAMES[kind]
     keys = {"id": sensor_id, "sensor_type": name, "topic": name.lower()}
@@ -329,14 +323,14 @@ def _absolute_poses(
     sensor: U64,
     options: OtherSensorOptions,
     rng: np.random.Generator,
-) -> AbsolutePoses:
+) -> tables.AbsolutePoses:
     """Measure T_G_S, G being the frame of the simulated world, at vertices."""
     count = int((time_ns[-1] - time_ns[0]) * 1e-9 / options.absolute_pose_every_s) + 1
     wanted = time_ns[0] + np.arange(count) * round(options.absolute_pose_every_s * 1e9)
     vertex = np.unique(np.searchsorted(time_ns, wanted).clip(0, len(time_ns) - 1))
     sigma = _sigma(options.absolute_pose_sigma_m, options.absolute_pose_sigma_deg)
     T_G_S = se3.compose(T_G_I[vertex], T_I_S)
-    return AbsolutePoses.filled(
+    return tables.AbsolutePoses.filled(
         len(vertex),
         vertex=vertex,
         timestamp_ns=time_ns[vertex],
@@ -353,7 +347,7 @@ def _odometry(
     kind: TransformationKind,
     options: OtherSensorOptions,
     rng: np.random.Generator,
-) -> TransformationEdges:
+) -> tables.TransformationEdges:
     """Measure the motion of the sensor between neighbouring vertices; the error is white."""
     T_G_S = se3.compose(T_G_I, T_I_S)
     T_A_B = se3.relative(T_G_S[:-1], T_G_S[1:])
@@ -361,7 +355,7 @@ def _odometry(
     sigma = _sigma(options.odometry_sigma_m, options.odometry_sigma_deg)
     if kind == TransformationKind.WHEEL_ODOMETRY:
         T_A_B[:, 4:] *= options.wheel_scale
-    return TransformationEdges.filled(
+    return tables.TransformationEdges.filled(
         count,
         id=random_ids(count, rng),
         kind=np.full(count, int(kind)),
@@ -375,7 +369,7 @@ def _odometry(
 
 def _loop_edges(
     T_G_I: F64, time_ns: I64, options: OtherSensorOptions, rng: np.random.Generator
-) -> tuple[LoopClosureEdges, NDArray[np.bool_]]:
+) -> tuple[tables.LoopClosureEdges, NDArray[np.bool_]]:
     """Add edges between places visited twice, and a share of false edges.
 
     A false edge joins two distant places with the relative pose of two near ones.
@@ -401,7 +395,7 @@ def _loop_edges(
     sigma = _sigma(options.loop_edge_sigma_m, options.loop_edge_sigma_deg)
     T_A_B = se3.relative(T_G_I[claimed[:, 0]], T_G_I[claimed[:, 1]])
     count = len(joined)
-    edges = LoopClosureEdges.filled(
+    edges = tables.LoopClosureEdges.filled(
         count,
         id=random_ids(count, rng),
         from_vertex=joined[:, 0],

@@ -12,13 +12,8 @@ import numpy as np
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.report import counted
+from maplab_py.storage import extension_fields
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.extension_fields import (
-    LOOP_RECORD,
-    RECORD_SHARE,
-    packed_size,
-    read_extension,
-)
 from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
 from maplab_py.storage.protobuf.map_files import (
     COPY_AGAIN,
@@ -166,16 +161,18 @@ def check_records(content: Content, max_bytes: int) -> None:
     Raises:
         MapError: A record is too large; names file and mission. Damaged records are not reported here.
     """
-    left = max_bytes // RECORD_SHARE
+    left = max_bytes // extension_fields.RECORD_SHARE
     for row, mission in enumerate(content.missions):
-        record = read_extension(unknown_bytes(mission), LOOP_RECORD)
+        record = extension_fields.read_extension(
+            unknown_bytes(mission), extension_fields.LOOP_RECORD
+        )
         if record is None:
             continue
-        left -= packed_size(record, left)
+        left -= extension_fields.packed_size(record, left)
         if left < 0:
             raise MapError(
                 f"{content.name('missions', row)}: its record of loop closures unpacks to more "
-                f"than {max_bytes / RECORD_SHARE / 1e6:g} MB (a quarter of "
+                f"than {max_bytes / extension_fields.RECORD_SHARE / 1e6:g} MB (a quarter of "
                 "--proto_max_size_megabytes; raise it if the record is really that large)"
             )
 

@@ -20,17 +20,10 @@ from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
+from maplab_py.storage import load_checks
 from maplab_py.storage.cache.map_cache import CachedMap
 from maplab_py.storage.checksums import verify
 from maplab_py.storage.file_parts import FileParts
-from maplab_py.storage.load_checks import (
-    absent_parts,
-    check_empty_files,
-    check_listed_edges,
-    check_records,
-    consistency_notes,
-    edge_kinds,
-)
 from maplab_py.storage.mission_names import with_names
 from maplab_py.storage.protobuf import (
     frames_from_messages,
@@ -187,17 +180,17 @@ def _loaded(
     progress: Progress,
 ) -> tuple[VIMap, int, int, list[str]]:
     parts = _read_files(files, budget, progress, in_processes=not repair)
-    check_empty_files(parts.facts)
+    load_checks.check_empty_files(parts.facts)
     sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, budget.max_bytes)
     content = parts.content()
-    check_records(content, budget.max_bytes)
+    load_checks.check_records(content, budget.max_bytes)
     vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
     vi_map = vi_map.replace(sensors=sensors)
     vi_map = with_names(vi_map, folder)
     if repair:
         vi_map, dropped = without_bad_numbers(vi_map)
         notes += dropped
-    notes += absent_parts(folder, vi_map) + consistency_notes(vi_map)
+    notes += load_checks.absent_parts(folder, vi_map) + load_checks.consistency_notes(vi_map)
     progress.step(1, 1, "read files")
     return vi_map, len(files), parts.unpacked_bytes, notes
 
@@ -258,7 +251,7 @@ def _assemble(
         "mission",
         content.namer("vertices"),
     )
-    kinds = edge_kinds(content)
+    kinds = load_checks.edge_kinds(content)
     in_file = unique_index(content.vertex_ids, "vertex", content.file_namer("vertices"))
     times = _vertex_times(content, parts)
     order = np.lexsort((times, mission))
@@ -267,7 +260,7 @@ def _assemble(
     vertex_index = IdIndex(vertex_table.id)
     name = content.namer("vertices", order)
     edges = _edge_tables(content, kinds, vertex_index)
-    notes = check_listed_edges(content, kinds, in_file, repair=repair)
+    notes = load_checks.check_listed_edges(content, kinds, in_file, repair=repair)
     missions = tables_from_messages.read_missions(content, baseframe_index, vertex_index, mission)
     frames = joined.frames(budget.max_bytes)
     frames = dataclasses.replace(frames, name=_frame_namer(frames.frames, name))

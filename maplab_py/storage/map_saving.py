@@ -24,18 +24,8 @@ from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.storage import checksums, mission_names
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.load_checks import check_loadable
-from maplab_py.storage.protobuf import tables_to_messages
+from maplab_py.storage.protobuf import map_files, tables_to_messages
 from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice, with_layout
-from maplab_py.storage.protobuf.map_files import (
-    METADATA,
-    MISSIONS,
-    RESOURCE_INFO,
-    SENSORS,
-    VI_MAP_FOLDER,
-    VI_MAP_METADATA,
-    FileKind,
-    is_map_folder,
-)
 from maplab_py.storage.protobuf.tables_to_messages import Partition
 from maplab_py.storage.resources.new import copied_files, with_staged_in_place
 from maplab_py.storage.written_files import TakenOver, WrittenFiles
@@ -163,7 +153,7 @@ def check_target(
             return
         if not folder.is_dir():
             raise UserError(f"{folder} is not a folder; give a folder")
-        if not is_map_folder(folder):
+        if not map_files.is_map_folder(folder):
             if any(folder.iterdir()):
                 raise UserError(f"{folder} is not empty and not a map; choose another folder")
         elif force:
@@ -198,21 +188,25 @@ def _write(
     vi_map: VIMap, folder: Path, compress: bool, taken: TakenOver | None, progress: Progress
 ) -> tuple[int, str]:
     """Return the number of files and their checksums."""
-    inner = folder / VI_MAP_FOLDER
+    inner = folder / map_files.VI_MAP_FOLDER
     inner.mkdir()
     listing = pb.VIMapMetadata()
-    _write_message(inner / MISSIONS, tables_to_messages.missions(vi_map), compress)
-    listing.files.add(file_type=FileKind.MISSIONS, path=MISSIONS)
+    _write_message(inner / map_files.MISSIONS, tables_to_messages.missions(vi_map), compress)
+    listing.files.add(file_type=map_files.FileKind.MISSIONS, path=map_files.MISSIONS)
     partition = taken.partition if taken else Partition()
     for content in tables_to_messages.contents(vi_map, partition):
         check_cancelled()
         progress.step(len(listing.files), len(vi_map.vertices) // 50 + 4, "write files")
-        if taken is None or not taken.take_over(content, f"{VI_MAP_FOLDER}/{content.name}"):
+        if taken is None or not taken.take_over(
+            content, f"{map_files.VI_MAP_FOLDER}/{content.name}"
+        ):
             _write_bytes(inner / content.name, content.data(), compress)
         listing.files.add(file_type=content.kind, path=content.name)
-    _write_text(inner / VI_MAP_METADATA, text_format.MessageToString(listing))
-    _write_text(inner / SENSORS, write_sensors(vi_map.sensors))
-    _write_message(folder / RESOURCE_INFO, tables_to_messages.resource_info(vi_map), compress)
+    _write_text(inner / map_files.VI_MAP_METADATA, text_format.MessageToString(listing))
+    _write_text(inner / map_files.SENSORS, write_sensors(vi_map.sensors))
+    _write_message(
+        folder / map_files.RESOURCE_INFO, tables_to_messages.resource_info(vi_map), compress
+    )
     metadata = pb.MetaData(
         map_folder=vi_map.metadata.map_folder or ".",
         map_description=vi_map.metadata.description,
@@ -220,7 +214,7 @@ def _write(
         map_resource_folder=vi_map.metadata.map_resource_folder,
         external_resource_folders=vi_map.metadata.external_resource_folders,
     )
-    _write_text(folder / METADATA, text_format.MessageToString(metadata))
+    _write_text(folder / map_files.METADATA, text_format.MessageToString(metadata))
     names = mission_names.text_of_names(vi_map)
     if names:
         _write_text(folder / mission_names.FILE_NAME, names)

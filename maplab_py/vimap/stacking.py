@@ -7,22 +7,8 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import I32
+from maplab_py.vimap import tables
 from maplab_py.vimap.sensor_merge import union
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    BaseFrames,
-    Frames,
-    ImuEdges,
-    ImuSamples,
-    Keypoints,
-    Landmarks,
-    LoopClosureEdges,
-    Missions,
-    ResourceOwner,
-    Resources,
-    TransformationEdges,
-    Vertices,
-)
 from maplab_py.vimap.vi_map import MapMetadata, VIMap
 
 
@@ -56,18 +42,20 @@ def stack(base: VIMap, other: VIMap) -> VIMap:
     return base.replace(
         sensors=union(base.sensors, other.sensors),
         metadata=metadata,
-        missions=Missions.concatenate([base.missions, missions]),
-        baseframes=BaseFrames.concatenate([base.baseframes, other.baseframes]),
-        vertices=Vertices.concatenate([base.vertices, vertices]),
-        frames=Frames.concatenate([base.frames, frames]),
-        keypoints=Keypoints.concatenate([base.keypoints, keypoints]),
-        landmarks=Landmarks.concatenate([base.landmarks, landmarks]),
-        imu_edges=ImuEdges.concatenate([base.imu_edges, imu]),
-        imu_samples=ImuSamples.concatenate([base.imu_samples, other.imu_samples]),
-        transformation_edges=TransformationEdges.concatenate([base.transformation_edges, relative]),
-        loop_closure_edges=LoopClosureEdges.concatenate([base.loop_closure_edges, loops]),
-        absolute_poses=AbsolutePoses.concatenate([base.absolute_poses, absolute]),
-        resources=Resources.concatenate([base.resources, resources]),
+        missions=tables.Missions.concatenate([base.missions, missions]),
+        baseframes=tables.BaseFrames.concatenate([base.baseframes, other.baseframes]),
+        vertices=tables.Vertices.concatenate([base.vertices, vertices]),
+        frames=tables.Frames.concatenate([base.frames, frames]),
+        keypoints=tables.Keypoints.concatenate([base.keypoints, keypoints]),
+        landmarks=tables.Landmarks.concatenate([base.landmarks, landmarks]),
+        imu_edges=tables.ImuEdges.concatenate([base.imu_edges, imu]),
+        imu_samples=tables.ImuSamples.concatenate([base.imu_samples, other.imu_samples]),
+        transformation_edges=tables.TransformationEdges.concatenate(
+            [base.transformation_edges, relative]
+        ),
+        loop_closure_edges=tables.LoopClosureEdges.concatenate([base.loop_closure_edges, loops]),
+        absolute_poses=tables.AbsolutePoses.concatenate([base.absolute_poses, absolute]),
+        resources=tables.Resources.concatenate([base.resources, resources]),
     )
 
 
@@ -75,9 +63,9 @@ def _shift(rows: I32, offset: int) -> I32:
     return np.where(rows >= 0, rows + offset, rows).astype(np.int32)
 
 
-def _shift_resources(resources: Resources, frames: int, missions: int) -> Resources:
-    offset = np.where(resources.owner_kind == ResourceOwner.FRAME, frames, missions)
-    owned = (resources.owner_kind != ResourceOwner.NONE) & (resources.owner >= 0)
+def _shift_resources(resources: tables.Resources, frames: int, missions: int) -> tables.Resources:
+    offset = np.where(resources.owner_kind == tables.ResourceOwner.FRAME, frames, missions)
+    owned = (resources.owner_kind != tables.ResourceOwner.NONE) & (resources.owner >= 0)
     return resources.replace(owner=np.where(owned, resources.owner + offset, resources.owner))
 
 

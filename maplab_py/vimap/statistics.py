@@ -9,13 +9,8 @@ import numpy as np
 
 from maplab_py.distinct import distinct
 from maplab_py.report import Report, counted
+from maplab_py.vimap import queries
 from maplab_py.vimap.ids import distinct_prefixes, is_valid, to_hex, to_hex_list
-from maplab_py.vimap.queries import (
-    coobservation_counts,
-    mission_clusters,
-    mission_distances_m,
-    mission_time_spans_ns,
-)
 from maplab_py.vimap.tables import Backbone, LandmarkQuality, ResourceOwner, TransformationKind
 from maplab_py.vimap.vi_map import VIMap
 
@@ -193,7 +188,7 @@ class CoobservabilityTable:
 
 def map_statistics(vi_map: VIMap) -> MapStatistics:
     """Count the entities of a map."""
-    distances, spans = mission_distances_m(vi_map), mission_time_spans_ns(vi_map)
+    distances, spans = queries.mission_distances_m(vi_map), queries.mission_time_spans_ns(vi_map)
     missions = tuple(
         _mission(vi_map, row, float(distances[row]), spans[row, 0], spans[row, 1])
         for row in range(len(vi_map.missions))
@@ -221,11 +216,11 @@ def map_statistics(vi_map: VIMap) -> MapStatistics:
 def coobservability(vi_map: VIMap) -> CoobservabilityReport:
     """Group missions that observe common landmarks."""
     names = to_hex_list(vi_map.missions.id)
-    label = mission_clusters(vi_map, with_loop_closures=False)
+    label = queries.mission_clusters(vi_map, with_loop_closures=False)
     clusters = tuple(
         tuple(names[row] for row in np.flatnonzero(label == value)) for value in np.unique(label)
     )
-    counts = coobservation_counts(vi_map).tolist()
+    counts = queries.coobservation_counts(vi_map).tolist()
     return CoobservabilityReport(tuple(names), clusters, tuple(tuple(row) for row in counts))
 
 

@@ -6,12 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from maplab_py.algorithms.evaluation import reports
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
-from maplab_py.algorithms.evaluation.reports import (
-    LocalizationEvaluationReport,
-    MapComparisonReport,
-    TrajectoryEvaluationReport,
-)
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
@@ -32,7 +28,7 @@ def evaluate_trajectory(
     options: TrajectoryEvaluationOptions = TrajectoryEvaluationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
     baseline: str = "",
-) -> TrajectoryEvaluationReport:
+) -> reports.TrajectoryEvaluationReport:
     """Compare the vertices with a ground-truth trajectory: APE, Sim(3) APE and scale, RPE.
 
     The RMSE of the last evaluation of this map in the session, against the same ground truth with
@@ -55,7 +51,7 @@ def evaluate_trajectory(
         if truth.note:
             context.terminal.note(truth.note)
 
-    def errors_of(vi_map: VIMap) -> TrajectoryEvaluationReport:
+    def errors_of(vi_map: VIMap) -> reports.TrajectoryEvaluationReport:
         missions = chosen.rows(vi_map)
         return trajectory_evaluation.evaluate_trajectory(
             vi_map, truth, options, missions=missions, progress=context.progress
@@ -67,7 +63,7 @@ def evaluate_trajectory(
     context.session.results[key] = report
     if reference is not None:
         errors = errors_of(reference).as_baseline(f"snapshot '{baseline}'")
-    elif isinstance(before, TrajectoryEvaluationReport):
+    elif isinstance(before, reports.TrajectoryEvaluationReport):
         errors = before.as_baseline("the last evaluation")
     else:
         return report
@@ -79,7 +75,7 @@ def evaluate_trajectory(
     example="compare_maps before_optvi",
     see_also=("import_colmap", "evaluate_trajectory"),
 )
-def compare_maps(context: CommandContext, other_map: str) -> MapComparisonReport:
+def compare_maps(context: CommandContext, other_map: str) -> reports.MapComparisonReport:
     """Show how the selected map and another one differ; rows are matched by their ids.
 
     Poses and landmarks are compared in G. An observation is a keypoint with its landmark.
@@ -116,7 +112,7 @@ def evaluate_localization(
     ground_truth: Path,
     map_folder: Path | None = None,
     map_ground_truth: Path | None = None,
-) -> LocalizationEvaluationReport:
+) -> reports.LocalizationEvaluationReport:
     """Compare poses in a map with ground truth, without aligning them.
 
     Poses are taken to be in the frame of the ground truth. When --map_folder is given, that map is
@@ -152,4 +148,4 @@ def evaluate_localization(
         evaluation.localization_errors(evaluation.read_localized(Path(name)), truth, T_R_G)
         for name in names
     )
-    return LocalizationEvaluationReport(str(ground_truth), alignment, files)
+    return reports.LocalizationEvaluationReport(str(ground_truth), alignment, files)

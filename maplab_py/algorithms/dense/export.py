@@ -21,15 +21,7 @@ from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.mvs import (
-    MvsScene,
-    bundler_text,
-    encode_model,
-    file_number,
-    list_text,
-    option_text,
-    projection_text,
-)
+from maplab_py.interop import mvs
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -81,7 +73,7 @@ def write_colmap_workspace(
     for view, image in _images(views, progress):
         write_bytes(folder / "images" / names[view], [_encode(image, ".png")], overwrite=overwrite)
         _paint(colours, image, tracks, view)
-    model = encode_model(dataclasses.replace(scene, colours=colours))
+    model = mvs.encode_model(dataclasses.replace(scene, colours=colours))
     for name, content in model.items():
         write_bytes(folder / "sparse" / name, [content], overwrite=overwrite)
     settings = (f"{name}\n__auto__, {_SOURCES}\n" for name in names)
@@ -114,20 +106,20 @@ def write_pmvs_folder(
         known = ", ".join(name[1:] for name in _IMAGE_SUFFIXES)
         raise UserError(f"--pmvs_image_format={image_format}: choose one of {known}")
     check_writable(folder / "bundle.rd.out", overwrite=overwrite)
-    names = [file_number(view) + suffix for view in range(len(views))]
+    names = [mvs.file_number(view) + suffix for view in range(len(views))]
     tracks, scene = _scene(views, names, only_good=only_good)
     colours = np.full((len(scene.p_G), 3), _GREY, dtype=np.uint8)
     for view, image in _images(views, progress):
         content = _encode(_three_channels(image), suffix)
         write_bytes(folder / "visualize" / names[view], [content], overwrite=overwrite)
-        matrix = folder / "txt" / f"{file_number(view)}.txt"
-        write_text(matrix, [projection_text(scene, view)], overwrite=overwrite)
+        matrix = folder / "txt" / f"{mvs.file_number(view)}.txt"
+        write_text(matrix, [mvs.projection_text(scene, view)], overwrite=overwrite)
         _paint(colours, image, tracks, view)
     scene = dataclasses.replace(scene, colours=colours)
     for name, text in (
-        ("list.rd.txt", list_text(names)),
-        ("option-all", option_text(len(names))),
-        ("bundle.rd.out", bundler_text(scene)),
+        ("list.rd.txt", mvs.list_text(names)),
+        ("option-all", mvs.option_text(len(names))),
+        ("bundle.rd.out", mvs.bundler_text(scene)),
     ):
         write_text(folder / name, [text], overwrite=overwrite)
     _keep(folder / "models", overwrite=overwrite)
@@ -136,11 +128,11 @@ def write_pmvs_folder(
 
 def _scene(
     views: UndistortedViews, names: list[str], *, only_good: bool
-) -> tuple[PointTracks, MvsScene]:
+) -> tuple[PointTracks, mvs.MvsScene]:
     tracks = views.tracks(only_good=only_good)
     size = [[p.width_px, p.height_px] for p in views.pinholes]
     K = [[p.focal_px, p.focal_px, *p.centre_px] for p in views.pinholes]
-    scene = MvsScene(
+    scene = mvs.MvsScene(
         np.array(size, dtype=np.int64),
         np.array(K),
         views.camera_of_view,
@@ -156,7 +148,7 @@ def _scene(
     return tracks, dataclasses.replace(scene, error_px=_errors_px(scene))
 
 
-def _errors_px(scene: MvsScene) -> F64:
+def _errors_px(scene: mvs.MvsScene) -> F64:
     """Return the mean reprojection error (L,) [px] of the points."""
     p_C = se3.transform(scene.T_C_G[scene.view], scene.p_G[scene.landmark])
     K = scene.K[scene.camera[scene.view]]
@@ -203,7 +195,7 @@ def _keep(folder: Path, *, overwrite: bool) -> None:
     write_bytes(folder / ".keep", [b""], overwrite=overwrite)
 
 
-def _report(folder: Path, views: UndistortedViews, scene: MvsScene) -> MvsExport:
+def _report(folder: Path, views: UndistortedViews, scene: mvs.MvsScene) -> MvsExport:
     error = float(np.median(scene.error_px)) if len(scene.p_G) else 0.0
     return MvsExport(
         folder,

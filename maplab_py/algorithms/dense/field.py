@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maplab_py.algorithms.dense.depth_inputs import (
-    DepthViews,
-    depth_type,
-    fuse_views,
-    grid_settings,
-    mission_groups,
-    short_id,
-)
+from maplab_py.algorithms.dense import depth_inputs
 from maplab_py.algorithms.dense.grid import GridContent, GridFormat, TsdfGrid, encode_arrays
 from maplab_py.algorithms.dense.grid_kernels import BLOCK_SIDE
 from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT, DistanceOptions, FusionOptions
@@ -283,25 +276,29 @@ def create_fields(
     """
     options, fusion = options or DistanceOptions(), fusion or FusionOptions()
     rows = np.array(chosen_missions(vi_map, missions))
-    kind = depth_type(vi_map, rows, input_type)
+    kind = depth_inputs.depth_type(vi_map, rows, input_type)
     former = resources_of(vi_map, (FIELD_TYPE,), rows)
     if former.any() and not overwrite:
         raise UserError(
             f"there is a distance field of {counted(int(np.count_nonzero(former)), 'mission')} already: "
             "give --overwrite to replace it"
         )
-    groups, notes = mission_groups(vi_map, rows)
-    depth = DepthViews(vi_map, map_folder, kind)
+    groups, notes = depth_inputs.mission_groups(vi_map, rows)
+    depth = depth_inputs.DepthViews(vi_map, map_folder, kind)
     new = NewResources(seed=b"distance field")
     reports, owners = [], []
     for group in groups:
         resources = depth.of_missions(group)[:: fusion.integrate_every_nth]
         if not len(resources):
-            notes.append(f"mission {short_id(vi_map, group[0])}: no {resource_type(kind).name}")
+            notes.append(
+                f"mission {depth_inputs.short_id(vi_map, group[0])}: no {resource_type(kind).name}"
+            )
             continue
         poses = depth.poses(resources, se3.inverse(vi_map.T_G_M[group[0]]))
-        settings = grid_settings(fusion)
-        grid = fuse_views(depth, resources, poses, settings, progress, with_free_space=True)
+        settings = depth_inputs.grid_settings(fusion)
+        grid = depth_inputs.fuse_views(
+            depth, resources, poses, settings, progress, with_free_space=True
+        )
         field = distance_field(grid, poses[:, 4:], options, min_weight, progress)
         new.add(FIELD_TYPE, encode_field(field))
         owners.append(group[0])

@@ -11,17 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.dense.grid_kernels import (
-    BLOCK_SIDE,
-    FULL,
-    NEIGHBOURS,
-    allocate_blocks,
-    fill_table,
-    find_neighbours,
-    integrate_depth,
-    join_vertices,
-    place_vertices,
-)
+from maplab_py.algorithms.dense import grid_kernels
 from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.array_types import F32, F64, I32
 from maplab_py.errors import MapError
@@ -29,7 +19,7 @@ from maplab_py.memory import require_memory
 
 _FIRST_CAPACITY = 1024
 _TABLE_ROWS_PER_BLOCK = 4
-_BYTES_PER_BLOCK = 8 * BLOCK_SIDE**3 + 12 + 16 * _TABLE_ROWS_PER_BLOCK
+_BYTES_PER_BLOCK = 8 * grid_kernels.BLOCK_SIDE**3 + 12 + 16 * _TABLE_ROWS_PER_BLOCK
 _STEPS_PER_BLOCK = 4
 """Blocks are allocated at pixels that are a quarter of a block apart at the largest depth ..."""
 _MAX_PIXEL_STEP = 8
@@ -71,7 +61,7 @@ class TsdfGrid:
         self.settings = settings
         self.count = 0
         self._coordinates: I32 = np.zeros((0, 3), dtype=np.int32)
-        shape = (0, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+        shape = (0, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE)
         self._distance: F32 = np.zeros(shape, dtype=np.float32)
         self._weight: F32 = np.zeros(shape, dtype=np.float32)
         self._table = np.zeros((0, 2), dtype=np.int64)
@@ -85,7 +75,7 @@ class TsdfGrid:
         grid._coordinates[: grid.count] = coordinates
         grid._distance[: grid.count] = distance
         grid._weight[: grid.count] = weight
-        fill_table(grid.coordinates, grid._table)
+        grid_kernels.fill_table(grid.coordinates, grid._table)
         return grid
 
     @property
@@ -125,7 +115,7 @@ class TsdfGrid:
             MapError: A surface is too far from the origin for the voxel size.
         """
         s = self.settings
-        block_m = BLOCK_SIDE * s.voxel_size_m
+        block_m = grid_kernels.BLOCK_SIDE * s.voxel_size_m
         if np.abs(T_G_C[:3, 3]).max() + 2.0 * s.max_depth_m > block_m * _LIMIT:
             raise MapError(
                 f"a camera is {np.abs(T_G_C[:3, 3]).max():.0f} m from the origin: the grid reaches "
@@ -138,8 +128,12 @@ class TsdfGrid:
         settings = np.array([block_m, s.truncation_m, *range_m, step, float(with_free_space)])
         while True:
             arguments = depth, camera, T_G_C, settings, self._table, self._coordinates
-            count = allocate_blocks(*arguments, self.count) if len(self._table) else FULL
-            if count != FULL:
+            count = (
+                grid_kernels.allocate_blocks(*arguments, self.count)
+                if len(self._table)
+                else grid_kernels.FULL
+            )
+            if count != grid_kernels.FULL:
                 break
             self._reserve(max(2 * len(self._coordinates), _FIRST_CAPACITY))
         self.count = count
@@ -154,19 +148,22 @@ class TsdfGrid:
 
     def mesh(self, min_weight: float) -> Mesh:
         """Return the surface between voxels of at least this weight."""
-        around = np.empty((self.count, NEIGHBOURS), dtype=np.int32)
-        find_neighbours(self.coordinates, self._table, around)
-        cells = np.empty((self.count, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE), dtype=np.int32)
+        around = np.empty((self.count, grid_kernels.NEIGHBOURS), dtype=np.int32)
+        grid_kernels.find_neighbours(self.coordinates, self._table, around)
+        cells = np.empty(
+            (self.count, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE),
+            dtype=np.int32,
+        )
         settings = np.array([self.settings.voxel_size_m, max(min_weight, 1e-12)])
         arguments = self.coordinates, around, self.distance, self.weight, settings, cells
-        points = np.empty((place_vertices(*arguments, np.empty((0, 3))), 3))
+        points = np.empty((grid_kernels.place_vertices(*arguments, np.empty((0, 3))), 3))
         quads = np.empty((0, 4), dtype=np.int32)
         if len(points):
-            place_vertices(*arguments, points)
-            number = join_vertices(around, self.distance, cells, quads)
+            grid_kernels.place_vertices(*arguments, points)
+            number = grid_kernels.join_vertices(around, self.distance, cells, quads)
             quads = np.empty((number, 4), dtype=np.int32)
         if len(quads):
-            join_vertices(around, self.distance, cells, quads)
+            grid_kernels.join_vertices(around, self.distance, cells, quads)
         return _triangulate(points, quads)
 
     def sorted(self) -> TsdfGrid:
@@ -190,7 +187,7 @@ class TsdfGrid:
         )
         T_C_G = np.linalg.inv(T_G_C)
         blocks = (array[first_block:] for array in (self.coordinates, self.distance, self.weight))
-        integrate_depth(depth, image, T_C_G, settings, *blocks)
+        grid_kernels.integrate_depth(depth, image, T_C_G, settings, *blocks)
 
     def _reserve(self, capacity: int) -> None:
         """Make room for so many blocks."""
@@ -202,7 +199,7 @@ class TsdfGrid:
             setattr(self, name, array)
         rows = 1 << int(np.ceil(np.log2(max(_TABLE_ROWS_PER_BLOCK * capacity, 2))))
         self._table = np.full((rows, 2), -1, dtype=np.int64)
-        fill_table(self.coordinates, self._table)
+        grid_kernels.fill_table(self.coordinates, self._table)
 
 
 def _triangulate(p: F64, quads: I32) -> Mesh:

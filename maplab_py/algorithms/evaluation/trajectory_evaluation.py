@@ -7,14 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.evaluation import pose_errors
+from maplab_py.algorithms.evaluation import pose_errors, reports
 from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.plausibility import clock_offset_ns, orientation_hint
-from maplab_py.algorithms.evaluation.reports import (
-    ErrorStatistics,
-    MissionEvaluation,
-    TrajectoryEvaluationReport,
-)
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
@@ -41,7 +36,7 @@ def evaluate_trajectory(
     *,
     missions: NDArray[np.integer] | None = None,
     progress: Progress = SILENT,
-) -> TrajectoryEvaluationReport:
+) -> reports.TrajectoryEvaluationReport:
     """Return the errors of the vertices' T_G_I after a joint alignment of the chosen missions.
 
     Relative errors are computed within missions. A constant rotation between the body frame of the
@@ -86,7 +81,7 @@ def evaluate_trajectory(
     if ground_truth.has_orientation:
         rpe_m, rpe_deg = _relative(vi_map, rows, T_R_B, T_R_I, options)
     kind = "all pairs" if options.rpe_all_pairs else "consecutive"
-    return TrajectoryEvaluationReport(
+    return reports.TrajectoryEvaluationReport(
         ground_truth=ground_truth.source,
         alignment=options.alignment,
         vertices=len(matched),
@@ -226,7 +221,7 @@ def _no_match_message(
     )
 
 
-def _similarity(T_R_B: F64, T_G_I: F64) -> tuple[ErrorStatistics | None, float | None]:
+def _similarity(T_R_B: F64, T_G_I: F64) -> tuple[reports.ErrorStatistics | None, float | None]:
     """Return position errors after a Sim(3) alignment and its scale; None if it is degenerate."""
     try:
         aligned, scale = pose_errors.align(T_R_B, T_G_I, "sim3")
@@ -237,7 +232,7 @@ def _similarity(T_R_B: F64, T_G_I: F64) -> tuple[ErrorStatistics | None, float |
 
 def _relative(
     vi_map: VIMap, rows: I64, T_R_B: F64, T_R_I: F64, options: TrajectoryEvaluationOptions
-) -> tuple[ErrorStatistics | None, ErrorStatistics | None]:
+) -> tuple[reports.ErrorStatistics | None, reports.ErrorStatistics | None]:
     """Return statistics of the relative errors [m], [deg] of segments within missions."""
     mission = vi_map.vertices.mission[rows]
     times_s = (vi_map.vertices.timestamp_ns[rows] - vi_map.vertices.timestamp_ns[rows].min()) * 1e-9
@@ -267,7 +262,7 @@ def _relative(
 
 def _by_mission(
     vi_map: VIMap, rows: I64, T_R_B: F64, options: TrajectoryEvaluationOptions
-) -> tuple[MissionEvaluation, ...]:
+) -> tuple[reports.MissionEvaluation, ...]:
     """Evaluate each mission with a separate alignment."""
     mission = vi_map.vertices.mission[rows]
     results = []
@@ -280,7 +275,7 @@ def _by_mission(
         except EstimationError:
             rmse = None
         mission_id = ids.to_hex(vi_map.missions.id[mission[members[0]]])
-        results.append(MissionEvaluation(mission_id, len(members), rmse))
+        results.append(reports.MissionEvaluation(mission_id, len(members), rmse))
     return tuple(results)
 
 

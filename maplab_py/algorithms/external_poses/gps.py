@@ -10,19 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.external_poses.alignment import (
-    Movement,
-    robust_yaw_position,
-    with_aligned_base_frame,
-)
+from maplab_py.algorithms.external_poses import alignment, trajectories
 from maplab_py.algorithms.external_poses.options import GpsOptions
-from maplab_py.algorithms.external_poses.trajectories import (
-    UNKNOWN_SIGMA_RAD,
-    content_words,
-    nearest,
-    with_sensor,
-    without_absolute_poses,
-)
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
@@ -48,7 +37,7 @@ class AttachedFixes:
     vi_map: VIMap
     origin: Origin
     added: int
-    movement: Movement
+    movement: alignment.Movement
     median_error_m: float  # between fixes and the aligned mission
 
 
@@ -85,7 +74,7 @@ def attach_fixes(
         EstimationError: The positions have no horizontal extent.
     """
     before = origin_of(vi_map)
-    vi_map = without_absolute_poses(
+    vi_map = trajectories.without_absolute_poses(
         vi_map, mission, track.source, replace=options.replace, flag="gps_replace"
     )
     origin = _origin(vi_map, before, track, options)
@@ -96,20 +85,22 @@ def attach_fixes(
     T_M_S = se3.compose(vi_map.vertices.T_M_I[rows], T_I_S)
     p_G = east_north_up_m(track, origin)[fixes]
     p_M = interpolate_poses(stamps, T_M_S, times[fixes])[0][:, 4:]
-    T_G_M = robust_yaw_position(p_G, p_M) if options.align else vi_map.T_G_M[mission]
+    T_G_M = alignment.robust_yaw_position(p_G, p_M) if options.align else vi_map.T_G_M[mission]
     error_m = np.linalg.norm(p_G - se3.transform(T_G_M, p_M), axis=1)
-    movement = Movement(0.0, 0.0)
+    movement = alignment.Movement(0.0, 0.0)
     if options.align:
-        vi_map, movement = with_aligned_base_frame(vi_map, mission, T_G_M)
+        vi_map, movement = alignment.with_aligned_base_frame(vi_map, mission, T_G_M)
     at_vertex = p_G + so3.rotate(T_G_M[:4], T_M_S[place, 4:] - p_M)
     q_G_S = se3.compose(T_G_M, T_M_S[place])[:, :4]
-    words = content_words(vi_map, mission, "gps", times, p_G)
+    words = trajectories.content_words(vi_map, mission, "gps", times, p_G)
     keys = {
         "topic": "",
         "description": "satellite positions, east north up of an origin on WGS 84",
         ORIGIN: dict(zip(_ORIGIN_KEYS, origin, strict=True)),
     }
-    vi_map = with_sensor(vi_map, mission, MissionSensor.ABSOLUTE_6DOF, words, T_I_S, keys)
+    vi_map = trajectories.with_sensor(
+        vi_map, mission, MissionSensor.ABSOLUTE_6DOF, words, T_I_S, keys
+    )
     added = AbsolutePoses.filled(
         len(fixes),
         vertex=rows[place],
@@ -153,7 +144,7 @@ def _matches(stamps: I64, times: I64, options: GpsOptions, source: str) -> tuple
     zeros = np.zeros((len(stamps), 1))
     covered = interpolate_vectors(stamps, zeros, times, max_gap_ns=gap_ns)[1]
     fixes = np.flatnonzero(covered)
-    place = nearest(stamps, times[fixes])
+    place = trajectories.nearest(stamps, times[fixes])
     order = np.lexsort((np.abs(times[fixes] - stamps[place]), place))
     place, first = np.unique(place[order], return_index=True)
     fixes = fixes[order][first]
@@ -168,4 +159,4 @@ def _matches(stamps: I64, times: I64, options: GpsOptions, source: str) -> tuple
 
 def _variance(options: GpsOptions) -> F64:
     horizontal, vertical = options.sigma_m, options.sigma_vertical_m or 2.0 * options.sigma_m
-    return np.array([horizontal, horizontal, vertical, *[UNKNOWN_SIGMA_RAD] * 3]) ** 2
+    return np.array([horizontal, horizontal, vertical, *[trajectories.UNKNOWN_SIGMA_RAD] * 3]) ** 2

@@ -12,12 +12,7 @@ import numpy as np
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.plausibility import motion_hint, orientation_hint
 from maplab_py.algorithms.evaluation.trajectory_evaluation import clock_hint
-from maplab_py.algorithms.external_poses.alignment import (
-    Movement,
-    check_vertical,
-    robust_yaw_position,
-    with_aligned_base_frame,
-)
+from maplab_py.algorithms.external_poses import alignment
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
 from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.errors import EstimationError, MapError, UserError
@@ -25,17 +20,9 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import Extrinsics, OtherSensor
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, tables
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    Backbone,
-    BaseFrames,
-    Missions,
-    TransformationEdges,
-    Vertices,
-)
 
 _ALONG = "odometry of a trajectory"
 _MOTION_DEG = 20.0
@@ -51,7 +38,7 @@ def shifted(trajectory: Trajectory, time_offset_s: float) -> Trajectory:
 
 def as_absolute_poses(
     vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
-) -> tuple[VIMap, int, Movement]:
+) -> tuple[VIMap, int, alignment.Movement]:
     """Attach poses T_G_S to the vertices of a mission (row) that are nearest to them.
 
     A pose is interpolated to the time of its vertex.
@@ -81,20 +68,20 @@ def as_absolute_poses(
     keys = {"topic": "", "description": "trajectory of another program"}
     vi_map = with_sensor(vi_map, mission, MissionSensor.ABSOLUTE_6DOF, words, T_I_S, keys)
     T_M_S = se3.compose(vi_map.vertices.T_M_I[rows], T_I_S)
-    movement, T_G_M, sigma = Movement(0.0, 0.0), vi_map.T_G_M[mission], _sigma(options)
+    movement, T_G_M, sigma = alignment.Movement(0.0, 0.0), vi_map.T_G_M[mission], _sigma(options)
     if len(rows) > 1:
-        T_G_M = robust_yaw_position(T_G_S[:, 4:], T_M_S[:, 4:])
+        T_G_M = alignment.robust_yaw_position(T_G_S[:, 4:], T_M_S[:, 4:])
     T_G_S_map = se3.compose(T_G_M, T_M_S)
     if trajectory.has_orientation:
         hint = orientation_hint(T_G_S[:, :4], T_G_S_map[:, :4], is_mounted=True)
         if hint and not clock_note(vi_map, mission, trajectory, options):
             raise EstimationError(f"{trajectory.source}: {hint}")
-        check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
+        alignment.check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
     else:  # the estimated orientation, which weighs nothing
         T_G_S, sigma[3:] = se3.make(T_G_S_map[:, :4], T_G_S[:, 4:]), UNKNOWN_SIGMA_RAD
     if options.align and len(rows) > 1:
-        vi_map, movement = with_aligned_base_frame(vi_map, mission, T_G_M)
-    added = AbsolutePoses.filled(
+        vi_map, movement = alignment.with_aligned_base_frame(vi_map, mission, T_G_M)
+    added = tables.AbsolutePoses.filled(
         len(rows),
         vertex=rows,
         timestamp_ns=vi_map.vertices.timestamp_ns[rows],
@@ -102,7 +89,7 @@ def as_absolute_poses(
         T_G_S=T_G_S,
         covariance=np.tile(np.diag(sigma**2), (len(rows), 1, 1)),
     )
-    table = AbsolutePoses.concatenate([vi_map.absolute_poses, added])
+    table = tables.AbsolutePoses.concatenate([vi_map.absolute_poses, added])
     return vi_map.replace(absolute_poses=table), missing, movement
 
 
@@ -143,7 +130,7 @@ def as_odometry(
     keys = {"topic": "", "description": "trajectory of another program"}
     vi_map = with_sensor(vi_map, mission, MissionSensor.ODOMETRY_6DOF, words, T_I_S, keys)
     edges = _edges(rows[first], stamps, first, T_R_S, words, options)
-    table = TransformationEdges.concatenate([vi_map.transformation_edges, edges])
+    table = tables.TransformationEdges.concatenate([vi_map.transformation_edges, edges])
     return vi_map.replace(transformation_edges=table), len(rows) - 1 - len(first), notes
 
 
@@ -162,8 +149,12 @@ def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
     times = trajectory.times_ns
     words = content_words(_NO_MISSION, 0, _ALONG, times, trajectory.T_R_B)
     rng = np.random.default_rng(words)
-    missions = Missions.filled(
-        1, id=random_ids(1, rng), baseframe=[0], root_vertex=[0], backbone=[Backbone.ODOMETRY]
+    missions = tables.Missions.filled(
+        1,
+        id=random_ids(1, rng),
+        baseframe=[0],
+        root_vertex=[0],
+        backbone=[tables.Backbone.ODOMETRY],
     )
     zeros = np.zeros((count, 3))
     biases = (trajectory.gyro_bias, trajectory.accel_bias)
@@ -172,8 +163,8 @@ def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:
     v_M = np.gradient(p, seconds, axis=0) if trajectory.v_R is None else trajectory.v_R
     vi_map = VIMap(
         missions=missions,
-        baseframes=BaseFrames.filled(1, id=random_ids(1, rng)),
-        vertices=Vertices.filled(
+        baseframes=tables.BaseFrames.filled(1, id=random_ids(1, rng)),
+        vertices=tables.Vertices.filled(
             count,
             id=random_ids(count, rng),
             mission=np.zeros(count, dtype=np.int32),
@@ -208,7 +199,7 @@ def nearest(stamps: I64, times: I64) -> I64:
     return np.asarray(np.where(is_before, after - 1, np.minimum(after, len(stamps) - 1)))
 
 
-_NO_MISSION = VIMap(missions=Missions.filled(1))
+_NO_MISSION = VIMap(missions=tables.Missions.filled(1))
 
 
 def _at(trajectory: Trajectory, stamps: I64, options: TrajectoryOptions) -> tuple[F64, Mask]:
@@ -223,11 +214,11 @@ def _edges(
     T_R_S: F64,
     words: U64,
     options: TrajectoryOptions,
-) -> TransformationEdges:
+) -> tables.TransformationEdges:
     """Return edges from poses `first` to the next; variances grow with time."""
     count, rng = len(first), np.random.default_rng(words)
     seconds = (stamps[first + 1] - stamps[first]) * 1e-9
-    return TransformationEdges.filled(
+    return tables.TransformationEdges.filled(
         count,
         id=random_ids(count, rng),
         kind=np.full(count, int(TransformationKind.ODOMETRY)),

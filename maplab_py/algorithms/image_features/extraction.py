@@ -12,12 +12,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.algorithms.dense.resources import IMAGES, FrameResources, check_size
-from maplab_py.algorithms.image_features.keypoint_edits import (
-    has_kind,
-    is_undescribed,
-    with_features,
-    without_kind,
-)
+from maplab_py.algorithms.image_features import keypoint_edits
 from maplab_py.algorithms.image_features.options import PLUGIN, ExtractionOptions, ExtractionReport
 from maplab_py.array_types import I64, U8, Mask
 from maplab_py.errors import MapError, MaplabError, UserError
@@ -66,7 +61,7 @@ def extract_features(
     frames, resources = _frames_with_images(vi_map, missions)
     skipped = 0
     if kind is not None and not options.replace:
-        new = ~has_kind(vi_map, kind)[frames]
+        new = ~keypoint_edits.has_kind(vi_map, kind)[frames]
         frames, resources, skipped = frames[new], resources[new], int(np.count_nonzero(~new))
     _check_kept(vi_map, frames, options)
     features, kind = _features_of_images(
@@ -74,7 +69,7 @@ def extract_features(
     )
     features = [_strongest(part, options.max_features) for part in features]
     if KINDS.get(options.feature_type) is None and not options.replace and kind is not None:
-        new = ~has_kind(vi_map, kind)[frames]
+        new = ~keypoint_edits.has_kind(vi_map, kind)[frames]
         skipped += int(np.count_nonzero(~new))
         features = [part for part, is_new in zip(features, new.tolist(), strict=True) if is_new]
         frames = frames[new]
@@ -82,14 +77,16 @@ def extract_features(
     if options.replace and kind is not None:
         chosen = np.zeros(len(vi_map.frames), dtype=np.bool_)
         chosen[frames] = True
-        result = without_kind(vi_map, chosen, kind)
+        result = keypoint_edits.without_kind(vi_map, chosen, kind)
     removed = len(vi_map.keypoints) - len(result.keypoints)
     counts = np.array([len(part.scores) for part in features], dtype=np.int64)
     if kind is not None:
         require_memory(
             2.0 * counts.sum() * (_BYTES_PER_KEYPOINT + kind.size), "adding the features to the map"
         )
-        result = with_features(result, frames.tolist(), features, kind, options.feature_sigma_px)
+        result = keypoint_edits.with_features(
+            result, frames.tolist(), features, kind, options.feature_sigma_px
+        )
     return result, ExtractionReport(
         feature_type=type_name(kind.feature_type) if kind is not None else options.feature_type,
         descriptor_bytes=kind.size if kind is not None else 0,
@@ -152,7 +149,7 @@ def _check_kept(vi_map: VIMap, frames: I64, options: ExtractionOptions) -> None:
     Raises:
         UserError: A frame has keypoints without descriptors.
     """
-    bare = frames[is_undescribed(vi_map)[frames]]
+    bare = frames[keypoint_edits.is_undescribed(vi_map)[frames]]
     if len(bare) and not options.replace:
         raise UserError(
             f"frame {to_hex(vi_map.frames.id[bare[0]])} and {len(bare) - 1} others have keypoints without "

@@ -19,18 +19,12 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.errors import MapError
-from maplab_py.storage.extension_fields import (
-    LOOP_RECORD,
-    PACKED,
-    read_extension,
-    unpacked,
-    with_extension,
-)
+from maplab_py.storage import extension_fields
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex_list
 from maplab_py.vimap.table import Table, column
 
-FIELD_NUMBER = LOOP_RECORD
+FIELD_NUMBER = extension_fields.LOOP_RECORD
 """Field number in the mission message."""
 _MAX_HEADER_BYTES = 100_000
 """Maximum size of the header of a record; typical headers have about three thousand bytes."""
@@ -133,7 +127,9 @@ def read_record(vi_map: VIMap) -> LoopRecord:
     Raises:
         MapError: The record is damaged.
     """
-    contents = (read_extension(field, FIELD_NUMBER) for field in vi_map.missions.unknown)
+    contents = (
+        extension_fields.read_extension(field, FIELD_NUMBER) for field in vi_map.missions.unknown
+    )
     record = LoopRecord.concatenate([_decode(part) for part in contents if part is not None])
     closures = record.closures
     alive = (vi_map.vertex_index.rows(closures.query) >= 0) & (
@@ -161,7 +157,7 @@ def write_record(vi_map: VIMap, record: LoopRecord) -> VIMap:
             record.pairs.take(pairs == row),
         )
         content = None if part.is_empty else _encode(part)
-        unknown[row] = with_extension(unknown[row], FIELD_NUMBER, content)
+        unknown[row] = extension_fields.with_extension(unknown[row], FIELD_NUMBER, content)
     return vi_map.replace(missions=vi_map.missions.replace(unknown=unknown))
 
 
@@ -169,7 +165,7 @@ def drop_record(vi_map: VIMap) -> VIMap:
     """Return the map without a record, a damaged one included."""
     unknown = vi_map.missions.unknown.copy()
     for row in range(len(unknown)):
-        unknown[row] = with_extension(unknown[row], FIELD_NUMBER, None)
+        unknown[row] = extension_fields.with_extension(unknown[row], FIELD_NUMBER, None)
     return vi_map.replace(missions=vi_map.missions.replace(unknown=unknown))
 
 
@@ -183,12 +179,12 @@ def _encode(record: LoopRecord) -> bytes:
             body.append(np.ascontiguousarray(little).tobytes())
     header = json.dumps(layout, separators=(",", ":")).encode()
     plain = len(header).to_bytes(4, "little") + header + b"".join(body)
-    return PACKED + zlib.compress(plain, 6)
+    return extension_fields.PACKED + zlib.compress(plain, 6)
 
 
 def _decode(content: bytes) -> LoopRecord:
     try:
-        plain = unpacked(content)
+        plain = extension_fields.unpacked(content)
         place = 4 + int.from_bytes(plain[:4], "little")
         if place > _MAX_HEADER_BYTES:
             raise ValueError(f"a header of {place} bytes")

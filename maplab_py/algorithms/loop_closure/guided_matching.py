@@ -14,12 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays, landmark_covariance
+from maplab_py.algorithms.loop_closure import features
 from maplab_py.algorithms.loop_closure.closure_table import Closures
-from maplab_py.algorithms.loop_closure.features import (
-    findable_landmarks,
-    most_frequent_kind,
-    points_in_mission,
-)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3, symmetric
@@ -96,14 +92,14 @@ class _Search:
         vertices, landmarks = self._sees.shape
         rows = np.repeat(np.arange(vertices), np.diff(self._sees.indptr))
         self._entries = np.append(rows * landmarks + self._sees.indices, -1)
-        self._findable = findable_landmarks(vi_map)
+        self._findable = features.findable_landmarks(vi_map)
         findable = np.flatnonzero(self._findable)
         self._covariance_G = np.zeros((len(vi_map.landmarks), 3, 3))
         self._covariance_G[findable] = landmark_covariance(vi_map, findable, self._sigma_px)
         ends = np.concatenate([closures.query_vertex, closures.place_vertex])
         missions = np.unique(vi_map.vertices.mission[ends])
         wanted = np.isin(vi_map.vertices.mission[vi_map.frames.vertex], missions)
-        kind, self._described = most_frequent_kind(
+        kind, self._described = features.most_frequent_kind(
             vi_map, wanted, options.type_number, options.sizes
         )
         raw = np.ascontiguousarray(vi_map.keypoints.descriptor[:, : kind.size])
@@ -115,7 +111,7 @@ class _Search:
         vi_map, c = self._map, self._closures
         problem, landmark = self._landmarks_of_places(rows)
         mission = vi_map.vertices.mission[c.place_vertex[rows]].astype(np.int64)
-        p_M = points_in_mission(vi_map, landmark, mission[problem])
+        p_M = features.points_in_mission(vi_map, landmark, mission[problem])
         p_I = se3.transform(se3.inverse(c.T_M_I[rows])[problem], p_M)
         keypoint, of_keypoint = self._keypoints(c.query_vertex[rows])
         origin_I, ray_I, rad_per_px, seen = keypoint_rays(vi_map, keypoint)

@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.gate import failures
-from maplab_py.algorithms.loop_closure.closure_record import (
-    USES,
-    ClosureRecord,
-    LoopRecord,
-    read_record,
-)
+from maplab_py.algorithms.loop_closure import closure_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.gates import closure_gates
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
@@ -56,7 +51,7 @@ def list_closures(
     Raises:
         UserError: No verdict contains the reason.
     """
-    record = read_record(vi_map)
+    record = closure_record.read_record(vi_map)
     c = record.closures
     lines = _lines(vi_map, record)
     is_accepted = c.verdict == VERDICTS.index(Verdict.ACCEPTED)
@@ -93,7 +88,7 @@ def list_closures(
 
 def accepted_by_mission(vi_map: VIMap) -> I64:
     """Return the number (M,) of accepted recorded closures with an end in each mission."""
-    closures = read_record(vi_map).closures
+    closures = closure_record.read_record(vi_map).closures
     accepted = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
     mission = vi_map.vertices.mission.astype(np.int64)
     query, place = (
@@ -111,7 +106,7 @@ def _verdicts_with(reason: str) -> list[int]:
     return codes
 
 
-def near_miss_order(closures: ClosureRecord) -> F64:
+def near_miss_order(closures: closure_record.ClosureRecord) -> F64:
     """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses."""
     failed, total = failures(closure_gates(closures, LoopClosureOptions()))
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)
@@ -119,7 +114,7 @@ def near_miss_order(closures: ClosureRecord) -> F64:
 
 def describe_closure(vi_map: VIMap, row: int) -> ClosureLine:
     """Return a recorded closure (a row of the closures of `read_record`)."""
-    record = read_record(vi_map)
+    record = closure_record.read_record(vi_map)
     chosen = record.closures.take(np.array([row]))
     return _lines(vi_map, dataclasses.replace(record, closures=chosen))[0]
 
@@ -135,7 +130,7 @@ def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0
     Raises:
         UserError: A prefix matches no closure or several.
     """
-    c = read_record(vi_map).closures
+    c = closure_record.read_record(vi_map).closures
     names = to_hex_list(c.id)
     rows = []
     for prefix in prefixes:
@@ -153,7 +148,7 @@ def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0
 
 
 def _with_neighbours(vi_map: VIMap, chosen: I64, reach_s: float) -> I64:
-    c = read_record(vi_map).closures
+    c = closure_record.read_record(vi_map).closures
     a, b = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
     time_ns, mission = vi_map.vertices.timestamp_ns, vi_map.vertices.mission
 
@@ -167,7 +162,7 @@ def _with_neighbours(vi_map: VIMap, chosen: I64, reach_s: float) -> I64:
     return np.union1d(chosen, np.flatnonzero((same | swapped).any(axis=1) & accepted))
 
 
-def _lines(vi_map: VIMap, record: LoopRecord) -> list[ClosureLine]:
+def _lines(vi_map: VIMap, record: closure_record.LoopRecord) -> list[ClosureLine]:
     c = record.closures
     a, b = (vi_map.vertex_index.rows(ids) for ids in (c.query, c.place))
     now = se3.relative(vi_map.T_G_I[a], vi_map.T_G_I[b])
@@ -198,7 +193,7 @@ def _lines(vi_map: VIMap, record: LoopRecord) -> list[ClosureLine]:
             support=int(c.support[i]),
             merged=int(merged[i]),
             verdict=VERDICTS[c.verdict[i]].value,
-            use=USES[c.use[i]],
+            use=closure_record.USES[c.use[i]],
             weight=round(float(c.weight[i]), 3),
         )
         for i, id_ in enumerate(to_hex_list(c.id))

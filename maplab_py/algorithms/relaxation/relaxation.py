@@ -28,12 +28,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
 from maplab_py.algorithms.loop_closure.workflow import search_loops
-from maplab_py.algorithms.relaxation.map_edges import (
-    has_odometry_backbone,
-    loop_edges,
-    trajectory_edges,
-    usable_loop_closures,
-)
+from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport, SwitchedOff
 from maplab_py.algorithms.relaxation.robust import Solution, optimize_robustly
 from maplab_py.array_types import F64, I64, Mask
@@ -112,14 +107,14 @@ def relax_graph(
     if loop_closures is not None:
         tables.append(loop_closures)
     offered = LoopClosureEdges.concatenate(tables)
-    closures, notes = usable_loop_closures(vi_map, offered, missions)
+    closures, notes = map_edges.usable_loop_closures(vi_map, offered, missions)
     num_ignored = len(offered) - len(closures)
     if len(closures) == 0:
         nothing_done = RelaxationReport(num_ignored=num_ignored, notes=tuple(notes))
         return Relaxed(vi_map, nothing_done, closures, np.zeros(0))
-    graph = trajectory_edges(vi_map, options)
-    odometry = has_odometry_backbone(vi_map)
-    loops = loop_edges(closures, options, as_given=odometry[closures.from_vertex])
+    graph = map_edges.trajectory_edges(vi_map, options)
+    odometry = map_edges.has_odometry_backbone(vi_map)
+    loops = map_edges.loop_edges(closures, options, as_given=odometry[closures.from_vertex])
     links = [(edges.from_vertex, edges.to_vertex) for edges in (graph, loops)]
     label = clusters(len(vi_map.vertices), links)
     is_active = np.isin(label, label[loops.from_vertex])

@@ -20,18 +20,9 @@ from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, States
+from maplab_py.estimation.terms import pose
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.terms.inertial_calibration import CalibratingInertialTerm, imu_blocks
-from maplab_py.estimation.terms.pose import (
-    SWITCH,
-    AbsolutePoseTerm,
-    Mounting,
-    RelativePoseTerm,
-    SwitchedRelativePoseTerm,
-    mounting_block,
-    switch_block,
-    whitening,
-)
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.wheel import WHEEL_SCALE, ScaledRelativePoseTerm, wheel_scale_block
@@ -254,7 +245,7 @@ def _with_mountings(
     if not owners:
         return so_far
     T_I_S = np.stack([vi_map.sensors.T_I_S(*owner) for owner in owners])
-    states = so_far.states.with_blocks(mounting_block(T_I_S))
+    states = so_far.states.with_blocks(pose.mounting_block(T_I_S))
     return dataclasses.replace(so_far, states=states, mounted=MountedSensors(tuple(owners)))
 
 
@@ -295,7 +286,7 @@ def _odometry(
     T_I_S, rows = _mounting(
         vi_map, so_far.mounted, table.from_vertex[edges], table.sensor_id[edges]
     )
-    W, measured = whitening(table.covariance[edges]), np.array(table.T_A_B[edges])
+    W, measured = pose.whitening(table.covariance[edges]), np.array(table.T_A_B[edges])
     first = selection.rows(table.from_vertex[edges])
     second = selection.rows(table.to_vertex[edges])
     has_scale = kind == TransformationKind.WHEEL_ODOMETRY and bool(so_far.wheels)
@@ -304,8 +295,8 @@ def _odometry(
     kernel_name = f"{'scaled_' if has_scale else ''}relative_pose"
     kernel_name += "" if is_fixed else "_with_mounting"
     kernel = residual_kernel(kernel_name, getattr(sources, kernel_name), progress)
-    mounting = None if is_fixed else Mounting.of(so_far.states, rows)
-    term = RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)
+    mounting = None if is_fixed else pose.Mounting.of(so_far.states, rows)
+    term = pose.RelativePoseTerm(kernel, name, first, second, T_I_S, measured, W, mounting=mounting)
     if not has_scale:
         return [term]
     wheels = np.stack([from_hex(sensor_id) for sensor_id in so_far.wheels])
@@ -340,23 +331,25 @@ def _with_loop_closures(
     if not len(edges):
         return so_far
     measured, (first, second) = table.T_A_B[edges], ends[:, edges]
-    W = whitening(table.covariance[edges])
+    W = pose.whitening(table.covariance[edges])
     if is_switched:
         kernel = residual_kernel("switched_relative_pose", switched_relative_pose, progress)
-        states = so_far.states.with_blocks(switch_block(np.ones(len(edges))))
-        rows, nodes = np.arange(len(edges)), states.nodes(SWITCH)
-        term = SwitchedRelativePoseTerm(
+        states = so_far.states.with_blocks(pose.switch_block(np.ones(len(edges))))
+        rows, nodes = np.arange(len(edges)), states.nodes(pose.SWITCH)
+        term = pose.SwitchedRelativePoseTerm(
             kernel, "loop closure", first, second, measured, W, rows, nodes
         )
         sigma = np.sqrt(np.maximum(table.switch_variable_variance[edges], 1e-16))
-        prior = BlockPrior(states, SWITCH, np.ones((len(edges), 1)), 1.0 / sigma[:, None, None])
+        prior = BlockPrior(
+            states, pose.SWITCH, np.ones((len(edges), 1)), 1.0 / sigma[:, None, None]
+        )
         terms = [*so_far.terms, term, prior]
         return dataclasses.replace(so_far, terms=terms, states=states, switched_edges=edges)
     kernel = residual_kernel("relative_pose", relative_pose, progress)
     W = W * table.switch_variable[edges, None, None]
     T_I_S = np.broadcast_to(se3.identity(), (len(edges), 7))
     loss = (Loss.DCS, 3.0) if options.loop_closure_robustness == "dcs" else (Loss.NONE, 1.0)
-    plain = RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)
+    plain = pose.RelativePoseTerm(kernel, "loop closure", first, second, T_I_S, measured, W, loss)
     return dataclasses.replace(so_far, terms=[*so_far.terms, plain])
 
 
@@ -378,7 +371,7 @@ def _with_absolute_poses(
     outlying = absolute_outliers(vi_map, rows, T_I_S, options.absolute_pose_gate_sigma)
     T_I_S, mounted, used = T_I_S[~outlying], mounted[~outlying], rows[~outlying]
     vertex = selection.rows(table.vertex[used])
-    W = whitening(table.covariance[used])
+    W = pose.whitening(table.covariance[used])
     scale = options.absolute_pose_loss_scale
     loss = (Loss.HUBER, scale) if scale > 0.0 else (Loss.NONE, 1.0)
     mounting = None
@@ -387,8 +380,8 @@ def _with_absolute_poses(
     else:
         name = "absolute_pose_with_mounting"
         kernel = residual_kernel(name, absolute_pose_with_mounting, progress)
-        mounting = Mounting.of(so_far.states, mounted)
-    term = AbsolutePoseTerm(
+        mounting = pose.Mounting.of(so_far.states, mounted)
+    term = pose.AbsolutePoseTerm(
         kernel, vertex, T_I_S, table.T_G_S[used], W, loss=loss, mounting=mounting
     )
     return dataclasses.replace(

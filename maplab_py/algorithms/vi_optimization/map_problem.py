@@ -13,30 +13,17 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.vi_optimization import data_selection, fixed_states
 from maplab_py.algorithms.vi_optimization.calibration_states import (
     RigCameras,
     parameter_count,
     rig_cameras,
-)
-from maplab_py.algorithms.vi_optimization.data_selection import (
-    Selection,
-    check_finite,
-    check_metric,
-    initial_states,
-    observations,
-    retriangulated,
-    select,
 )
 from maplab_py.algorithms.vi_optimization.factor_terms import (
     MapFactors,
     factor_terms,
     landmark_prior,
     prior_terms,
-)
-from maplab_py.algorithms.vi_optimization.fixed_states import (
-    fix_gauge,
-    fix_vertices,
-    hold_unconstrained,
 )
 from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
 from maplab_py.algorithms.vi_optimization.options import (
@@ -61,13 +48,7 @@ from maplab_py.estimation.states import (
     VELOCITY,
     States,
 )
-from maplab_py.estimation.terms.cameras import (
-    EXTRINSICS,
-    INTRINSICS,
-    TIMING,
-    camera_blocks,
-    pixel_delay_s,
-)
+from maplab_py.estimation.terms import cameras
 from maplab_py.estimation.terms.extension import REGISTERED, ExpressionTerm, ResidualRows
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
@@ -76,7 +57,7 @@ from maplab_py.vimap import VIMap
 
 
 def extension_terms(
-    vi_map: VIMap, selection: Selection, options: DataOptions, progress: Progress
+    vi_map: VIMap, selection: data_selection.Selection, options: DataOptions, progress: Progress
 ) -> list[ExpressionTerm]:
     """Return the terms of measurements at the selected vertices.
 
@@ -109,7 +90,7 @@ class MapTerms:
     """States and terms of a map, from which a problem is built."""
 
     vi_map: VIMap
-    selection: Selection
+    selection: data_selection.Selection
     states: States
     visual: VisualTerms | None
     rejection: OutlierRejection | None
@@ -137,7 +118,7 @@ class MapProblem:
     """Optimisation problem of a map with the data needed to apply its solution to the map."""
 
     vi_map: VIMap
-    selection: Selection
+    selection: data_selection.Selection
     problem: Problem
     states: States
     rejection: OutlierRejection | None
@@ -165,14 +146,14 @@ def build(
     parts = collect_terms(vi_map, options, missions=missions, progress=progress)
     states = parts.states
     problem = make_problem(states, parts.visual, parts.terms, options, progress)
-    held = hold_unconstrained(problem, states)
+    held = fixed_states.hold_unconstrained(problem, states)
     _fix_by_options(problem, options, states, parts.rig)
     fixed = None
     if fixed_vertices is not None:
         fixed = parts.selection.rows(fixed_vertices)
         fixed = fixed[fixed >= 0]
-        fix_vertices(problem, fixed)
-    gauge = fix_gauge(
+        fixed_states.fix_vertices(problem, fixed)
+    gauge = fixed_states.fix_gauge(
         problem,
         states,
         held,
@@ -205,12 +186,12 @@ def collect_terms(
             "--ba_fix_vertices keeps the base frames as well: drop it, or leave "
             "--ba_absolute_pose_sensor_fix_mission_baseframes on"
         )
-    selection = select(vi_map, options, missions)
+    selection = data_selection.select(vi_map, options, missions)
     if not len(selection.vertices):
         raise EstimationError("nothing to optimise: the map has no vertices")
-    check_finite(vi_map, selection, options)
-    check_metric(vi_map, selection, options)
-    states = initial_states(vi_map, selection)
+    data_selection.check_finite(vi_map, selection, options)
+    data_selection.check_metric(vi_map, selection, options)
+    states = data_selection.initial_states(vi_map, selection)
     visual, rejection, rig, states = _visual(vi_map, selection, options, states, progress)
     factors = factor_terms(vi_map, selection, options, states, progress)
     states = factors.states
@@ -226,7 +207,7 @@ def collect_terms(
 
 def _visual(
     vi_map: VIMap,
-    selection: Selection,
+    selection: data_selection.Selection,
     options: VIOptimizationOptions,
     states: States,
     progress: Progress,
@@ -239,7 +220,7 @@ def _visual(
         return None, None, None, states
     used_missions = distinct(vi_map.vertices.mission[selection.vertices]).astype(np.int64)
     rig = rig_cameras(vi_map, used_missions)
-    data, sigma_px = observations(vi_map, selection, options, rig.first_of_mission)
+    data, sigma_px = data_selection.observations(vi_map, selection, options, rig.first_of_mission)
     calibrating, line_delays = is_calibrating(options), not options.fix_ncamera_line_delay
     visual = VisualTerms(
         visual_kernels(progress),
@@ -254,10 +235,12 @@ def _visual(
     )
     estimated = calibrating + line_delays  # columns of the timing that are states
     if calibrating:
-        states = states.with_blocks(*camera_blocks(rig.cameras, rig.timing_s[:, :estimated]))
+        states = states.with_blocks(
+            *cameras.camera_blocks(rig.cameras, rig.timing_s[:, :estimated])
+        )
     if rig.is_moving or line_delays or not options.fix_ncamera_time_offset:
         known_s = np.where(np.arange(2) < estimated, 0.0, rig.timing_s)
-        known_delay_s = pixel_delay_s(known_s, data.camera, data.uv_px[:, 1])
+        known_delay_s = cameras.pixel_delay_s(known_s, data.camera, data.uv_px[:, 1])
         angular_velocity_I = angular_velocity_at_vertices(vi_map)[selection.vertices]
         visual.follow_motion(angular_velocity_I, known_delay_s if known_s.any() else None)
         visual.refresh(states)
@@ -266,12 +249,12 @@ def _visual(
     if options.retriangulate_doubtful and not options.fix_landmark_positions:
         doubtful = rejection.doubtful_landmarks()
         rejection.restart()
-        fresh = retriangulated(vi_map, selection, states, data.start, doubtful)
+        fresh = data_selection.retriangulated(vi_map, selection, states, data.start, doubtful)
         states = rejection.better_placed(states, fresh)
         rejection.gate(states)
     visual.refresh(states)
     if not rejection.is_used.any():
-        return None, None, None, initial_states(vi_map, selection)
+        return None, None, None, data_selection.initial_states(vi_map, selection)
     return visual, rejection, rig, states
 
 
@@ -299,12 +282,12 @@ def _fix_by_options(
     ):
         if is_fixed:
             problem.fix(first + kind)
-    if rig is not None and EXTRINSICS in states.blocks:
+    if rig is not None and cameras.EXTRINSICS in states.blocks:
         _fix_cameras(problem, options, states, rig)
 
 
 def _fix_cameras(problem: Problem, options: FixedStates, states: States, rig: RigCameras) -> None:
-    extrinsics, intrinsics = states.nodes(EXTRINSICS), states.nodes(INTRINSICS)
+    extrinsics, intrinsics = states.nodes(cameras.EXTRINSICS), states.nodes(cameras.INTRINSICS)
     for nodes, is_fixed in (
         (extrinsics[:, 0], options.fix_ncamera_extrinsics_translation),
         (extrinsics[:, 1], options.fix_ncamera_extrinsics_rotation),
@@ -313,7 +296,7 @@ def _fix_cameras(problem: Problem, options: FixedStates, states: States, rig: Ri
         if is_fixed:
             problem.fix(nodes)
     is_free = [not options.fix_ncamera_time_offset, not options.fix_ncamera_line_delay, False]
-    timing = states.nodes(TIMING).reshape(-1)
+    timing = states.nodes(cameras.TIMING).reshape(-1)
     problem.restrict(
         timing, np.broadcast_to(np.diag(is_free).astype(np.float64), (len(timing), 3, 3))
     )

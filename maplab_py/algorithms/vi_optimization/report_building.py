@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from maplab_py.algorithms.vi_optimization import reports
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem
-from maplab_py.algorithms.vi_optimization.reports import (
-    CalibratedParameter,
-    MissionReprojection,
-    TermReport,
-    VIOptimizationReport,
-)
 from maplab_py.array_types import F64, I64
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
@@ -34,7 +29,7 @@ _OF_CAMERAS = (INTRINSICS, EXTRINSICS, TIMING)
 _POSE = ["x [m]", "y [m]", "z [m]", *_ROTATION]
 
 
-def calibration_rows(map_problem: MapProblem, after: States) -> list[CalibratedParameter]:
+def calibration_rows(map_problem: MapProblem, after: States) -> list[reports.CalibratedParameter]:
     """Return a row for every calibration parameter that was estimated."""
     names = [
         name
@@ -47,7 +42,7 @@ def calibration_rows(map_problem: MapProblem, after: States) -> list[CalibratedP
         marginals: Marginals | None = Marginals(map_problem.problem, after)
     except EstimationError:
         marginals = None
-    rows: list[CalibratedParameter] = []
+    rows: list[reports.CalibratedParameter] = []
     for name in names:
         rows += _rows_of(map_problem, after, name, marginals)
     return rows
@@ -55,7 +50,7 @@ def calibration_rows(map_problem: MapProblem, after: States) -> list[CalibratedP
 
 def _rows_of(
     map_problem: MapProblem, after: States, name: str, marginals: Marginals | None
-) -> list[CalibratedParameter]:
+) -> list[reports.CalibratedParameter]:
     block, before = after.blocks[name], map_problem.states.blocks[name]
     is_free = map_problem.problem.can_move(after.nodes(name)).reshape(len(block), -1)
     change = block.difference(before.values)
@@ -70,7 +65,7 @@ def _rows_of(
         start = before.values[row, column] if block.manifold is Manifold.VECTOR else 0.0
         label = f"{_owner(map_problem, name, int(row))} {parameter_names(map_problem, block)[row][column]}"
         rows.append(
-            CalibratedParameter(
+            reports.CalibratedParameter(
                 label,
                 float(start),
                 float(start + change[row, column]),
@@ -118,7 +113,7 @@ def _owner(map_problem: MapProblem, name: str, row: int) -> str:
 
 def make_report(
     map_problem: MapProblem, after: States, summary: SolverSummary
-) -> VIOptimizationReport:
+) -> reports.VIOptimizationReport:
     """Return the report; times are filled in by the caller."""
     vi_map, selection, problem, rejection = (
         map_problem.vi_map, map_problem.selection, map_problem.problem, map_problem.rejection,
@@ -138,7 +133,7 @@ def make_report(
         gated, rejected = rejection.gated, rejection.rejected
         landmarks = int(np.count_nonzero(rejection.used_landmarks()))
     mean, median = _mean_median(errors)
-    return VIOptimizationReport(
+    return reports.VIOptimizationReport(
         cost_before=sum(term.cost_before for term in terms),
         cost_after=_cost(terms),
         terms=terms,
@@ -184,7 +179,7 @@ def _note(used: int, landmarks: int) -> str:
     )
 
 
-def _cost(terms: list[TermReport]) -> float:
+def _cost(terms: list[reports.TermReport]) -> float:
     return sum(term.cost_after for term in terms)
 
 
@@ -200,16 +195,16 @@ def _name_of(map_problem: MapProblem, states: States, node: int) -> str:
 
 def _terms(
     problem: Problem, before: States, after: States, errors_px: list[F64]
-) -> list[TermReport]:
+) -> list[reports.TermReport]:
     terms = []
     if problem.visual is not None:
         used = int(np.count_nonzero(problem.visual.observations.inverse_sigma))
         both = zip(errors_px, (before, after), strict=True)
         costs = [problem.visual.cost_of_errors(error_px, s) for error_px, s in both]
-        terms.append(TermReport("reprojection", used, *costs))
+        terms.append(reports.TermReport("reprojection", used, *costs))
     for term in problem.factors:
         costs = [factor_terms.cost(term, states) for states in (before, after)]
-        terms.append(TermReport(term.name, len(term.nodes), *costs))
+        terms.append(reports.TermReport(term.name, len(term.nodes), *costs))
     return terms
 
 
@@ -219,13 +214,13 @@ def _mean_median(errors: F64) -> tuple[list[float], list[float]]:
     return errors.mean(axis=0).tolist(), np.median(errors, axis=0).tolist()
 
 
-def _by_mission(vi_map: VIMap, errors: F64, missions: I64) -> list[MissionReprojection]:
+def _by_mission(vi_map: VIMap, errors: F64, missions: I64) -> list[reports.MissionReprojection]:
     rows = []
     for mission in distinct(missions).tolist():
         mission_errors = errors[missions == mission]
         mean, median = _mean_median(mission_errors)
         name = to_hex(vi_map.missions.id[mission])
-        rows.append(MissionReprojection(name, len(mission_errors), *mean, *median))
+        rows.append(reports.MissionReprojection(name, len(mission_errors), *mean, *median))
     return rows
 
 

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.algorithms.vi_optimization.calibration_states import (
-    with_cameras,
-    with_imus,
-    with_wheels,
-)
+from maplab_py.algorithms.vi_optimization import calibration_states
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem
 from maplab_py.algorithms.vi_optimization.options import FixedStates
 from maplab_py.estimation.states import States
@@ -42,9 +38,9 @@ def with_estimated_sensors(map_problem: MapProblem, states: States) -> SensorSet
     """Return the map's sensors with the calibrations of the states."""
     sensors = map_problem.vi_map.sensors
     if map_problem.rig is not None and EXTRINSICS in states.blocks:
-        sensors = with_cameras(sensors, map_problem.rig, states)
-    sensors = with_imus(sensors, map_problem.factors.imus, states)
-    sensors = with_wheels(sensors, map_problem.factors.wheels, states)
+        sensors = calibration_states.with_cameras(sensors, map_problem.rig, states)
+    sensors = calibration_states.with_imus(sensors, map_problem.factors.imus, states)
+    sensors = calibration_states.with_wheels(sensors, map_problem.factors.wheels, states)
     return map_problem.factors.mounted.written(sensors, states)
 
 

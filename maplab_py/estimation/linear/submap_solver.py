@@ -15,14 +15,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.linear import supernodal
-from maplab_py.estimation.linear.block_storage import (
-    BlockLayout,
-    add_blocks,
-    layout_of_panels,
-    panel_places,
-    project_panels,
-)
+from maplab_py.estimation.linear import block_storage, supernodal
 from maplab_py.estimation.linear.dense_kernels import Blas
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern
@@ -303,9 +296,9 @@ class SubmapCholesky:
             )
         require_memory(held, f"the largest submap of {num_nodes * node_size} unknowns")
         self.numbers = np.empty(self.submaps.room)
-        position, column_start, leading = layout_of_panels(self.plan)
+        position, column_start, leading = block_storage.layout_of_panels(self.plan)
         shift = self.submaps.offset - self.plan.panel_start[self.submaps.start[:-1]]
-        self.layout = BlockLayout(
+        self.layout = block_storage.BlockLayout(
             node_size, position, column_start + shift[self.node_part], leading
         )
         self._begins = [self.submaps.begins_with(part) for part in range(len(self.submaps))]
@@ -316,7 +309,7 @@ class SubmapCholesky:
 
     def places(self, rows: I32, cols: I32) -> I32:
         """Return what `add` needs to know about blocks (B,) of the pattern."""
-        return np.asarray(panel_places(self.plan, self.layout.position, rows, cols))
+        return np.asarray(block_storage.panel_places(self.plan, self.layout.position, rows, cols))
 
     def start(self) -> None:
         """Set the right side to zero; parts are when they are selected."""
@@ -345,7 +338,7 @@ class SubmapCholesky:
 
     def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
         """Add blocks (B, d, d) at block rows and columns (B,) of the selected part."""
-        add_blocks(self.layout, rows, cols, places, values, self.numbers)
+        block_storage.add_blocks(self.layout, rows, cols, places, values, self.numbers)
 
     def add_to_diagonal(self, nodes: I64, added: F64) -> None:
         """Add numbers (k, d) to the diagonal at nodes (k,) of the selected part."""
@@ -363,7 +356,9 @@ class SubmapCholesky:
     def project(self, is_restricted: Mask, projector: F64, size: F64) -> None:
         """Turn the selected part A into P A P + s (I - P); see `project_panels`."""
         inner = self.submaps.range_of(self._selected)
-        project_panels(self._placed, is_restricted, projector, size, self.numbers, *inner)
+        block_storage.project_panels(
+            self._placed, is_restricted, projector, size, self.numbers, *inner
+        )
 
     def eliminate(self) -> None:
         """Eliminate the selected part: the separators above get what it leaves, the file its factor.

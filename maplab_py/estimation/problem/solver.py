@@ -13,13 +13,8 @@ import numpy as np
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.problem import trust_region
 from maplab_py.estimation.problem.protocol import L, LeastSquares, S, Step
-from maplab_py.estimation.problem.trust_region import (
-    Decreases,
-    Schedule,
-    StepJudge,
-    TrustRegion,
-)
 from maplab_py.estimation.states import States
 from maplab_py.progress import Progress
 
@@ -42,7 +37,7 @@ class SolverOptions:
     parameter_tolerance: float = 1e-8
     forecast_tolerance: float = 0.0  # share of the cost that all further steps may save
     slow_ratio: float = 1.0  # stop when decreases shrink by no more than that; 1 = go on
-    schedule: Schedule = Schedule.STEP_QUALITY
+    schedule: trust_region.Schedule = trust_region.Schedule.STEP_QUALITY
     max_uphill_steps: int = 0  # consecutive steps that may raise the cost
 
 
@@ -70,13 +65,13 @@ class _Run(Generic[S, L]):
 
     def __init__(self, problem: LeastSquares[S, L], states: S, options: SolverOptions) -> None:
         self.problem, self.states, self.options = problem, states, options
-        self.region = TrustRegion(
+        self.region = trust_region.TrustRegion(
             options.initial_radius, options.min_radius, options.max_radius, options.schedule
         )
-        self.decreases = Decreases()
+        self.decreases = trust_region.Decreases()
         self.recent: deque[float] = deque(maxlen=_RECENT_STEPS)
         self.linearize()
-        self.judge = StepJudge(self.cost, options.max_uphill_steps)
+        self.judge = trust_region.StepJudge(self.cost, options.max_uphill_steps)
         self.best, self.best_cost = states, self.cost
         self.rejected = 0
         self.singular: list[int] = []
@@ -120,7 +115,7 @@ class _Run(Generic[S, L]):
     def problem_changed(self) -> None:
         """Forget earlier costs: those before and after the change cannot be compared."""
         self.judge.restart(self.cost)
-        self.decreases = Decreases()
+        self.decreases = trust_region.Decreases()
         self.best, self.best_cost = self.states, self.cost
 
     def cost_corrected(self, cost_before: float) -> None:

@@ -11,19 +11,14 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
+from maplab_py.estimation.kernels import visual_arguments
 from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
-from maplab_py.estimation.kernels.visual_arguments import (
-    VisualData,
-    VisualRule,
-    VisualStates,
-    VisualSums,
-    VisualTarget,
-)
 from maplab_py.estimation.linear.assembled import BlockPlaces, BlockSums
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.states import NODES_PER_VERTEX, States
+from maplab_py.estimation.terms import visual_structure
 from maplab_py.estimation.terms.cameras import (
     EXTRINSICS,
     INTRINSICS,
@@ -33,11 +28,6 @@ from maplab_py.estimation.terms.cameras import (
     border_values,
     camera_nodes,
     pixel_delay_s,
-)
-from maplab_py.estimation.terms.visual_structure import (
-    EliminationPlan,
-    elimination_plan,
-    landmark_chunks,
 )
 from maplab_py.geometry import se3
 from maplab_py.vimap.table import starts_of_counts
@@ -78,7 +68,7 @@ class Observations:
 class VisualPlaces:
     """Places of the blocks of the visual terms in a solver's storage."""
 
-    target: VisualTarget
+    target: visual_arguments.VisualTarget
     border: BlockPlaces | None  # of cameras that are estimated
 
 
@@ -131,7 +121,7 @@ class VisualTerms:
         self._prior = np.zeros((count, 4)) if landmark_prior is None else landmark_prior
         self.observations = observations
         self.num_vertices = num_vertices
-        self.chunk_start = landmark_chunks(observations.start)
+        self.chunk_start = visual_structure.landmark_chunks(observations.start)
         self.estimates_cameras = estimate_cameras or estimate_line_delays
         self._estimates_line_delays = estimate_line_delays
         self._uv_motion = self._no_motion() if self.estimates_cameras else np.zeros((0, 2))
@@ -139,14 +129,14 @@ class VisualTerms:
         self._known_delay_s: F64 | None = None
 
     @cached_property
-    def plan(self) -> EliminationPlan:
+    def plan(self) -> visual_structure.EliminationPlan:
         """Blocks of the reduced system, which only solvers that form it need.
 
         Raises:
             NotEnoughMemory: It does not fit.
         """
         data = self.observations
-        return elimination_plan(data.start, data.vertex, self.num_vertices)
+        return visual_structure.elimination_plan(data.start, data.vertex, self.num_vertices)
 
     def forget_plan(self) -> None:
         """Give back the memory of the plan, which is made again when somebody needs it."""
@@ -158,7 +148,7 @@ class VisualTerms:
         rows: I64,
         vertex: I32,
         num_vertices: int,
-        plan: EliminationPlan | None,
+        plan: visual_structure.EliminationPlan | None,
     ) -> VisualTerms:
         """Return the terms of some landmarks over the vertices that see them, numbered anew.
 
@@ -193,9 +183,11 @@ class VisualTerms:
         return np.empty((self.plan.largest_slab, 3, 6))
 
     @cached_property
-    def _sums(self) -> VisualSums:
+    def _sums(self) -> visual_arguments.VisualSums:
         width = camera_columns(self._cameras.parameters.shape[1] - 1) * self.estimates_cameras
-        return VisualSums.zeros(self.num_chunks, self.num_vertices, len(self._cameras.T_I_C), width)
+        return visual_arguments.VisualSums.zeros(
+            self.num_chunks, self.num_vertices, len(self._cameras.T_I_C), width
+        )
 
     @property
     def num_chunks(self) -> int:
@@ -258,7 +250,7 @@ class VisualTerms:
             part = slice(first, first + _BLOCKS_AT_ONCE)
             parts.append(solver.places(*node_blocks(rows[part], cols[part])))
         layout = solver.layout
-        target = VisualTarget(
+        target = visual_arguments.VisualTarget(
             NODES_PER_VERTEX, np.concatenate(parts), layout.position, layout.column_start,
             layout.leading,
         )  # fmt: skip
@@ -343,11 +335,11 @@ class VisualTerms:
         off = (states.p_G - self._prior[:, :3]) * self._prior[:, 3:]
         return 0.5 * (total + float(np.sum(off * off)))
 
-    def _data(self) -> VisualData:
+    def _data(self) -> visual_arguments.VisualData:
         data, uv_px = self.observations, self.observations.uv_px
         if self._known_delay_s is not None:
             uv_px = uv_px - self._uv_motion[:, :2] * self._known_delay_s[:, None]
-        return VisualData(
+        return visual_arguments.VisualData(
             data.start,
             data.vertex,
             data.camera,
@@ -357,7 +349,7 @@ class VisualTerms:
             self._uv_motion,
         )
 
-    def _at(self, states: States) -> VisualStates:
+    def _at(self, states: States) -> visual_arguments.VisualStates:
         T_I_C, parameters = self._cameras.T_I_C, self._cameras.parameters
         timing_s = np.zeros((len(T_I_C), 1))
         if self.estimates_cameras:
@@ -365,10 +357,10 @@ class VisualTerms:
             T_I_C = np.ascontiguousarray(blocks[EXTRINSICS].values)
             parameters = np.concatenate([parameters[:, :1], blocks[INTRINSICS].values], axis=1)
             timing_s = blocks[TIMING].values
-        return VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, timing_s)
+        return visual_arguments.VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, timing_s)
 
-    def _rule(self, damping: float) -> VisualRule:
-        return VisualRule(int(self.loss), float(damping), self.moves_points)
+    def _rule(self, damping: float) -> visual_arguments.VisualRule:
+        return visual_arguments.VisualRule(int(self.loss), float(damping), self.moves_points)
 
 
 def node_blocks(rows: I32, cols: I32) -> tuple[I32, I32]:

@@ -10,35 +10,12 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
+from maplab_py.interop.bags import sensor_messages
 from maplab_py.interop.bags.options import BagExportOptions
 from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
 from maplab_py.interop.bags.reports import BagReport, written_topics
-from maplab_py.interop.bags.sensor_messages import (
-    CAMERA_INFO,
-    CLOUD,
-    IMAGE,
-    PATH,
-    MessageMaker,
-    has_camera_info,
-)
 from maplab_py.interop.ply import parse_ply
-from maplab_py.interop.recordings.bag_layouts import (
-    imu_messages,
-    odometry_messages,
-    pose_messages,
-    tf_messages,
-)
-from maplab_py.interop.recordings.bag_writing import (
-    BagFormat,
-    BagMessage,
-    Channel,
-    check_bag_writable,
-    format_of_path,
-    in_order,
-    messages_of_topic,
-    watched,
-    write_bag,
-)
+from maplab_py.interop.recordings import bag_layouts, bag_writing
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
@@ -57,7 +34,7 @@ class MessageStream:
 
     topic: str
     count: int
-    messages: Iterator[BagMessage]
+    messages: Iterator[bag_writing.BagMessage]
 
 
 def export_bag(
@@ -90,8 +67,8 @@ def export_bag(
     """
     options = options or BagExportOptions()
     contents = options.contents
-    kind = format_of_path(path, options.format)
-    check_bag_writable(path, kind, overwrite=overwrite)
+    kind = bag_writing.format_of_path(path, options.format)
+    bag_writing.check_bag_writable(path, kind, overwrite=overwrite)
     export = MissionStreams(vi_map, map_folder, mission, kind, options)
     parts: dict[str, Callable[[], list[MessageStream]]] = {
         "poses": export.poses,
@@ -113,8 +90,10 @@ def export_bag(
     if not streams:
         raise UserError(f"the mission has none of {', '.join(contents)}: choose by --bag_content")
     total = sum(stream.count for stream in streams)
-    messages = watched(in_order(*(stream.messages for stream in streams)), total, progress)
-    counts = write_bag(path, kind, messages, overwrite=overwrite)
+    messages = bag_writing.watched(
+        bag_writing.in_order(*(stream.messages for stream in streams)), total, progress
+    )
+    counts = bag_writing.write_bag(path, kind, messages, overwrite=overwrite)
     return BagReport(
         bag=path,
         format=kind.value,
@@ -134,13 +113,13 @@ class MissionStreams:
         vi_map: VIMap,
         map_folder: Path,
         mission: int,
-        kind: BagFormat,
+        kind: bag_writing.BagFormat,
         options: BagExportOptions,
     ) -> None:
         self._map, self._mission, self._options = vi_map, mission, options
         self._is_ros_2 = kind.is_ros_2
         self._store = ResourceStore(vi_map, map_folder)
-        self._maker = MessageMaker(is_ros_2=kind.is_ros_2)
+        self._maker = sensor_messages.MessageMaker(is_ros_2=kind.is_ros_2)
         start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
         self._vertices = slice(start, stop)
         self._times_ns: I64 = vi_map.vertices.timestamp_ns[start:stop]
@@ -151,7 +130,7 @@ class MissionStreams:
 
     def poses(self) -> list[MessageStream]:
         """Poses T_G_I."""
-        rows = pose_messages(
+        rows = bag_layouts.pose_messages(
             self._times_ns,
             self._map.T_G_I[self._vertices],
             self._options.world_frame,
@@ -165,12 +144,12 @@ class MissionStreams:
             return []
         T_G_I = self._map.T_G_I[self._vertices]
         row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
-        return [self._fixed("/path", PATH, self._times_ns[-1:], [row])]
+        return [self._fixed("/path", sensor_messages.PATH, self._times_ns[-1:], [row])]
 
     def odometry(self) -> list[MessageStream]:
         """Poses T_M_I with velocities."""
         table = self._map.vertices
-        rows = odometry_messages(
+        rows = bag_layouts.odometry_messages(
             self._times_ns,
             table.T_M_I[self._vertices],
             table.v_M[self._vertices],
@@ -192,7 +171,7 @@ class MissionStreams:
         for camera in range(len(self._cameras)):
             T_I_C = self._map.sensors.T_I_S(self._imu_id, self._cameras[camera].id)
             tree.append((_repeated(T_I_C, count), (names.base_frame, f"cam{camera}")))
-        rows = tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
+        rows = bag_layouts.tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
         return [self._fixed(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
 
     def imu(self) -> list[MessageStream]:
@@ -202,7 +181,7 @@ class MissionStreams:
         rows = mission_sample_rows(self._map, self._mission)
         times_ns = self._map.imu_samples.timestamp_ns[rows]
         samples = self._map.imu_samples.accel_gyro[rows]
-        messages = imu_messages(
+        messages = bag_layouts.imu_messages(
             times_ns, samples, self._options.base_frame, is_ros_2=self._is_ros_2
         )
         topic = _absolute(self._map.sensors.imu(self._imu_id).topic or "imu0")
@@ -223,11 +202,13 @@ class MissionStreams:
             is_raw = kinds == IMAGES
             topic = _absolute((is_raw and camera.topic) or f"cam{index}/{name}")
             stamps = times_ns - camera.time_offset_ns
-            images = self._resource_messages(rows, times_ns, stamps, Channel(topic, IMAGE), index)
+            images = self._resource_messages(
+                rows, times_ns, stamps, bag_writing.Channel(topic, sensor_messages.IMAGE), index
+            )
             streams.append(MessageStream(topic, len(rows), images))
-            if is_raw and has_camera_info(camera):
+            if is_raw and sensor_messages.has_camera_info(camera):
                 info = f"/cam{index}/camera_info"
-                channel = Channel(info, CAMERA_INFO)
+                channel = bag_writing.Channel(info, sensor_messages.CAMERA_INFO)
                 infos = self._camera_infos(times_ns, stamps, channel, index)
                 streams.append(MessageStream(info, len(rows), infos))
             elif is_raw and len(rows):
@@ -245,36 +226,42 @@ class MissionStreams:
             mine = mine[np.argsort(table.timestamp_ns[mine], kind="stable")]
             sensor = vi_map.sensors.sensors.get(to_hex(sensor_id))
             topic = _absolute(getattr(sensor, "topic", "") or f"points{number}")
-            messages = self._clouds_of(mine, Channel(topic, CLOUD), f"lidar{number}")
+            messages = self._clouds_of(
+                mine, bag_writing.Channel(topic, sensor_messages.CLOUD), f"lidar{number}"
+            )
             streams.append(MessageStream(topic, len(mine), messages))
         return streams
 
-    def _clouds_of(self, rows: I64, channel: Channel, frame: str) -> Iterator[BagMessage]:
+    def _clouds_of(
+        self, rows: I64, channel: bag_writing.Channel, frame: str
+    ) -> Iterator[bag_writing.BagMessage]:
         times = self._map.resources.timestamp_ns[rows]
         for row, time_ns in zip(rows.tolist(), times.tolist(), strict=True):
             name = f"resource {to_hex(self._map.resources.id[row])}"
             cloud = parse_ply(self._store.load(row), name)
-            yield BagMessage(time_ns, channel, self._maker.cloud(time_ns, frame, cloud))
+            yield bag_writing.BagMessage(time_ns, channel, self._maker.cloud(time_ns, frame, cloud))
 
     def _resource_messages(
-        self, rows: I64, times_ns: I64, stamps_ns: I64, channel: Channel, camera: int
-    ) -> Iterator[BagMessage]:
+        self, rows: I64, times_ns: I64, stamps_ns: I64, channel: bag_writing.Channel, camera: int
+    ) -> Iterator[bag_writing.BagMessage]:
         for row, time_ns, stamp_ns in zip(
             rows.tolist(), times_ns.tolist(), stamps_ns.tolist(), strict=True
         ):
             data = self._maker.image(stamp_ns, f"cam{camera}", self._store.load(row))
-            yield BagMessage(time_ns, channel, data)
+            yield bag_writing.BagMessage(time_ns, channel, data)
 
     def _camera_infos(
-        self, times_ns: I64, stamps_ns: I64, channel: Channel, camera: int
-    ) -> Iterator[BagMessage]:
+        self, times_ns: I64, stamps_ns: I64, channel: bag_writing.Channel, camera: int
+    ) -> Iterator[bag_writing.BagMessage]:
         for time_ns, stamp_ns in zip(times_ns.tolist(), stamps_ns.tolist(), strict=True):
             model = self._cameras[camera]
             data = self._maker.camera_info(stamp_ns, f"cam{camera}", model)
-            yield BagMessage(time_ns, channel, data)
+            yield bag_writing.BagMessage(time_ns, channel, data)
 
     def _fixed(self, topic: str, kind: str, times_ns: I64, rows: list[bytes]) -> MessageStream:
-        return MessageStream(topic, len(rows), messages_of_topic(times_ns, topic, kind, rows))
+        return MessageStream(
+            topic, len(rows), bag_writing.messages_of_topic(times_ns, topic, kind, rows)
+        )
 
 
 def _repeated(T_A_B: F64, count: int) -> F64:

@@ -16,14 +16,7 @@ from maplab_py.interop.bags.options import BagImportOptions
 from maplab_py.interop.bags.reports import BagImport
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
-from maplab_py.interop.recordings.bag_files import (
-    all_messages,
-    check_bag,
-    header_stamp_ns,
-    listed_topics,
-    opened_bag,
-    topic_types,
-)
+from maplab_py.interop.recordings import bag_files
 from maplab_py.interop.recordings.images import (
     EncodedImage,
     camera_bits,
@@ -31,21 +24,9 @@ from maplab_py.interop.recordings.images import (
     image_of_message,
 )
 from maplab_py.interop.recordings.protocol import CameraImage
+from maplab_py.interop.resources import matching, point_clouds
 from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
-from maplab_py.interop.resources.matching import (
-    MS_TO_NS,
-    camera_frames,
-    frames_without,
-    matched_files,
-    mission_rig,
-)
-from maplab_py.interop.resources.point_clouds import (
-    add_clouds,
-    chosen_sensor,
-    cloud_times_ns,
-    empty_clouds_note,
-)
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import back_project, project
@@ -221,8 +202,8 @@ def import_bag_resources(
             camera, or no message belongs to the mission.
         MapError: The bag or a message is damaged, or stamps run backwards.
     """
-    check_bag(path, "--rosbag_path")
-    with opened_bag(path) as reader:
+    bag_files.check_bag(path, "--rosbag_path")
+    with bag_files.opened_bag(path) as reader:
         topic = _opened_topic(path, reader, options.resource_topic)
         if topic.type == CLOUD:
             if options.camera_calibration_topic:
@@ -234,10 +215,11 @@ def import_bag_resources(
 
 
 def _opened_topic(path: Path, reader: BagReader, asked: str) -> _Topic:
-    types = topic_types(reader)
+    types = bag_files.topic_types(reader)
     topic = _name_in_bag(path, types, asked, "--resource_topic", (IMAGE, COMPRESSED, CLOUD))
     stamps = [
-        header_stamp_ns(data, is_ros_2=reader.is2) for _, data in _messages(path, reader, topic)
+        bag_files.header_stamp_ns(data, is_ros_2=reader.is2)
+        for _, data in _messages(path, reader, topic)
     ]
     stamps_ns = np.array(stamps, dtype=np.int64)
     if not len(stamps_ns):
@@ -259,7 +241,9 @@ def _name_in_bag(
     Raises:
         UserError: It is not given, not there, or of another type.
     """
-    usable = listed_topics({topic: kind for topic, kind in types.items() if kind in wanted})
+    usable = bag_files.listed_topics(
+        {topic: kind for topic, kind in types.items() if kind in wanted}
+    )
     topic = next((t for t in types if asked and t.strip("/") == asked.strip("/")), None)
     if topic is None:
         problem = f"there is no topic {asked}" if asked else "no topic is given"
@@ -274,26 +258,26 @@ def _name_in_bag(
 
 def _messages(path: Path, reader: BagReader, topic: str) -> Iterator[tuple[str, bytes]]:
     connections = [c for c in reader.connections if c.topic == topic]
-    for connection, _, data in all_messages(path, reader, connections):
+    for connection, _, data in bag_files.all_messages(path, reader, connections):
         yield connection.msgtype, data
 
 
 def _import_images(
     vi_map: VIMap, mission: int, topic: _Topic, options: BagImportOptions, progress: Progress
 ) -> tuple[VIMap, BagImport]:
-    cameras = mission_rig(vi_map, mission).cameras
+    cameras = matching.mission_rig(vi_map, mission).cameras
     index = _camera_index(cameras, topic, options.camera)
     camera = cameras[index]
     difference_px = _calibration_difference(topic, options, camera)
     _, first = next(topic.chosen(np.array([0])))
     is_depth = _is_depth(first)
-    frames = camera_frames(vi_map, mission, index)
+    frames = matching.camera_frames(vi_map, mission, index)
     kinds = (RAW_DEPTH_MAPS,) if is_depth else (RAW_GREY, RAW_COLOUR)
-    wanted = frames_without(vi_map, frames, kinds)
-    matches = matched_files(
+    wanted = matching.frames_without(vi_map, frames, kinds)
+    matches = matching.matched_files(
         vi_map.frames.timestamp_ns[wanted],
         topic.stamps_ns + camera.time_offset_ns + options.resource_time_offset_ns,
-        round(options.image_tolerance_ms * MS_TO_NS),
+        round(options.image_tolerance_ms * matching.MS_TO_NS),
     )
     owners, numbers = wanted[matches >= 0], matches[matches >= 0]
     if not len(owners) and len(wanted) == len(frames):
@@ -349,7 +333,7 @@ def _calibration_difference(
     asked, flag = options.camera_calibration_topic, "--camera_calibration_topic"
     if not asked:
         return None
-    types = topic_types(topic.reader)
+    types = bag_files.topic_types(topic.reader)
     name = _name_in_bag(topic.path, types, asked, flag, (CAMERA_INFO,))
     for type_, data in _messages(topic.path, topic.reader, name):
         message = topic.reader.deserialize(data, type_)
@@ -408,7 +392,7 @@ def _depth_m(message: Any, name: str, camera: Camera) -> F32:
 def _import_clouds(
     vi_map: VIMap, mission: int, topic: _Topic, options: BagImportOptions, progress: Progress
 ) -> tuple[VIMap, BagImport]:
-    sensor = chosen_sensor(vi_map, mission, options.sensor_id)
+    sensor = point_clouds.chosen_sensor(vi_map, mission, options.sensor_id)
     times_ns = topic.stamps_ns + options.resource_time_offset_ns
     first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
     inside = (times_ns >= first_ns) & (times_ns <= last_ns)
@@ -417,9 +401,11 @@ def _import_clouds(
             f"{topic.name}: no stamp is within the mission, which goes from {first_ns} to {last_ns} ns:"
             " check --resource_time_offset_ns and --map_mission"
         )
-    chosen = np.flatnonzero(inside & ~np.isin(times_ns, cloud_times_ns(vi_map, sensor)))
+    chosen = np.flatnonzero(
+        inside & ~np.isin(times_ns, point_clouds.cloud_times_ns(vi_map, sensor))
+    )
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    chosen, empty = add_clouds(
+    chosen, empty = point_clouds.add_clouds(
         new,
         chosen,
         (
@@ -447,7 +433,7 @@ def _import_clouds(
         attached=len(chosen),
         had_some=int(np.count_nonzero(inside)) - len(chosen) - empty,
         messages_outside_mission=int(np.count_nonzero(~inside)),
-        notes=empty_clouds_note(empty),
+        notes=point_clouds.empty_clouds_note(empty),
     )
 
 

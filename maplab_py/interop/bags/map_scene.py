@@ -13,15 +13,8 @@ from maplab_py.interop.bags.options import BagExportOptions
 from maplab_py.interop.bags.reports import BagReport, written_topics
 from maplab_py.interop.bags.sensor_messages import CLOUD, LINES, PATH, MessageMaker
 from maplab_py.interop.ply import PlyCloud
+from maplab_py.interop.recordings import bag_writing
 from maplab_py.interop.recordings.bag_layouts import pose_messages
-from maplab_py.interop.recordings.bag_writing import (
-    BagFormat,
-    check_bag_writable,
-    in_order,
-    messages_of_topic,
-    watched,
-    write_bag,
-)
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.queries import mission_labels
@@ -58,7 +51,7 @@ def export_mcap(
     """
     if not len(vi_map.vertices):
         raise UserError("the map has no vertices: there is nothing to show")
-    check_bag_writable(path, BagFormat.MCAP, overwrite=overwrite)
+    bag_writing.check_bag_writable(path, bag_writing.BagFormat.MCAP, overwrite=overwrite)
     maker = MessageMaker(is_ros_2=True)
     begin_ns = int(vi_map.vertices.timestamp_ns.min())
     streams = [*_landmarks(vi_map, maker, begin_ns), *_closures(vi_map, maker, begin_ns)]
@@ -66,14 +59,16 @@ def export_mcap(
         streams += _mission(vi_map, maker, mission, label, begin_ns)
         if images:
             options = BagExportOptions()
-            parts = MissionStreams(vi_map, map_folder, mission, BagFormat.MCAP, options)
+            parts = MissionStreams(vi_map, map_folder, mission, bag_writing.BagFormat.MCAP, options)
             streams += [s for s in parts.images(IMAGES, "image_raw") if s.count]
     total = sum(stream.count for stream in streams)
-    messages = watched(in_order(*(stream.messages for stream in streams)), total, progress)
-    counts = write_bag(path, BagFormat.MCAP, messages, overwrite=overwrite)
+    messages = bag_writing.watched(
+        bag_writing.in_order(*(stream.messages for stream in streams)), total, progress
+    )
+    counts = bag_writing.write_bag(path, bag_writing.BagFormat.MCAP, messages, overwrite=overwrite)
     return BagReport(
         bag=path,
-        format=BagFormat.MCAP.value,
+        format=bag_writing.BagFormat.MCAP.value,
         missions=tuple(mission_labels(vi_map)),
         messages=total,
         copied_messages=0,
@@ -114,10 +109,12 @@ def _mission(
     path = maker.path(times_ns, T_G_I, _FRAME)
     return [
         _single(f"/mission_{name}/path", PATH, begin_ns, path),
-        MessageStream(topic, len(poses), messages_of_topic(times_ns, topic, _POSE, poses)),
+        MessageStream(
+            topic, len(poses), bag_writing.messages_of_topic(times_ns, topic, _POSE, poses)
+        ),
     ]
 
 
 def _single(topic: str, kind: str, time_ns: int, row: bytes) -> MessageStream:
     times_ns = np.array([time_ns], dtype=np.int64)
-    return MessageStream(topic, 1, messages_of_topic(times_ns, topic, kind, [row]))
+    return MessageStream(topic, 1, bag_writing.messages_of_topic(times_ns, topic, kind, [row]))

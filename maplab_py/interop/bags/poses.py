@@ -14,21 +14,9 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.bags.options import PoseToBagOptions
 from maplab_py.interop.bags.reports import BagReport, written_topics
+from maplab_py.interop.recordings import bag_writing
 from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
 from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages
-from maplab_py.interop.recordings.bag_writing import (
-    BagFormat,
-    BagMessage,
-    Channel,
-    channel_of,
-    check_bag_writable,
-    format_of_bag,
-    format_of_path,
-    in_order,
-    messages_of_bag,
-    watched,
-    write_bag,
-)
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
@@ -87,25 +75,25 @@ def add_poses_to_bag(
     check_bag(source, "--rosbag_plugin_input_bag")
     if target.exists() and target.resolve() == source.resolve():
         raise UserError(f"--rosbag_plugin_output_bag={target} is the input: name another bag")
-    kind = format_of_bag(source)
-    format_of_path(target, kind.value)
-    check_bag_writable(target, kind, overwrite=overwrite)
+    kind = bag_writing.format_of_bag(source)
+    bag_writing.format_of_path(target, kind.value)
+    bag_writing.check_bag_writable(target, kind, overwrite=overwrite)
     poses = [*_mission_poses(vi_map, missions, options)]
     if not poses:
         raise UserError("the missions have no vertices: there are no poses to add")
     dropped = (TF_TOPIC,) if options.drop_tf else ()
     with opened_bag(source) as reader:
-        present = {(c.topic, c.msgtype): channel_of(c) for c in reader.connections}
+        present = {(c.topic, c.msgtype): bag_writing.channel_of(c) for c in reader.connections}
         _check_types(source, present, poses, options, kind)
         added = [_added(entry, options, kind, present) for entry in poses]
         total = reader.message_count + sum(len(entry.times_ns) for entry in poses)
         copied = Counter[str]()
-        counts = write_bag(
+        counts = bag_writing.write_bag(
             target,
             kind,
-            watched(
-                in_order(
-                    _counted(messages_of_bag(source, reader, without=dropped), copied),
+            bag_writing.watched(
+                bag_writing.in_order(
+                    _counted(bag_writing.messages_of_bag(source, reader, without=dropped), copied),
                     *(stream for streams in added for stream in streams),
                 ),
                 total,
@@ -158,9 +146,9 @@ def _mission_poses(
 def _added(
     poses: MissionPoses,
     options: PoseToBagOptions,
-    kind: BagFormat,
-    present: dict[tuple[str, str], Channel],
-) -> list[Iterator[BagMessage]]:
+    kind: bag_writing.BagFormat,
+    present: dict[tuple[str, str], bag_writing.Channel],
+) -> list[Iterator[bag_writing.BagMessage]]:
     """Return the streams of messages of a mission; topics that the bag has go on in their channel."""
     world, odom, base = poses.frames
     T_G_M, T_M_I = poses.T_G_Ms, poses.T_M_I
@@ -179,29 +167,31 @@ def _added(
         streams.append((TF_TOPIC, TF_TYPE, rows))
     times = poses.times_ns.tolist()
     return [
-        _in_channel(times, present.get((topic, type_), Channel(topic, type_)), rows)
+        _in_channel(times, present.get((topic, type_), bag_writing.Channel(topic, type_)), rows)
         for topic, type_, rows in streams
     ]
 
 
-def _in_channel(times_ns: list[int], channel: Channel, rows: list[bytes]) -> Iterator[BagMessage]:
+def _in_channel(
+    times_ns: list[int], channel: bag_writing.Channel, rows: list[bytes]
+) -> Iterator[bag_writing.BagMessage]:
     for time_ns, data in zip(times_ns, rows, strict=True):
-        yield BagMessage(time_ns, channel, data)
+        yield bag_writing.BagMessage(time_ns, channel, data)
 
 
 def _check_types(
     source: Path,
-    present: dict[tuple[str, str], Channel],
+    present: dict[tuple[str, str], bag_writing.Channel],
     poses: list[MissionPoses],
     options: PoseToBagOptions,
-    kind: BagFormat,
+    kind: bag_writing.BagFormat,
 ) -> None:
     """Refuse a bag whose topics of the same names have other types.
 
     ROS 1 knows the transforms of /tf under an older name of their type, too.
     """
     added = {TF_TOPIC: {TF_TYPE}} if options.add_tf and not options.drop_tf else {}
-    if kind is BagFormat.ROS1 and added:
+    if kind is bag_writing.BagFormat.ROS1 and added:
         added[TF_TOPIC].add("tf/msg/tfMessage")
     if options.add_transform_stamped:
         names = ("T_G_I", "T_M_I", "T_G_M")
@@ -215,7 +205,9 @@ def _check_types(
             )
 
 
-def _counted(messages: Iterator[BagMessage], counts: Counter[str]) -> Iterator[BagMessage]:
+def _counted(
+    messages: Iterator[bag_writing.BagMessage], counts: Counter[str]
+) -> Iterator[bag_writing.BagMessage]:
     for message in messages:
         counts[message.channel.topic] += 1
         yield message

@@ -11,14 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.errors import MapError
+from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.kalibr import read_camera_chain, read_kalibr_imu
-from maplab_py.interop.calibrations.models import (
-    KALIBR_NOISE,
-    note_line_delays,
-    read_camera,
-    read_imu,
-    read_time_shift_ns,
-)
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry, with_imu
 from maplab_py.sensors.yaml_entry import Entry
 
@@ -42,10 +36,10 @@ def read_camera_file(entry: Entry) -> Parts:
     key = "distortion_coefficients"
     if key not in entry and "distortion_coeffs" in entry:
         key = "distortion_coeffs"
-    camera = read_camera(entry, key, description=entry.text("comment"))
+    camera = models.read_camera(entry, key, description=entry.text("comment"))
     T_B_C = entry.pose("T_BS")[None]
     form = "Kimera" if "camera_id" in entry else "EuRoC"
-    notes = note_line_delays(entry, [camera])
+    notes = models.note_line_delays(entry, [camera])
     notes += note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION, settings=form == "Kimera")
     return Parts(form, [camera], T_B_C, is_on_body=True, notes=notes)
 
@@ -56,15 +50,15 @@ def read_imu_file(entry: Entry) -> Parts:
     Raises:
         MapError: A key is missing or wrong.
     """
-    imu = read_imu(
-        entry, KALIBR_NOISE, description=entry.text("comment"), topic=entry.text("rostopic")
+    imu = models.read_imu(
+        entry, models.KALIBR_NOISE, description=entry.text("comment"), topic=entry.text("rostopic")
     )
     T_B_I = entry.pose("T_BS")
     is_kimera = "imu_preintegration_type" in entry or "n_gravity" in entry
     if "n_gravity" in entry:
         gravity = float(np.linalg.norm(entry.vector("n_gravity", 3)))
         imu = dataclasses.replace(imu, gravity_magnitude_mps2=gravity or imu.gravity_magnitude_mps2)
-    shift_ns = read_time_shift_ns(entry, "imu_time_shift")
+    shift_ns = models.read_time_shift_ns(entry, "imu_time_shift")
     notes = note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION, settings=is_kimera)
     form = "Kimera" if is_kimera else "EuRoC"
     return Parts(form, imu=imu, T_B_I=T_B_I, is_on_body=True, time_shift_ns=shift_ns, notes=notes)

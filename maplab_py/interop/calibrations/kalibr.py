@@ -15,12 +15,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibrations.models import (
-    KALIBR_NOISE,
-    note_line_delays,
-    read_camera,
-    read_imu,
-)
+from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, compare_poses, note_unknown_keys
 from maplab_py.sensors import Camera, Imu, ImuIntrinsics
 from maplab_py.sensors.yaml_entry import Entry
@@ -56,7 +51,7 @@ def read_camera_chain(entry: Entry, form: str = "kalibr") -> Parts:
     why = ""
     for number in numbers:
         part = entry.child(f"cam{number}")
-        cameras.append(read_camera(part, "distortion_coeffs"))
+        cameras.append(models.read_camera(part, "distortion_coeffs"))
         given = _given_poses(part, T_cam_B)
         if number and not given:
             raise MapError(f"{part.where}: {_NO_IMU_POSE}")
@@ -68,7 +63,7 @@ def read_camera_chain(entry: Entry, form: str = "kalibr") -> Parts:
         T_cam_B.append(given[0][1])
         notes += compare_poses(part.where, given)
     poses = np.stack(T_cam_B)
-    notes += _compare_pairs(entry, poses) + note_line_delays(entry, cameras)
+    notes += _compare_pairs(entry, poses) + models.note_line_delays(entry, cameras)
     notes += note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION)
     if why:  # the body is the first camera
         poses = se3.compose(poses, se3.inverse(poses[0]))
@@ -125,7 +120,7 @@ def read_kalibr_imu(top: Entry, form: str = "kalibr") -> Parts:
         raise MapError(f"{entry.where}: key 'T_i_b' of the only IMU must be the identity")
     if abs(entry.number("time_offset", 0.0)) > 0.0:
         raise MapError(f"{entry.where}: key 'time_offset' of the only IMU must be 0")
-    imu = read_imu(entry, KALIBR_NOISE, topic=entry.text("rostopic"))
+    imu = models.read_imu(entry, models.KALIBR_NOISE, topic=entry.text("rostopic"))
     imu, T_I_i = with_measurement_matrices(imu, *_measurement_matrices(entry))
     notes = note_unknown_keys(top, (*_NOT_OF_THE_CALIBRATION, "integration_sigma"))
     return Parts(form, imu=imu, T_B_I=se3.inverse(T_I_i), notes=notes)

@@ -12,12 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from maplab_py.errors import MapError
-from maplab_py.interop.calibrations.models import (
-    make_camera,
-    note_line_delays,
-    read_imu,
-    read_time_shift_ns,
-)
+from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
 from maplab_py.sensors import Camera
 from maplab_py.sensors.yaml_entry import Entry
@@ -64,19 +59,19 @@ def read_okvis(entry: Entry) -> Parts:
         terms = part.numbers("distortion_coefficients") if has_terms else np.zeros(0)
         pinhole = np.concatenate([focal, centre])
         names = ("cam_model", "pinhole"), ("distortion_type", distortion)
-        cameras.append(make_camera(part, *names, pinhole, terms, size))
+        cameras.append(models.make_camera(part, *names, pinhole, terms, size))
         poses.append(part.pose("T_SC"))
     shift_ns = 0
     for key in ("camera_parameters", "camera_params"):
         if key in entry:
-            shift_ns = read_time_shift_ns(entry.child(key), "image_delay", sign=-1)
+            shift_ns = models.read_time_shift_ns(entry.child(key), "image_delay", sign=-1)
     if "imageDelay" in entry:
-        shift_ns = read_time_shift_ns(entry, "imageDelay", sign=-1)
+        shift_ns = models.read_time_shift_ns(entry, "imageDelay", sign=-1)
     cameras = [dataclasses.replace(camera, time_offset_ns=shift_ns) for camera in cameras]
     imu = None
     for key in ("imu_parameters", "imu_params"):
         if key in entry and imu is None:
-            imu = read_imu(entry.child(key), _OKVIS_NOISE, _limits("a_max", "g_max"))
+            imu = models.read_imu(entry.child(key), _OKVIS_NOISE, _limits("a_max", "g_max"))
     notes = note_unknown_keys(entry, settings=True)
     return Parts("OKVIS", cameras, np.stack(poses), imu, notes=notes)
 
@@ -106,7 +101,7 @@ def read_svo(entry: Entry) -> Parts:
         kind = lens.text("type", default="none")
         terms = lens.numbers("parameters") if "parameters" in lens else np.zeros(0)
         cameras.append(
-            make_camera(
+            models.make_camera(
                 part,
                 ("type", part.text("type")),
                 ("distortion", _SVO_DISTORTIONS.get(kind, kind)),
@@ -121,10 +116,10 @@ def read_svo(entry: Entry) -> Parts:
     imu = None
     if "imu_params" in entry:
         part = entry.child("imu_params")
-        shift_ns = read_time_shift_ns(part, "delay_imu_cam", sign=-1)
+        shift_ns = models.read_time_shift_ns(part, "delay_imu_cam", sign=-1)
         cameras = [dataclasses.replace(camera, time_offset_ns=shift_ns) for camera in cameras]
-        imu = read_imu(part, _SVO_NOISE, _limits("acc_max", "omega_max"))
-    notes = note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
+        imu = models.read_imu(part, _SVO_NOISE, _limits("acc_max", "omega_max"))
+    notes = models.note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
     return Parts("SVO", cameras, np.stack(poses), imu, notes=notes)
 
 
@@ -136,7 +131,7 @@ def _old_svo_camera(entry: Entry) -> Camera:
     terms = [entry.number(f"cam_d{row}", 0.0) for row in range(4)]
     if model.lower() == "atan":
         numbers = np.concatenate([numbers[:2] * size, numbers[2:] * size - 0.5])
-        return make_camera(
+        return models.make_camera(
             entry, ("cam_model", "pinhole"), ("cam_model", "fov"), numbers, terms[:1], size
         )
     if model.lower() != "pinhole":
@@ -145,4 +140,4 @@ def _old_svo_camera(entry: Entry) -> Camera:
             "Pinhole"
         )
     names = ("cam_model", "pinhole"), ("cam_model", "radtan")
-    return make_camera(entry, *names, numbers, terms, size)
+    return models.make_camera(entry, *names, numbers, terms, size)

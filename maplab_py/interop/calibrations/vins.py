@@ -14,12 +14,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibrations.models import (
-    make_camera,
-    note_line_delays,
-    read_imu,
-    read_time_shift_ns,
-)
+from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry
 from maplab_py.sensors import Camera, Imu
 from maplab_py.sensors.yaml_entry import Entry
@@ -64,7 +59,7 @@ def read_vins(entry: Entry, folder: Path) -> Parts:
         cameras = [_camera(read_entry(path)) for path in files]
         poses = [_pose(entry, f"body_T_cam{row}") for row in range(count)]
         notes += _compare_sizes(entry, cameras)
-    shift_ns = read_time_shift_ns(entry, "td")
+    shift_ns = models.read_time_shift_ns(entry, "td")
     topics = ("image0_topic", "image1_topic")
     cameras = [
         dataclasses.replace(
@@ -85,7 +80,7 @@ def read_vins(entry: Entry, folder: Path) -> Parts:
     if missing and imu is not None:
         raise MapError(f"{why}: let VINS estimate it first, or calibrate with kalibr")
     T_B_C = np.stack([se3.identity() if pose is None else pose for pose in poses])
-    notes += note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
+    notes += models.note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
     return Parts("VINS", cameras, T_B_C, imu, why_not_on_imu=why, notes=notes)
 
 
@@ -107,7 +102,7 @@ def _camera(entry: Entry) -> Camera:
         coefficients = [values.number(key) for key in ("k2", "k3", "k4", "k5")]
     entry.text("camera_name")
     size = (entry.integer("image_width"), entry.integer("image_height"))
-    return make_camera(
+    return models.make_camera(
         entry, ("model_type", projection), ("model_type", distortion), numbers, coefficients, size
     )
 
@@ -127,7 +122,7 @@ def _mono_pose(entry: Entry) -> F64 | None:
 
 
 def _line_delay_ns(entry: Entry, camera: Camera) -> int:
-    readout_ns = read_time_shift_ns(entry, "rolling_shutter_tr")
+    readout_ns = models.read_time_shift_ns(entry, "rolling_shutter_tr")
     return round(readout_ns / camera.height_px) if entry.integer("rolling_shutter", 0) else 0
 
 
@@ -135,7 +130,7 @@ def _imu(entry: Entry) -> Imu | None:
     if not entry.integer("imu", int("acc_n" in entry)):
         return None
     noise, limits = ("acc_n", "acc_w", "gyr_n", "gyr_w"), {"gravity_magnitude_mps2": "g_norm"}
-    return read_imu(entry, noise, limits, topic=entry.text("imu_topic"))
+    return models.read_imu(entry, noise, limits, topic=entry.text("imu_topic"))
 
 
 def _compare_sizes(entry: Entry, cameras: list[Camera]) -> list[str]:

@@ -16,25 +16,10 @@ from maplab_py.array_types import F64, I64
 from maplab_py.distinct import distinct
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.colmap import model as colmap
 from maplab_py.interop.colmap.binary import binary_files
 from maplab_py.interop.colmap.child import TEXT
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
-from maplab_py.interop.colmap.model import (
-    FILE_NAME,
-    FILES,
-    NO_POINT,
-    PIXEL_CENTRE,
-    ColmapCamera,
-    ColmapFrames,
-    ColmapImages,
-    ColmapModel,
-    ColmapPoints,
-    ColmapRig,
-    Sensor,
-    SensorType,
-    SideFile,
-    colmap_camera,
-)
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
 from maplab_py.interop.colmap.undistortion import undistorted
 from maplab_py.output_files import check_writable, write_bytes
@@ -90,13 +75,13 @@ def export_colmap(
             write_job_model(model, work)
         if options.colmap_format == "text":
             run_job("write_text", work, folder)
-            for kind in FILES:
+            for kind in colmap.FILES:
                 path = folder / f"{kind}.txt"
                 write_bytes(path, _chunks(work / TEXT / path.name), overwrite=overwrite)
         else:
             for file, content in binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
-        write_bytes(folder / FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
+        write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:
             _write_database(vi_map, exported, options, work, folder, overwrite=overwrite)
     return ColmapExportReport(
@@ -142,13 +127,13 @@ def _check_folder(
     suffix, other = (".txt", ".bin") if is_text else (".bin", ".txt")
     if folder.exists() and not folder.is_dir():
         raise UserError(f"--colmap_folder={folder} is a file: name a folder")
-    for kind in FILES:
+    for kind in colmap.FILES:
         if (folder / f"{kind}{other}").exists():
             raise UserError(
                 f"--colmap_folder={folder}: holds {kind}{other}, a model in the other format, which COLMAP "
                 "could read instead: choose another folder"
             )
-    names = [f"{kind}{suffix}" for kind in FILES] + [FILE_NAME]
+    names = [f"{kind}{suffix}" for kind in colmap.FILES] + [colmap.FILE_NAME]
     names += [DATABASE] if options.colmap_database else []
     for file in names:
         check_writable(folder / file, overwrite=overwrite)
@@ -229,7 +214,7 @@ def matches_of_landmarks(exported: ExportedModel) -> tuple[I64, I64, NDArray[np.
     out.
     """
     images = exported.model.images
-    observing = np.flatnonzero(images.point != NO_POINT)
+    observing = np.flatnonzero(images.point != colmap.NO_POINT)
     observing = observing[np.argsort(images.point[observing], kind="stable")]
     point, image = images.point[observing], images.keypoint_image[observing]
     keypoint = observing - images.keypoint_start[image]
@@ -267,8 +252,8 @@ class MapRig:
 class ExportedModel:
     """A model with the rows of the map that it was made of."""
 
-    model: ColmapModel
-    side_file: SideFile
+    model: colmap.ColmapModel
+    side_file: colmap.SideFile
     frames: I64  # (N,) rows of the images
     keypoints: I64  # (K,) rows
     landmarks: I64  # (L,) rows
@@ -308,24 +293,24 @@ def model_of_map(
     T_W_C = se3.compose(vi_map.T_G_I[vertex[frame_row]], T_I_C)
     keypoints = ragged_rows(vi_map.keypoint_start, frames)
     landmarks, point = _exported_landmarks(vi_map, keypoints, quality)
-    images = ColmapImages(
+    images = colmap.ColmapImages(
         id=np.arange(1, len(frames) + 1),
         camera=camera_row + 1,
         T_C_W=se3.inverse(T_W_C),
         name=image_names(vi_map, frames),
         keypoint_count=vi_map.frames.keypoint_count[frames].astype(np.int64),
-        uv=vi_map.keypoints.uv_px[keypoints] + PIXEL_CENTRE,
+        uv=vi_map.keypoints.uv_px[keypoints] + colmap.PIXEL_CENTRE,
         point=point,
     )
     error, mean_error = _errors(vi_map, rigs, images, camera_row, landmarks)
-    model = ColmapModel(
+    model = colmap.ColmapModel(
         cameras,
         colmap_rigs,
-        ColmapFrames(
+        colmap.ColmapFrames(
             np.arange(1, len(vertex) + 1), rig_row + 1, se3.inverse(T_W_R), frame_row, images.id
         ),
         images,
-        ColmapPoints(
+        colmap.ColmapPoints(
             landmarks + 1,
             vi_map.p_G[landmarks],
             np.full((len(landmarks), 3), _GREY, dtype=np.uint8),
@@ -333,7 +318,7 @@ def model_of_map(
         ),
     )
     side_file = _side_file(vi_map, rigs, frames, vertex, images)
-    observations = int(np.count_nonzero(point != NO_POINT))
+    observations = int(np.count_nonzero(point != colmap.NO_POINT))
     return ExportedModel(model, side_file, frames, keypoints, landmarks, observations, mean_error)
 
 
@@ -393,16 +378,18 @@ def _exported_frames(vi_map: VIMap, missions: I64) -> I64:
     return np.flatnonzero(of_mission & table.is_valid & is_valid(table.id))
 
 
-def _sensors(rigs: list[MapRig]) -> tuple[tuple[ColmapCamera, ...], tuple[ColmapRig, ...]]:
-    cameras: list[ColmapCamera] = []
+def _sensors(
+    rigs: list[MapRig],
+) -> tuple[tuple[colmap.ColmapCamera, ...], tuple[colmap.ColmapRig, ...]]:
+    cameras: list[colmap.ColmapCamera] = []
     result = []
     for number, rig in enumerate(rigs, start=1):
-        sensors: list[Sensor] = []
+        sensors: list[colmap.Sensor] = []
         for camera in rig.cameras:
-            cameras.append(colmap_camera(camera, len(cameras) + 1))
-            sensors.append((SensorType.CAMERA, len(cameras)))
+            cameras.append(colmap.colmap_camera(camera, len(cameras) + 1))
+            sensors.append((colmap.SensorType.CAMERA, len(cameras)))
         T_S_R = se3.compose(se3.inverse(rig.T_I_C), rig.T_I_C[0])
-        result.append(ColmapRig(number, tuple(sensors), T_S_R))
+        result.append(colmap.ColmapRig(number, tuple(sensors), T_S_R))
     return tuple(cameras), tuple(result)
 
 
@@ -417,15 +404,15 @@ def _exported_landmarks(vi_map: VIMap, keypoints: I64, quality: str) -> tuple[I6
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
     observed = landmark >= 0
     observed[observed] = wanted[landmark[observed]]
-    point = np.where(observed, landmark + 1, NO_POINT)
+    point = np.where(observed, landmark + 1, colmap.NO_POINT)
     return distinct(landmark[observed]), point
 
 
 def _errors(
-    vi_map: VIMap, rigs: list[MapRig], images: ColmapImages, camera_row: I64, landmarks: I64
+    vi_map: VIMap, rigs: list[MapRig], images: colmap.ColmapImages, camera_row: I64, landmarks: I64
 ) -> tuple[F64, float]:
     """Return the mean reprojection error (L,) of each landmark [px], and that of all observations."""
-    observing = np.flatnonzero(images.point != NO_POINT)
+    observing = np.flatnonzero(images.point != colmap.NO_POINT)
     image = images.keypoint_image[observing]
     landmark = images.point[observing] - 1
     p_C = se3.transform(images.T_C_W[image], vi_map.p_G[landmark])
@@ -434,7 +421,7 @@ def _errors(
     for row, camera in enumerate(cameras):
         mine = np.flatnonzero(camera_row[image] == row)
         uv, seen[mine] = project(camera, p_C[mine])
-        error[mine] = np.linalg.norm(uv + PIXEL_CENTRE - images.uv[observing[mine]], axis=1)
+        error[mine] = np.linalg.norm(uv + colmap.PIXEL_CENTRE - images.uv[observing[mine]], axis=1)
     place = np.searchsorted(landmarks, landmark[seen])
     count = np.bincount(place, minlength=len(landmarks))
     total = np.bincount(place, error[seen], minlength=len(landmarks))
@@ -443,15 +430,15 @@ def _errors(
 
 
 def _side_file(
-    vi_map: VIMap, rigs: list[MapRig], frames: I64, vertex: I64, images: ColmapImages
-) -> SideFile:
+    vi_map: VIMap, rigs: list[MapRig], frames: I64, vertex: I64, images: colmap.ColmapImages
+) -> colmap.SideFile:
     cameras = [camera.id for rig in rigs for camera in rig.cameras]
     used = np.unique(vi_map.vertices.mission[vertex])
-    order = np.flatnonzero(images.point != NO_POINT)
+    order = np.flatnonzero(images.point != colmap.NO_POINT)
     point, first = np.unique(images.point[order], return_index=True)
     observing = order[first]
     image = images.keypoint_image[observing]
-    return SideFile(
+    return colmap.SideFile(
         mission_id=vi_map.missions.id[used],
         mission_name=np.array(vi_map.missions.name[used].tolist(), dtype=np.str_),
         is_metric=np.array([is_metric(vi_map, row) for row in used.tolist()], dtype=np.int64),

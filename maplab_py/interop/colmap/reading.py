@@ -15,18 +15,10 @@ from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.input_files import read_bytes
+from maplab_py.interop.colmap import model as colmap
 from maplab_py.interop.colmap.binary import REMEDY, read_binary, read_binary_cameras
 from maplab_py.interop.colmap.child import BINARY, TEXT
 from maplab_py.interop.colmap.child_process import run_job
-from maplab_py.interop.colmap.model import (
-    FILES,
-    MODELS,
-    NO_POINT,
-    ColmapCamera,
-    ColmapModel,
-    SensorType,
-    map_camera,
-)
 from maplab_py.sensors import Camera
 
 _ROUNDING = 1e-9
@@ -35,7 +27,7 @@ _HEADER_BYTES = 4096
 _NEEDED = ("cameras", "images", "points3D")
 
 
-def read_model(folder: Path) -> ColmapModel:
+def read_model(folder: Path) -> colmap.ColmapModel:
     """Read and check a model; binary files come before text files, as in COLMAP.
 
     Raises:
@@ -98,7 +90,7 @@ def _count(path: Path) -> str:
         return "?"
 
 
-def _read_text(folder: Path) -> ColmapModel:
+def _read_text(folder: Path) -> colmap.ColmapModel:
     """Let pycolmap convert the text, and compare the result with what the files announce.
 
     Names and poses of images are read here: pycolmap cuts names at blanks, and takes poses from the frames.
@@ -110,7 +102,7 @@ def _read_text(folder: Path) -> ColmapModel:
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
         (work / TEXT).mkdir()
-        for kind in FILES:
+        for kind in colmap.FILES:
             path = folder / f"{kind}.txt"
             if kind != "images" and path.is_file():
                 (work / TEXT / path.name).symlink_to(path.resolve())
@@ -193,7 +185,7 @@ def _announced(path: Path) -> int | None:
     return int(match[1]) if match else None
 
 
-def check_model(model: ColmapModel, source: Path) -> None:
+def check_model(model: colmap.ColmapModel, source: Path) -> None:
     """Check that ids are unique, that what is named exists, and that there are images.
 
     Raises:
@@ -205,7 +197,12 @@ def check_model(model: ColmapModel, source: Path) -> None:
     cameras = np.array([camera.id for camera in model.cameras], dtype=np.int64)
     rigs = np.array([rig.id for rig in model.rigs], dtype=np.int64)
     sensors = np.array(
-        [number for rig in model.rigs for kind, number in rig.sensors if kind == SensorType.CAMERA],
+        [
+            number
+            for rig in model.rigs
+            for kind, number in rig.sensors
+            if kind == colmap.SensorType.CAMERA
+        ],
         dtype=np.int64,
     )
     for noun, ids in (
@@ -228,7 +225,7 @@ def check_model(model: ColmapModel, source: Path) -> None:
     _known(source, "a frame names rig {}", frames.rig, rigs)
     _known(source, "no frame has image {}", images.id, frames.image_id)
     _known(source, "no rig has camera {}", images.camera, sensors)
-    observed = images.point[images.point != NO_POINT]
+    observed = images.point[images.point != colmap.NO_POINT]
     _known(source, "a keypoint names point {}", observed, points.id)
 
 
@@ -274,10 +271,10 @@ def read_cameras(path: Path) -> tuple[list[Camera], F64]:
                 f"{path}: has {len(cameras)} cameras, and does not say how they are mounted: name the "
                 "folder of a model with a rig of them"
             )
-    return [map_camera(camera, "") for camera in cameras], se3.relative(T_R_C[0], T_R_C)
+    return [colmap.map_camera(camera, "") for camera in cameras], se3.relative(T_R_C[0], T_R_C)
 
 
-def _rig(model: ColmapModel, folder: Path) -> tuple[tuple[ColmapCamera, ...], F64]:
+def _rig(model: colmap.ColmapModel, folder: Path) -> tuple[tuple[colmap.ColmapCamera, ...], F64]:
     """Return the cameras of a model's rig and their poses T_R_C (n, 7)."""
     if len(model.rigs) != 1:
         raise UserError(
@@ -286,14 +283,14 @@ def _rig(model: ColmapModel, folder: Path) -> tuple[tuple[ColmapCamera, ...], F6
         )
     rig = model.rigs[0]
     by_id = {camera.id: camera for camera in model.cameras}
-    mine = [row for row, sensor in enumerate(rig.sensors) if sensor[0] == SensorType.CAMERA]
+    mine = [row for row, sensor in enumerate(rig.sensors) if sensor[0] == colmap.SensorType.CAMERA]
     T_S_R = rig.T_S_R[mine]
     if not np.isfinite(T_S_R).all():
         raise UserError(f"{folder}: rig {rig.id} has a camera without pose: reconstruct it first")
     return tuple(by_id[rig.sensors[row][1]] for row in mine), se3.inverse(T_S_R)
 
 
-def _text_cameras(path: Path) -> tuple[ColmapCamera, ...]:
+def _text_cameras(path: Path) -> tuple[colmap.ColmapCamera, ...]:
     """Read cameras.txt: lines of id, model, width, height and parameters.
 
     Raises:
@@ -303,7 +300,7 @@ def _text_cameras(path: Path) -> tuple[ColmapCamera, ...]:
         data = read_bytes(path, _MAX_BYTES, remedy="it is no file of cameras", error=MapError)
     except OSError as error:
         raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
-    numbers = {model.name: model.number for model in MODELS.values()}
+    numbers = {model.name: model.number for model in colmap.MODELS.values()}
     cameras = []
     for number, line in enumerate(data.decode("utf-8", errors="replace").splitlines(), start=1):
         words = line.split()
@@ -318,7 +315,7 @@ def _text_cameras(path: Path) -> tuple[ColmapCamera, ...]:
             parameters = np.array([float(word) for word in words[4:]])
         except ValueError as error:
             raise MapError(f"{path}:{number}: {error}; {REMEDY}") from None
-        model = MODELS[numbers[words[1]]]
+        model = colmap.MODELS[numbers[words[1]]]
         if len(parameters) != model.parameters or not np.isfinite(parameters).all():
             raise MapError(
                 f"{path}:{number}: {model.name} has {model.parameters} parameters that are numbers, not "
@@ -326,5 +323,5 @@ def _text_cameras(path: Path) -> tuple[ColmapCamera, ...]:
             )
         if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
             raise MapError(f"{path}:{number}: the images have no pixels; {REMEDY}")
-        cameras.append(ColmapCamera(camera_id, model.number, width, height, parameters))
+        cameras.append(colmap.ColmapCamera(camera_id, model.number, width, height, parameters))
     return tuple(cameras)

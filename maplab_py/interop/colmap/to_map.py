@@ -21,26 +21,13 @@ from maplab_py.interop.colmap.model import (
 )
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
-from maplab_py.vimap import MissionSensor, VIMap
+from maplab_py.vimap import MissionSensor, VIMap, tables
 from maplab_py.vimap.descriptors import no_blocks
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.scale_marks import KEY
 from maplab_py.vimap.table import ragged_rows
-from maplab_py.vimap.tables import (
-    Backbone,
-    BaseFrames,
-    FrameField,
-    Frames,
-    Keypoints,
-    LandmarkQuality,
-    Landmarks,
-    Missions,
-    TransformationEdges,
-    TransformationKind,
-    Vertices,
-)
 
-_PRESENT = FrameField.SIGMA | FrameField.SCALE | FrameField.LANDMARK_ID
+_PRESENT = tables.FrameField.SIGMA | tables.FrameField.SCALE | tables.FrameField.LANDMARK_ID
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -166,8 +153,10 @@ def map_of_model(
     vi_map = VIMap(
         sensors=sensors,
         missions=_missions(bodies, side, sensor_id, rng),
-        baseframes=BaseFrames.filled(missions, id=random_ids(missions, rng), is_known=is_metric),
-        vertices=Vertices.filled(
+        baseframes=tables.BaseFrames.filled(
+            missions, id=random_ids(missions, rng), is_known=is_metric
+        ),
+        vertices=tables.Vertices.filled(
             count,
             id=_restored(random_ids(count, rng), bodies.side_vertex, vertex_id),
             mission=bodies.mission,
@@ -176,7 +165,7 @@ def map_of_model(
             nframe_id=random_ids(count, rng),
         ),
         frames=frames,
-        keypoints=Keypoints.filled(
+        keypoints=tables.Keypoints.filled(
             len(keypoints),
             uv_px=model.images.uv[keypoints] - PIXEL_CENTRE,
             sigma_px=np.full(len(keypoints), sigma_px),
@@ -258,7 +247,7 @@ def _frames(
     times_ns: I64,
     side: SideFile | None,
     rng: np.random.Generator,
-) -> tuple[Frames, I64]:
+) -> tuple[tables.Frames, I64]:
     """Return the frames, and the rows of their images."""
     vertex_of = np.full(len(model.frames.id), -1, dtype=np.int64)
     vertex_of[bodies.frame] = np.arange(len(bodies.frame))
@@ -284,7 +273,7 @@ def _frames(
         rows = side_images(model, side)[image]
         ids = _restored(ids, rows, side.image_frame_id)
         stamps = np.where(rows >= 0, side.image_time_ns[rows], stamps)
-    table = Frames.filled(
+    table = tables.Frames.filled(
         count,
         id=ids,
         vertex=vertex,
@@ -300,12 +289,12 @@ def _frames(
 def _landmarks(
     model: ColmapModel,
     side: SideFile | None,
-    frames: Frames,
+    frames: tables.Frames,
     keypoints: I64,
     p_G: F64,
     T_G_I: F64,
     rng: np.random.Generator,
-) -> tuple[Landmarks, I64, int]:
+) -> tuple[tables.Landmarks, I64, int]:
     """Return landmarks in the order of point ids, rows (K,) of keypoints, and points left out."""
     point = _rows_of(model.points.id, model.images.point[keypoints])
     observing = np.flatnonzero(point >= 0)
@@ -319,12 +308,12 @@ def _landmarks(
     landmark = np.full(len(keypoints), -1, dtype=np.int64)
     landmark[observing] = np.searchsorted(seen, rank[point[observing]])
     ids = random_ids(len(rows), rng)
-    quality = np.full(len(rows), int(LandmarkQuality.GOOD))
+    quality = np.full(len(rows), int(tables.LandmarkQuality.GOOD))
     if side is not None:
         known = _same_points(model, side, model.points.id[rows])
         ids = _restored(ids, known, side.landmark_id)
         quality = np.where(known >= 0, side.landmark_quality[known], quality)
-    table = Landmarks.filled(
+    table = tables.Landmarks.filled(
         len(rows),
         id=ids,
         vertex=store,
@@ -350,7 +339,7 @@ def _same_points(model: ColmapModel, side: SideFile, ids: I64) -> I64:
 
 def _missions(
     bodies: BodyFrames, side: SideFile | None, sensor_id: U64, rng: np.random.Generator
-) -> Missions:
+) -> tables.Missions:
     count = len(bodies.mission_rig)
     # the rows of a side file's mission that a model has put on two rigs: the first keeps the id
     rows, first = np.unique(bodies.mission_row, return_index=True)
@@ -359,12 +348,12 @@ def _missions(
     names = np.full(count, "", dtype=object)
     if side is not None:
         names[known >= 0] = side.mission_name[known[known >= 0]].tolist()
-    return Missions.filled(
+    return tables.Missions.filled(
         count,
         id=_restored(random_ids(count, rng), known, None if side is None else side.mission_id),
         baseframe=np.arange(count),
         root_vertex=np.searchsorted(bodies.mission, np.arange(count)),
-        backbone=np.full(count, int(Backbone.ODOMETRY)),
+        backbone=np.full(count, int(tables.Backbone.ODOMETRY)),
         sensor_id=sensor_id,
         name=names,
     )
@@ -372,13 +361,13 @@ def _missions(
 
 def _edges(
     bodies: BodyFrames, T_G_I: F64, sensor_id: U64, sigma: F64, rng: np.random.Generator
-) -> TransformationEdges:
+) -> tables.TransformationEdges:
     start = np.flatnonzero(bodies.mission[1:] == bodies.mission[:-1])
     count = len(start)
-    return TransformationEdges.filled(
+    return tables.TransformationEdges.filled(
         count,
         id=random_ids(count, rng),
-        kind=np.full(count, int(TransformationKind.ODOMETRY)),
+        kind=np.full(count, int(tables.TransformationKind.ODOMETRY)),
         from_vertex=start,
         to_vertex=start + 1,
         T_A_B=se3.relative(T_G_I[start], T_G_I[start + 1]),

@@ -20,14 +20,8 @@ from maplab_py.interop.live.transport import (
     topic_of,
     wait_for_topics,
 )
+from maplab_py.interop.recordings import bag_writing
 from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.bag_writing import (
-    BagMessage,
-    Channel,
-    check_bag_writable,
-    format_of_path,
-    write_bag,
-)
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
@@ -99,8 +93,8 @@ def record_bag(
         FlagError: An option is wrong.
         UserError: A topic is missing, the bag cannot be written, or does not fit the messages.
     """
-    names, bag_format = options.names, format_of_path(path)
-    check_bag_writable(path, bag_format, overwrite=overwrite)
+    names, bag_format = options.names, bag_writing.format_of_path(path)
+    bag_writing.check_bag_writable(path, bag_format, overwrite=overwrite)
     with open_transport(kind, network) as transport:
         if transport.is_ros_2 != bag_format.is_ros_2:
             wanted = "a folder" if transport.is_ros_2 else "a file .bag"
@@ -108,7 +102,7 @@ def record_bag(
         topics = _topics(transport, names, network.live_wait_s)
         arrivals = _Arrivals(transport, topics, silence_s, options.duration_s)
         messages = arrivals.messages(progress, is_to_end)
-        counts = write_bag(path, bag_format, messages, overwrite=overwrite)
+        counts = bag_writing.write_bag(path, bag_format, messages, overwrite=overwrite)
         notes = [*transport.problems]
         if arrivals.dropped:
             notes.append(
@@ -159,24 +153,26 @@ class _Arrivals:
     ) -> None:
         self.dropped, self.duration_s = 0, 0.0
         self._silence_s, self._longest_s = silence_s, duration_s
-        self._queue: queue.Queue[BagMessage] = queue.Queue(_MAX_WAITING)
+        self._queue: queue.Queue[bag_writing.BagMessage] = queue.Queue(_MAX_WAITING)
         self._waiting_bytes = 0
         for topic in topics:
-            take = partial(self._take, Channel(topic.name, topic.type))
+            take = partial(self._take, bag_writing.Channel(topic.name, topic.type))
             transport.subscribe(topic, take)
 
-    def _take(self, channel: Channel, data: bytes) -> None:
+    def _take(self, channel: bag_writing.Channel, data: bytes) -> None:
         """Keep a message; called by the receiving thread."""
         if self._waiting_bytes > _MAX_WAITING_BYTES:
             self.dropped += 1
             return
         try:
-            self._queue.put_nowait(BagMessage(time.time_ns(), channel, bytes(data)))
+            self._queue.put_nowait(bag_writing.BagMessage(time.time_ns(), channel, bytes(data)))
             self._waiting_bytes += len(data)
         except queue.Full:
             self.dropped += 1
 
-    def messages(self, progress: Progress, is_to_end: Callable[[], bool]) -> Iterator[BagMessage]:
+    def messages(
+        self, progress: Progress, is_to_end: Callable[[], bool]
+    ) -> Iterator[bag_writing.BagMessage]:
         """Yield messages until the end."""
         begin_s = heard_s = time.monotonic()
         count = size = 0

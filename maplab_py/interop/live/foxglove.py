@@ -16,16 +16,8 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from maplab_py.errors import UserError
+from maplab_py.interop.live import transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import (
-    MAX_MESSAGE_BYTES,
-    Publish,
-    Take,
-    Topic,
-    answer_of,
-    listening_address,
-    ros2_type,
-)
 from maplab_py.interop.recordings.bag_files import message_types
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
@@ -64,34 +56,34 @@ class FoxgloveClient:
         self.problems: list[str] = []
         self.is_ros_2 = True
         self._channels: dict[int, _Channel] = {}
-        self._subscriptions: list[tuple[Topic, Take]] = []  # by number
+        self._subscriptions: list[tuple[transport.Topic, transport.Take]] = []  # by number
         self._publications: list[tuple[str, str]] = []  # topic and type, by number
         self._capabilities: list[str] = []
         self._lock = threading.Lock()
         self._is_closed = threading.Event()
         self._has_topics = threading.Event()
-        self._connection: Any = answer_of(self._connected, network.live_wait_s)
+        self._connection: Any = transport.answer_of(self._connected, network.live_wait_s)
         self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
         self._thread.start()
         self._has_topics.wait(network.live_wait_s)
 
-    def topics(self) -> dict[str, Topic]:
+    def topics(self) -> dict[str, transport.Topic]:
         """Return the topics that are published now, by name."""
         with self._lock:
             channels = sorted(self._channels.values(), key=lambda channel: channel.topic)
         return {
-            channel.topic: Topic(channel.topic, channel.type)
+            channel.topic: transport.Topic(channel.topic, channel.type)
             for channel in channels
             if channel.encoding in _ENCODINGS
         }
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
+    def subscribe(self, topic: transport.Topic, take: transport.Take) -> None:
         """Call a function with every message of a topic from now on."""
         with self._lock:
             self._subscriptions.append((topic, take))
         self._ask_for([len(self._subscriptions) - 1])
 
-    def advertise(self, topic: str, kind: str) -> Publish:
+    def advertise(self, topic: str, kind: str) -> transport.Publish:
         """Announce messages of a type; return what sends them."""
         number = len(self._publications)
         self._publications.append((topic, kind))
@@ -129,7 +121,7 @@ class FoxgloveClient:
             return connect(
                 self._url,
                 subprotocols=SUBPROTOCOLS,
-                max_size=MAX_MESSAGE_BYTES,
+                max_size=transport.MAX_MESSAGE_BYTES,
                 compression=None,
                 open_timeout=_CONNECT_S,
                 close_timeout=1.0,
@@ -249,7 +241,7 @@ class FoxgloveClient:
 
 def _channel(entry: dict[str, Any]) -> _Channel:
     """Return a channel as the server announces it; schemas of ROS 1 have names of two parts."""
-    kind = ros2_type(str(entry["schemaName"]))
+    kind = transport.ros2_type(str(entry["schemaName"]))
     return _Channel(int(entry["id"]), str(entry["topic"]), str(entry["encoding"]), kind)
 
 
@@ -279,7 +271,10 @@ class FoxgloveServer:
             from websockets.sync.server import serve
         except ImportError as error:
             raise library_missing() from error
-        host, port = listening_address(network), urlsplit(network.foxglove_url).port or 8765
+        host, port = (
+            transport.listening_address(network),
+            urlsplit(network.foxglove_url).port or 8765,
+        )
         self.name = f"Foxglove ws://{host}:{port}"
         self.problems: list[str] = []
         self._channels: list[dict[str, Any]] = []
@@ -302,11 +297,11 @@ class FoxgloveServer:
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
-    def topics(self) -> dict[str, Topic]:
+    def topics(self) -> dict[str, transport.Topic]:
         """Return nothing: a server sees no topics of others."""
         return {}
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
+    def subscribe(self, topic: transport.Topic, take: transport.Take) -> None:
         """Refuse: a server has nothing to receive.
 
         Raises:
@@ -314,7 +309,7 @@ class FoxgloveServer:
         """
         raise UserError(f"{self.name}: {topic.name} cannot be received by a server ({take})")
 
-    def advertise(self, topic: str, kind: str) -> Publish:
+    def advertise(self, topic: str, kind: str) -> transport.Publish:
         """Announce messages of a type; return what sends them."""
         definition, _ = message_types(is_ros_2=True).generate_msgdef(kind, ros_version=2)
         number = len(self._channels)

@@ -17,17 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from maplab_py.errors import UserError
+from maplab_py.interop.live import transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import (
-    LOOPBACK,
-    MAX_MESSAGE_BYTES,
-    RAISE_RECEIVE_BUFFERS,
-    SOCKET_BYTES,
-    Publish,
-    Take,
-    Topic,
-    listening_address,
-)
 from maplab_py.interop.recordings.bag_files import message_types
 
 # ROS's `sensor_msgs/msg/Image` is the type `sensor_msgs::msg::dds_::Image_` of DDS: the module `dds_`
@@ -157,7 +148,7 @@ class Ros2:
         self._is_closed = False
         self._thread = threading.Thread(target=self._receive, name="ros2", daemon=True)
 
-    def topics(self) -> dict[str, Topic]:
+    def topics(self) -> dict[str, transport.Topic]:
         """Return the topics that are published now, by name."""
         from cyclonedds.core import InstanceState, Policy, ReadCondition, SampleState, ViewState
 
@@ -166,7 +157,7 @@ class Ros2:
             condition = ReadCondition(self._publications, mask)
             publications = self._publications.read(10 * _LARGEST_TAKE, condition=condition)
         published_here = {bytes(writer.guid.bytes) for writer in self._writers.values()}
-        topics: dict[str, Topic] = {}
+        topics: dict[str, transport.Topic] = {}
         for publication in publications:
             name = getattr(publication, "topic_name", "")
             if not name.startswith(f"{_PREFIX}/") or publication.key.bytes in published_here:
@@ -175,7 +166,7 @@ class Ros2:
             reliability = publication.qos[Policy.Reliability]
             is_reliable = reliability != Policy.Reliability.BestEffort
             known = topics.get(name)
-            topics[name] = Topic(
+            topics[name] = transport.Topic(
                 name,
                 ros_type_name(publication.type_name),
                 1 + (known.publishers if known else 0),
@@ -183,7 +174,7 @@ class Ros2:
             )
         return topics
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
+    def subscribe(self, topic: transport.Topic, take: transport.Take) -> None:
         """Call a function with every message of a topic from now on."""
         reader = _Reader(self._participant, topic, take)
         with self._lock:
@@ -192,7 +183,7 @@ class Ros2:
         if not self._thread.is_alive():
             self._thread.start()
 
-    def advertise(self, topic: str, kind: str) -> Publish:
+    def advertise(self, topic: str, kind: str) -> transport.Publish:
         """Announce messages of a type; return what sends them."""
         from cyclonedds._clayer import ddspy_write
         from cyclonedds.pub import DataWriter
@@ -256,7 +247,7 @@ class Ros2:
 class _Reader:
     """Takes the messages of one topic as bytes."""
 
-    def __init__(self, participant: Any, topic: Topic, take: Take) -> None:
+    def __init__(self, participant: Any, topic: transport.Topic, take: transport.Take) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic as DdsTopic
@@ -297,9 +288,9 @@ def _quality(kind: str, *, is_reliable: bool) -> Any:
 
 def _configuration(network: NetworkOptions) -> str:
     """Return Cyclone's configuration; the user's own (CYCLONEDDS_URI) is read after it and wins."""
-    address = listening_address(network)
-    is_local = address == LOOPBACK
-    peers = [LOOPBACK] if is_local else []
+    address = transport.listening_address(network)
+    is_local = address == transport.LOOPBACK
+    peers = [transport.LOOPBACK] if is_local else []
     peers += [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     listed = "".join(f'<Peer Address="{peer}"/>' for peer in peers)
     multicast = "false" if is_local else "default"
@@ -311,8 +302,8 @@ def _configuration(network: NetworkOptions) -> str:
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
         f"<Peers>{listed}</Peers></Discovery>"
         # a least size that the kernel refuses would end the domain
-        f'<Internal><SocketReceiveBufferSize max="{SOCKET_BYTES} B"/>'
-        f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal>"
+        f'<Internal><SocketReceiveBufferSize max="{transport.SOCKET_BYTES} B"/>'
+        f"<MaxSampleSize>{transport.MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal>"
         f"<Compatibility><IgnoreTypeInformation>{_FAST_DDS}</IgnoreTypeInformation></Compatibility>"
         "</Domain></CycloneDDS>"
     )
@@ -329,5 +320,5 @@ def _socket_problems() -> list[str]:
         return []
     return [
         f"receive buffers are limited to {limit} bytes, so images will be lost: "
-        f"`{RAISE_RECEIVE_BUFFERS}`, or publish compressed images"
+        f"`{transport.RAISE_RECEIVE_BUFFERS}`, or publish compressed images"
     ]

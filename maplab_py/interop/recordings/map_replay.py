@@ -8,14 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings.protocol import (
-    ImuBatch,
-    Item,
-    PartSpan,
-    RecordedSensors,
-    TrackedFrame,
-    TrackedFrameSet,
-)
+from maplab_py.interop.recordings import protocol
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_sensor_id
@@ -70,7 +63,7 @@ class MapRecording:
                 "another mission"
             )
         imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
-        self.device = RecordedSensors(vi_map.sensors, rig_id, imu_id)
+        self.device = protocol.RecordedSensors(vi_map.sensors, rig_id, imu_id)
         self._times_ns = vi_map.vertices.timestamp_ns[self._vertices]
         self._samples = (
             mission_sample_rows(vi_map, mission) if imu_id else np.zeros(0, dtype=np.int64)
@@ -83,11 +76,13 @@ class MapRecording:
         starts = [int(times[0]) for times in (self._times_ns, self._sample_times_ns) if len(times)]
         return min(starts)
 
-    def parts(self) -> tuple[PartSpan, ...]:
+    def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return no parts: the clock of a mission runs on."""
         return ()
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield frame sets and the IMU samples between them; see `Recording.items`."""
         row, last = np.searchsorted(
             self._sample_times_ns,
@@ -109,27 +104,27 @@ class MapRecording:
         if row < last:
             yield self._batch(row, last)
 
-    def _batch(self, first: int, end: int) -> ImuBatch:
+    def _batch(self, first: int, end: int) -> protocol.ImuBatch:
         imu = self.device.imu
         assert imu is not None  # there are samples
         rows = self._samples[first:end]
-        return ImuBatch.of(
+        return protocol.ImuBatch.of(
             imu, self._sample_times_ns[first:end], self._map.imu_samples.accel_gyro[rows]
         )
 
-    def _frame_set(self, vertex: int, time_ns: int) -> TrackedFrameSet:
+    def _frame_set(self, vertex: int, time_ns: int) -> protocol.TrackedFrameSet:
         first, end = self._map.frame_start[vertex : vertex + 2].tolist()
-        frames: list[TrackedFrame | None] = [None] * len(self.device.cameras)
+        frames: list[protocol.TrackedFrame | None] = [None] * len(self.device.cameras)
         for row in range(first, end):
             camera = int(self._map.frames.camera_index[row])
             if self._map.frames.id[row].any() and self._map.frames.is_valid[row]:
                 frames[camera] = self._frame(row, camera)
-        return TrackedFrameSet(time_ns, tuple(frames))
+        return protocol.TrackedFrameSet(time_ns, tuple(frames))
 
-    def _frame(self, row: int, camera: int) -> TrackedFrame:
+    def _frame(self, row: int, camera: int) -> protocol.TrackedFrame:
         vi_map, table = self._map, self._map.keypoints
         rows = slice(*vi_map.keypoint_start[row : row + 2].tolist())
-        return TrackedFrame(
+        return protocol.TrackedFrame(
             camera=camera,
             stamp_ns=int(vi_map.frames.timestamp_ns[row]),
             uv_px=table.uv_px[rows],

@@ -9,16 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    Event,
-    FrameSet,
-    ImuBatch,
-    Item,
-    Recording,
-    TrackedFrameSet,
-)
 
 
 @dataclasses.dataclass
@@ -90,7 +82,7 @@ class EventStream:
     counts both. A gap between IMU samples is counted, and delivered as it is.
     """
 
-    def __init__(self, recording: Recording, options: StreamOptions | None = None) -> None:
+    def __init__(self, recording: protocol.Recording, options: StreamOptions | None = None) -> None:
         """Prepare a stream."""
         self._recording = recording
         self._options = options or StreamOptions()
@@ -99,7 +91,7 @@ class EventStream:
             images=[Times() for _ in range(cameras)], unmatched_images=[0] * cameras
         )
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[protocol.Event]:
         """Yield the events.
 
         Raises:
@@ -116,7 +108,7 @@ class EventStream:
         needs_imu = bool(recording.device.imu_id)
         for item in items:
             for event in sets.push(item):
-                if isinstance(event, ImuBatch):
+                if isinstance(event, protocol.ImuBatch):
                     needs_imu = False
                     yield event
                 elif needs_imu:
@@ -125,16 +117,16 @@ class EventStream:
                     self.statistics.frame_sets.add(event.time_ns)
                     yield event
         for event in sets.finish():
-            if isinstance(event, ImuBatch):
+            if isinstance(event, protocol.ImuBatch):
                 yield event
         self._check_not_empty()
 
-    def _counted(self, items: Iterator[Item]) -> Iterator[Item]:
+    def _counted(self, items: Iterator[protocol.Item]) -> Iterator[protocol.Item]:
         """Count items on their way."""
         for item in items:
-            if isinstance(item, ImuBatch):
+            if isinstance(item, protocol.ImuBatch):
                 self._count_samples(item)
-            elif isinstance(item, CameraImage):
+            elif isinstance(item, protocol.CameraImage):
                 self.statistics.images[item.camera].add(item.time_ns)
             else:
                 for frame in item.frames:
@@ -142,7 +134,7 @@ class EventStream:
                         self.statistics.images[frame.camera].add(item.time_ns)
             yield item
 
-    def _count_samples(self, batch: ImuBatch) -> None:
+    def _count_samples(self, batch: protocol.ImuBatch) -> None:
         statistics, imu = self.statistics, self.statistics.imu
         times_ns = batch.times_ns
         if imu.count:
@@ -182,21 +174,21 @@ class Synchroniser:
         """Put images of so many cameras together whose times differ by at most the tolerance."""
         self.unmatched = [0] * cameras
         self._cameras, self._tolerance_ns = cameras, tolerance_ns
-        self._open: dict[int, CameraImage] = {}
-        self._held: list[ImuBatch] = []  # while a set is open
+        self._open: dict[int, protocol.CameraImage] = {}
+        self._held: list[protocol.ImuBatch] = []  # while a set is open
 
-    def push(self, item: Item) -> Iterator[Event]:
+    def push(self, item: protocol.Item) -> Iterator[protocol.Event]:
         """Take the next item; yield what is complete by now."""
         if self._open and item.time_ns > self._oldest_ns + self._tolerance_ns:
             yield from self._give_up()
-        if isinstance(item, ImuBatch):
+        if isinstance(item, protocol.ImuBatch):
             if not self._open:
                 yield item
                 return
             self._held.append(item)
             if int(item.times_ns[-1]) > self._oldest_ns + self._tolerance_ns:
                 yield from self._give_up()
-        elif isinstance(item, TrackedFrameSet):
+        elif isinstance(item, protocol.TrackedFrameSet):
             yield item
         else:
             if item.camera in self._open:
@@ -205,7 +197,7 @@ class Synchroniser:
             if len(self._open) == self._cameras:
                 yield from self._complete()
 
-    def finish(self) -> Iterator[Event]:
+    def finish(self) -> Iterator[protocol.Event]:
         """Yield what is left at the end of the recording."""
         yield from self._give_up()
 
@@ -213,14 +205,14 @@ class Synchroniser:
     def _oldest_ns(self) -> int:
         return min(image.time_ns for image in self._open.values())
 
-    def _give_up(self) -> Iterator[Event]:
+    def _give_up(self) -> Iterator[protocol.Event]:
         for camera in self._open:
             self.unmatched[camera] += 1
         self._open = {}
         held, self._held = self._held, []
         yield from held
 
-    def _complete(self) -> Iterator[Event]:
+    def _complete(self) -> Iterator[protocol.Event]:
         images = tuple(self._open[camera] for camera in range(self._cameras))
         time_ns = images[0].time_ns
         self._open = {}
@@ -232,5 +224,5 @@ class Synchroniser:
             if count < len(batch):
                 later.append(batch[count:])
         self._held = []
-        yield FrameSet(time_ns, images)
+        yield protocol.FrameSet(time_ns, images)
         yield from later

@@ -9,15 +9,9 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
+from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.clocks import ClockRestart
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    FrameSet,
-    ImuBatch,
-    PartSpan,
-    Recording,
-)
 from maplab_py.interop.recordings.stream import EventStream, StreamStatistics, Times
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -70,11 +64,11 @@ class RecordingReport(Report):
     imu: ImuSummary | None
     cameras: tuple[CameraSummary, ...]
     notes: tuple[str, ...]
-    parts: tuple[PartSpan, ...] = ()  # where the clock starts again
+    parts: tuple[protocol.PartSpan, ...] = ()  # where the clock starts again
 
 
 def summarise(
-    recording: Recording,
+    recording: protocol.Recording,
     options: StreamOptions | None = None,
     *,
     check_images: bool = False,
@@ -94,14 +88,14 @@ def summarise(
     """
     options = options or StreamOptions()
     stream, checked = EventStream(recording, options), 0
-    parts: tuple[PartSpan, ...] = ()
+    parts: tuple[protocol.PartSpan, ...] = ()
     encodings: dict[int, str] = {}
     unread: list[str] = []
     try:
         for event in stream:
-            if isinstance(event, ImuBatch):
+            if isinstance(event, protocol.ImuBatch):
                 continue
-            if isinstance(event, FrameSet):
+            if isinstance(event, protocol.FrameSet):
                 for image in event.images:
                     if image.camera not in encodings:
                         encodings[image.camera] = _encoding(image, unread)
@@ -121,7 +115,7 @@ def summarise(
     return dataclasses.replace(report, parts=parts, notes=(note, *report.notes))
 
 
-def _encoding(image: CameraImage, unread: list[str]) -> str:
+def _encoding(image: protocol.CameraImage, unread: list[str]) -> str:
     """Return the encoding of an image, empty if it cannot be read, which is added to `unread`."""
     try:
         image.data.check()
@@ -132,7 +126,7 @@ def _encoding(image: CameraImage, unread: list[str]) -> str:
 
 
 def _report(
-    recording: Recording,
+    recording: protocol.Recording,
     statistics: StreamStatistics,
     checked: int,
     options: StreamOptions,
@@ -164,7 +158,7 @@ def _report(
 
 
 def _notes(
-    recording: Recording,
+    recording: protocol.Recording,
     statistics: StreamStatistics,
     options: StreamOptions,
     encodings: dict[int, str],
@@ -262,7 +256,9 @@ def _imu_summary(statistics: StreamStatistics, start_ns: int) -> ImuSummary:
     )
 
 
-def _camera_summary(recording: Recording, row: int, times: Times, unmatched: int) -> CameraSummary:
+def _camera_summary(
+    recording: protocol.Recording, row: int, times: Times, unmatched: int
+) -> CameraSummary:
     camera = recording.device.cameras[row]
     return CameraSummary(
         camera=row,

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F32
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.resources.matching import (
-    MS_TO_NS,
-    camera_frames,
-    frames_without,
-    matched_files,
-    mission_rig,
-    stamped_files,
-)
+from maplab_py.interop.resources import matching
 from maplab_py.interop.resources.reports import ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
@@ -73,16 +66,16 @@ def import_depth_maps(
         MapError: A file is damaged, or of another size than the camera's images.
     """
     options = options or DepthImportOptions()
-    cameras = mission_rig(vi_map, mission).cameras
+    cameras = matching.mission_rig(vi_map, mission).cameras
     if not 0 <= camera < len(cameras):
         raise UserError(f"--camera={camera}: the mission has cameras 0 to {len(cameras) - 1}")
-    times, files = stamped_files(folder, (".png",), "--depth_folder")
-    frames = camera_frames(vi_map, mission, camera)
-    wanted = frames_without(vi_map, frames, (RAW_DEPTH_MAPS,))
-    matches = matched_files(
+    times, files = matching.stamped_files(folder, (".png",), "--depth_folder")
+    frames = matching.camera_frames(vi_map, mission, camera)
+    wanted = matching.frames_without(vi_map, frames, (RAW_DEPTH_MAPS,))
+    matches = matching.matched_files(
         vi_map.frames.timestamp_ns[wanted],
         times + cameras[camera].time_offset_ns,
-        round(options.image_tolerance_ms * MS_TO_NS),
+        round(options.image_tolerance_ms * matching.MS_TO_NS),
     )
     matched = np.flatnonzero(matches >= 0)
     if not len(matched) and len(wanted) == len(frames):

@@ -12,13 +12,7 @@ from maplab_py.interop.images import as_8_bits
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
 from maplab_py.interop.recordings.images import EncodedImage
 from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors
-from maplab_py.interop.resources.matching import (
-    MS_TO_NS,
-    camera_frames,
-    frames_without,
-    matched_files,
-    mission_rig,
-)
+from maplab_py.interop.resources import matching
 from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.output_files import write_bytes, write_text
@@ -67,7 +61,7 @@ def import_images(
     root = image_root(folder)
     if root is None:
         raise UserError(f"--dataset_folder={folder}: there is no folder mav0/cam0 or cam0")
-    rig = mission_rig(vi_map, mission)
+    rig = matching.mission_rig(vi_map, mission)
     recording = FolderRecording(root, RecordedSensors(vi_map.sensors, rig.id))
     images = [item for item in recording.items() if isinstance(item, CameraImage)]
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
@@ -75,13 +69,13 @@ def import_images(
     owners: list[int] = []
     skipped = without = 0
     for camera in range(len(rig.cameras)):
-        frames = camera_frames(vi_map, mission, camera, options.every_nth)
-        wanted = frames_without(vi_map, frames, (RAW_GREY, RAW_COLOUR))
+        frames = matching.camera_frames(vi_map, mission, camera, options.every_nth)
+        wanted = matching.frames_without(vi_map, frames, (RAW_GREY, RAW_COLOUR))
         skipped += len(frames) - len(wanted)
         of_camera = [image for image in images if image.camera == camera]
         times = np.array([image.time_ns for image in of_camera], dtype=np.int64)
-        tolerance_ns = round(options.image_tolerance_ms * MS_TO_NS)
-        matches = matched_files(vi_map.frames.timestamp_ns[wanted], times, tolerance_ns)
+        tolerance_ns = round(options.image_tolerance_ms * matching.MS_TO_NS)
+        matches = matching.matched_files(vi_map.frames.timestamp_ns[wanted], times, tolerance_ns)
         without += int(np.count_nonzero(matches < 0))
         for done, (frame, match) in enumerate(zip(wanted.tolist(), matches.tolist(), strict=True)):
             progress.step(done, len(wanted), f"images of camera {camera}")

@@ -17,24 +17,17 @@ from maplab_py.storage.protobuf.descriptor_layout import Blocks, read_blocks, un
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_field, unknown_bytes
 from maplab_py.storage.protobuf.map_files import COPY_AGAIN
 from maplab_py.storage.protobuf.message_numbers import Name
+from maplab_py.vimap import tables
 from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
 from maplab_py.vimap.table import object_column, starts_of_counts
-from maplab_py.vimap.tables import (
-    DescriptorLayout,
-    FrameField,
-    Frames,
-    Keypoints,
-    LandmarkQuality,
-    Landmarks,
-)
 
 _OPTIONAL = {
-    FrameField.SIGMA: ("sigmas_px", 1),
-    FrameField.SCALE: ("scales", 1),
-    FrameField.TRACK_ID: ("track_ids", 1),
-    FrameField.POSITION_3D: ("positions_3d", 3),
-    FrameField.TIME_OFFSET: ("time_offsets_ns", 1),
-    FrameField.LANDMARK_ID: ("landmark_ids", 1),
+    tables.FrameField.SIGMA: ("sigmas_px", 1),
+    tables.FrameField.SCALE: ("scales", 1),
+    tables.FrameField.TRACK_ID: ("track_ids", 1),
+    tables.FrameField.POSITION_3D: ("positions_3d", 3),
+    tables.FrameField.TIME_OFFSET: ("time_offsets_ns", 1),
+    tables.FrameField.LANDMARK_ID: ("landmark_ids", 1),
 }
 _FILE_FIELDS = {"uv_px": "keypoints_px", "sigma_px": "sigmas_px", "scale": "scales"}
 
@@ -43,8 +36,8 @@ _FILE_FIELDS = {"uv_px": "keypoints_px", "sigma_px": "sigmas_px", "scale": "scal
 class FrameContent:
     """Frames with keypoints; landmarks of keypoints still as ids."""
 
-    frames: Frames
-    keypoints: Keypoints
+    frames: tables.Frames
+    keypoints: tables.Keypoints
     landmark_ids: U64  # (K, 2), zero = none
     name: Name  # file and id of a frame (row)
 
@@ -85,7 +78,7 @@ def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> Frame
     counts = [_checked_count(frame, place, name) for place, frame in enumerate(frames)]
     present = [_present(frame) for frame in frames]
     described = [_descriptors(frame, counts[k], k, name) for k, frame in enumerate(frames)]
-    table = Frames.filled(
+    table = tables.Frames.filled(
         len(frames),
         id=ids,
         vertex=[row for row, _, _ in owned],
@@ -103,7 +96,7 @@ def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> Frame
 
 def read_landmarks(
     vertices: list[Any], vertex_name: Name
-) -> tuple[Landmarks, dict[str, U64 | I64]]:
+) -> tuple[tables.Landmarks, dict[str, U64 | I64]]:
     """Return landmarks by vertex row, and the columns of `ListedObservations`.
 
     Raises:
@@ -125,7 +118,7 @@ def read_landmarks(
     for place, (lm, count) in enumerate(zip(landmarks, counts, strict=True)):
         if not count == len(lm.keypoint_indices) == len(lm.frame_indices):
             raise MapError(f"{name(place)}: its three lists of observations differ in length")
-    table = Landmarks.filled(
+    table = tables.Landmarks.filled(
         len(landmarks),
         id=ids,
         vertex=[row for row, _ in owned],
@@ -138,7 +131,7 @@ def read_landmarks(
             [lm.covariance for lm in landmarks], 3, "covariance", name
         ),
         quality=message_numbers.choices(
-            [lm.quality for lm in landmarks], len(LandmarkQuality), "quality", name
+            [lm.quality for lm in landmarks], len(tables.LandmarkQuality), "quality", name
         ),
         feature_type=[lm.feature_type for lm in landmarks],
         unknown=object_column([unknown_bytes(lm) for lm in landmarks]),
@@ -213,19 +206,19 @@ def _checked_count(frame: Any, place: int, name: Name) -> int:
 
 def _descriptors(
     frame: Any, count: int, place: int, name: Name
-) -> tuple[DescriptorLayout, Blocks | None]:
+) -> tuple[tables.DescriptorLayout, Blocks | None]:
     try:
         return read_blocks(frame.descriptors, frame.descriptor_types, count)
     except MapError as error:
         raise MapError(f"{name(place)}: {error}; {COPY_AGAIN}") from error
 
 
-def _descriptor_table(table: Frames, max_bytes: int) -> NDArray[np.uint8]:
+def _descriptor_table(table: tables.Frames, max_bytes: int) -> NDArray[np.uint8]:
     """Return zeros (K, widest) for the descriptors; every row is as wide as the widest."""
     return np.zeros(check_descriptor_table(table, max_bytes), dtype=np.uint8)
 
 
-def check_descriptor_table(table: Frames, max_bytes: int) -> tuple[int, int]:
+def check_descriptor_table(table: tables.Frames, max_bytes: int) -> tuple[int, int]:
     """Return the shape (K, widest) of the table of descriptors.
 
     Raises:
@@ -259,7 +252,9 @@ def _present(frame: Any) -> int:
     return sum(int(bit) for bit, (name, _) in _OPTIONAL.items() if len(getattr(frame, name)))
 
 
-def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int) -> FrameContent:
+def _with_keypoints(
+    table: tables.Frames, frames: list[Any], name: Name, max_bytes: int
+) -> FrameContent:
     counts = table.keypoint_count
     total = int(counts.sum())
     columns: dict[str, NDArray[Any]] = {
@@ -271,9 +266,9 @@ def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int
         "position_3d": np.zeros((total, 0)),
         "time_offset_ns": np.zeros((total, 0), dtype=np.int32),
     }
-    if (table.present & FrameField.POSITION_3D).any():
+    if (table.present & tables.FrameField.POSITION_3D).any():
         columns["position_3d"] = np.zeros((total, 3))
-    if (table.present & FrameField.TIME_OFFSET).any():
+    if (table.present & tables.FrameField.TIME_OFFSET).any():
         columns["time_offset_ns"] = np.zeros((total, 1), dtype=np.int32)
     begin = 0
     for place, (frame, count) in enumerate(zip(frames, counts.tolist(), strict=True)):
@@ -289,7 +284,7 @@ def _with_keypoints(table: Frames, frames: list[Any], name: Name, max_bytes: int
         message_numbers.finite(values, _FILE_FIELDS[field], lambda row: name(int(owner[row])))
     return FrameContent(
         frames=table,
-        keypoints=Keypoints.filled(total, **columns),
+        keypoints=tables.Keypoints.filled(total, **columns),
         landmark_ids=_landmark_ids(frames, counts, name),
         name=name,
     )

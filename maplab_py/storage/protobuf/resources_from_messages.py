@@ -10,13 +10,8 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.protobuf import map_files
 from maplab_py.storage.protobuf.ids import ids_of
-from maplab_py.storage.protobuf.map_files import (
-    METADATA,
-    RESOURCE_INFO,
-    read_message,
-    read_text_message,
-)
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content
 from maplab_py.vimap import MapMetadata, ResourceOwner
@@ -26,15 +21,15 @@ from maplab_py.vimap.tables import Resources
 
 def read_metadata(folder: Path, max_bytes: int) -> tuple[MapMetadata, list[str]]:
     """Return the content of the folder's `metadata` file and notes; defaults if it is missing."""
-    path = folder / METADATA
+    path = folder / map_files.METADATA
     if not path.is_file():
         return MapMetadata(map_folder=str(folder)), []
     message, notes = pb.MetaData(), []
     try:
-        read_text_message(path, message, max_bytes)
+        map_files.read_text_message(path, message, max_bytes)
     except MapError as error:  # other programs may write more fields, which are not needed here
         message = pb.MetaData()
-        read_text_message(path, message, max_bytes, allow_unknown_field=True)
+        map_files.read_text_message(path, message, max_bytes, allow_unknown_field=True)
         notes.append(f"{str(error).removeprefix(f'{folder}/')}: the unknown field is ignored")
     in_use = message.resource_folder_in_use if message.HasField("resource_folder_in_use") else -1
     metadata = MapMetadata(
@@ -67,11 +62,11 @@ def read_resources(
         _of_sensors(content.missions),
     ]
     table = Resources.concatenate(parts)
-    path = folder / RESOURCE_INFO
+    path = folder / map_files.RESOURCE_INFO
     if not path.is_file() or not path.stat().st_size:
         return table
     info = pb.ResourceInfoMap()
-    read_message(path, info, budget)
+    map_files.read_message(path, info, budget)
     if not len(info.resource_type) == len(info.resource_id) == len(info.resource_info):
         raise MapError(f"{path}: its three lists differ in length")
     if not all(entry.HasField("folder_idx") for entry in info.resource_info):

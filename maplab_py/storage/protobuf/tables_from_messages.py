@@ -16,30 +16,18 @@ from maplab_py.errors import MapError
 from maplab_py.storage.protobuf import message_numbers
 from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
 from maplab_py.storage.protobuf.message_numbers import Name
+from maplab_py.vimap import tables
 from maplab_py.vimap.ids import IdIndex, as_keys, is_valid, to_hex
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    Backbone,
-    BaseFrames,
-    ImuEdges,
-    ImuSamples,
-    LoopClosureEdges,
-    Missions,
-    MissionSensor,
-    TransformationEdges,
-    TransformationKind,
-    Vertices,
-)
 
 SENSOR_FIELDS = {
-    MissionSensor.NCAMERA: "ncamera_id",
-    MissionSensor.IMU: "imu_id",
-    MissionSensor.LIDAR: "lidar_id",
-    MissionSensor.ODOMETRY_6DOF: "odometry_6dof_id",
-    MissionSensor.LOOP_CLOSURE: "loop_closure_id",
-    MissionSensor.ABSOLUTE_6DOF: "absolute_6dof_id",
-    MissionSensor.DETECTION: "detection_id",
-    MissionSensor.WHEEL_ODOMETRY: "wheel_odometry_id",
+    tables.MissionSensor.NCAMERA: "ncamera_id",
+    tables.MissionSensor.IMU: "imu_id",
+    tables.MissionSensor.LIDAR: "lidar_id",
+    tables.MissionSensor.ODOMETRY_6DOF: "odometry_6dof_id",
+    tables.MissionSensor.LOOP_CLOSURE: "loop_closure_id",
+    tables.MissionSensor.ABSOLUTE_6DOF: "absolute_6dof_id",
+    tables.MissionSensor.DETECTION: "detection_id",
+    tables.MissionSensor.WHEEL_ODOMETRY: "wheel_odometry_id",
 }
 
 
@@ -116,10 +104,10 @@ def required_rows(index: IdIndex, ids: U64, field: str, name: Name) -> I64:
     return rows
 
 
-def read_baseframes(content: Content) -> BaseFrames:
+def read_baseframes(content: Content) -> tables.BaseFrames:
     """Return the base frames in file order."""
     frames, name = content.baseframes, content.namer("baseframes")
-    return BaseFrames.filled(
+    return tables.BaseFrames.filled(
         len(frames),
         id=content.baseframe_ids,
         T_G_M=message_numbers.poses([b.T_G_M for b in frames], "T_G_M", name),
@@ -133,10 +121,10 @@ def read_baseframes(content: Content) -> BaseFrames:
 
 def read_missions(
     content: Content, baseframe_rows: IdIndex, vertex_rows: IdIndex, vertex_mission: I64
-) -> Missions:
+) -> tables.Missions:
     """Return the missions in file order; `vertex_mission` is the mission row of each vertex."""
     missions = content.missions
-    sensor_id = np.zeros((len(missions), len(MissionSensor), 2), dtype=np.uint64)
+    sensor_id = np.zeros((len(missions), len(tables.MissionSensor), 2), dtype=np.uint64)
     for kind, field in SENSOR_FIELDS.items():
         sensor_id[:, kind] = ids_of(
             [getattr(m, field) for m in missions], field, content.namer("missions")
@@ -153,24 +141,24 @@ def read_missions(
     if len(rootless):
         raise MapError(f"{name(int(rootless[0]))}: has vertices but no root vertex")
     baseframe_ids = ids_of([m.baseframe_id for m in missions], "base frame", name)
-    return Missions.filled(
+    return tables.Missions.filled(
         len(missions),
         id=content.mission_ids,
         baseframe=required_rows(baseframe_rows, baseframe_ids, "base frame", name),
         root_vertex=root,
         backbone=message_numbers.choices(
-            [m.backbone for m in missions], len(Backbone), "backbone", name
+            [m.backbone for m in missions], len(tables.Backbone), "backbone", name
         ),
         sensor_id=sensor_id,
         unknown=_objects([unknown_bytes(m) for m in missions]),
     )
 
 
-def read_vertices(vertices: list[Any], ids: U64, timestamp_ns: I64, name: Name) -> Vertices:
+def read_vertices(vertices: list[Any], ids: U64, timestamp_ns: I64, name: Name) -> tables.Vertices:
     """Return the vertices in the given order, still without missions."""
     T_M_I = message_numbers.rows([v.T_M_I for v in vertices], 7, "T_M_I", name)
     message_numbers.check_poses(T_M_I, "T_M_I", name)
-    return Vertices.filled(
+    return tables.Vertices.filled(
         len(vertices),
         id=ids,
         T_M_I=T_M_I,
@@ -183,14 +171,14 @@ def read_vertices(vertices: list[Any], ids: U64, timestamp_ns: I64, name: Name) 
     )
 
 
-def read_absolute_poses(vertices: list[Any], vertex_name: Name) -> AbsolutePoses:
+def read_absolute_poses(vertices: list[Any], vertex_name: Name) -> tables.AbsolutePoses:
     """Return the absolute measurements of the vertices (in row order)."""
     owned = [(row, m) for row, v in enumerate(vertices) for m in v.absolute_poses]
 
     def name(place: int) -> str:
         return vertex_name(owned[place][0])
 
-    return AbsolutePoses.filled(
+    return tables.AbsolutePoses.filled(
         len(owned),
         vertex=[row for row, _ in owned],
         timestamp_ns=[m.timestamp_ns for _, m in owned],
@@ -205,7 +193,7 @@ def read_absolute_poses(vertices: list[Any], vertex_name: Name) -> AbsolutePoses
 
 def read_imu_edges(
     content: Content, rows: list[int], vertex_rows: IdIndex
-) -> tuple[ImuEdges, ImuSamples]:
+) -> tuple[tables.ImuEdges, tables.ImuSamples]:
     """Return inertial edges (rows in file order), sorted by their first vertex, with samples."""
     edges = [content.edges[k].imu for k in rows]
     ids = content.edge_ids[rows]
@@ -220,7 +208,7 @@ def read_imu_edges(
                 f"{name(row)}: {len(edge.accel_gyro)} measured numbers do not fit "
                 f"{count} time stamps (6 each)"
             )
-    table = ImuEdges.filled(
+    table = tables.ImuEdges.filled(
         len(edges),
         id=ids[order],
         from_vertex=first[order],
@@ -230,7 +218,7 @@ def read_imu_edges(
     )
     times = [np.array(e.timestamps_ns, dtype=np.int64) for e in edges]
     data = [np.array(e.accel_gyro, dtype=np.float64) for e in edges]
-    samples = ImuSamples(
+    samples = tables.ImuSamples(
         timestamp_ns=np.concatenate(times) if times else np.zeros(0, dtype=np.int64),
         accel_gyro=(np.concatenate(data) if data else np.zeros(0)).reshape(-1, 6),
     )
@@ -242,14 +230,14 @@ def read_imu_edges(
 def read_transformation_edges(
     content: Content,
     rows: list[int],
-    kinds: list[TransformationKind],
+    kinds: list[tables.TransformationKind],
     edges: list[Any],
     vertex_rows: IdIndex,
-) -> TransformationEdges:
+) -> tables.TransformationEdges:
     """Return relative-pose edges (rows in file order), sorted by their first vertex."""
     name = content.namer("edges", rows)
     first, second = _ends(edges, vertex_rows, name)
-    table = TransformationEdges.filled(
+    table = tables.TransformationEdges.filled(
         len(edges),
         id=content.edge_ids[rows],
         kind=[int(kind) for kind in kinds],
@@ -265,12 +253,14 @@ def read_transformation_edges(
     return table.take(np.lexsort((second, first, table.kind)))
 
 
-def read_loop_closures(content: Content, rows: list[int], vertex_rows: IdIndex) -> LoopClosureEdges:
+def read_loop_closures(
+    content: Content, rows: list[int], vertex_rows: IdIndex
+) -> tables.LoopClosureEdges:
     """Return loop-closure edges (rows in file order)."""
     edges = [content.edges[k].loop_closure for k in rows]
     name = content.namer("edges", rows)
     first, second = _ends(edges, vertex_rows, name)
-    return LoopClosureEdges.filled(
+    return tables.LoopClosureEdges.filled(
         len(edges),
         id=content.edge_ids[rows],
         from_vertex=first,

@@ -12,14 +12,7 @@ import numpy as np
 from maplab_py.cancellation import check_cancelled, lasting_effect
 from maplab_py.errors import UserError
 from maplab_py.options import Options
-from maplab_py.storage.resources.store import (
-    MAP_FOLDER,
-    copied_to_external,
-    existing_files,
-    in_map_folder,
-    relative_path,
-    resource_path,
-)
+from maplab_py.storage.resources import store
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import ConsistencyReport, Violation
 
@@ -36,8 +29,8 @@ def missing_files(vi_map: VIMap, map_folder: Path | None) -> list[Path]:
     """Return the files of resources that are not there; relative where the map has no folder."""
     missing = [path for path in _paths(vi_map, map_folder) if not path.is_file()]
     if map_folder is None:
-        rows = np.flatnonzero(vi_map.resources.folder == MAP_FOLDER)
-        missing += [relative_path(vi_map, row) for row in rows.tolist()]
+        rows = np.flatnonzero(vi_map.resources.folder == store.MAP_FOLDER)
+        missing += [store.relative_path(vi_map, row) for row in rows.tolist()]
     return missing
 
 
@@ -48,8 +41,8 @@ def _paths(vi_map: VIMap, map_folder: Path | None) -> Iterator[Path]:
     """
     listed = len(vi_map.metadata.external_resource_folders)
     for row, folder in enumerate(vi_map.resources.folder.tolist()):
-        if 0 <= folder < listed or (folder == MAP_FOLDER and map_folder is not None):
-            yield resource_path(vi_map, row, map_folder or Path())
+        if 0 <= folder < listed or (folder == store.MAP_FOLDER and map_folder is not None):
+            yield store.resource_path(vi_map, row, map_folder or Path())
 
 
 def orphaned_files(maps: Iterable[VIMap], home: VIMap, map_folder: Path | None) -> list[Path]:
@@ -109,7 +102,7 @@ def with_merged_folders(vi_map: VIMap, map_folder: Path | None) -> tuple[VIMap, 
     metadata = vi_map.metadata
     known: dict[str, int] = {}
     if map_folder is not None:
-        known[os.path.realpath(resource_folder(vi_map, map_folder))] = MAP_FOLDER
+        known[os.path.realpath(resource_folder(vi_map, map_folder))] = store.MAP_FOLDER
     kept: list[str] = []
     merged: list[str] = []
     place = []
@@ -124,15 +117,17 @@ def with_merged_folders(vi_map: VIMap, map_folder: Path | None) -> tuple[VIMap, 
     if not merged:
         return vi_map, []
     table = vi_map.resources
-    column = np.array([*place, MAP_FOLDER], dtype=np.int32)
+    column = np.array([*place, store.MAP_FOLDER], dtype=np.int32)
     in_use = metadata.resource_folder_in_use
     metadata = dataclasses.replace(
         metadata,
         external_resource_folders=tuple(kept),
         resource_folder_in_use=place[in_use] if 0 <= in_use < len(place) else in_use,
     )
-    inside = (table.folder >= MAP_FOLDER) & (table.folder < len(place))
-    folder = np.where(inside, column[np.where(inside, table.folder, MAP_FOLDER)], table.folder)
+    inside = (table.folder >= store.MAP_FOLDER) & (table.folder < len(place))
+    folder = np.where(
+        inside, column[np.where(inside, table.folder, store.MAP_FOLDER)], table.folder
+    )
     table = table.replace(folder=folder.astype(np.int32))
     return vi_map.replace(resources=table, metadata=metadata), merged
 
@@ -177,7 +172,7 @@ class ResourceMigration(Options):
         """Count the resource files to copy, and those to delete afterwards; nothing is written."""
         moved = self.move_resources_to_external_folder
         if moved or self.copy_resources_to_external_folder:
-            files = len(existing_files(vi_map, old_folder or folder))
+            files = len(store.existing_files(vi_map, old_folder or folder))
             return files, files if moved else 0
         _, copies, leaving = self.prepare(vi_map, old_folder, folder)
         return len(copies), len(leaving)
@@ -198,16 +193,16 @@ class ResourceMigration(Options):
         home = old_folder or folder
         external = self.copy_resources_to_external_folder or self.move_resources_to_external_folder
         if external:
-            before = [path for path, _ in existing_files(vi_map, home)]
-            moved = copied_to_external(vi_map, home, Path(external))
-            kept = {path.resolve() for path, _ in existing_files(moved, folder)}
+            before = [path for path, _ in store.existing_files(vi_map, home)]
+            moved = store.copied_to_external(vi_map, home, Path(external))
+            kept = {path.resolve() for path, _ in store.existing_files(moved, folder)}
             leaving = [path for path in before if path.resolve() not in kept]
             return moved, [], leaving if self.move_resources_to_external_folder else []
         to_map = self.copy_resources_to_map_folder or self.move_resources_to_map_folder
-        in_folder = np.flatnonzero(vi_map.resources.folder == MAP_FOLDER)
-        files = existing_files(vi_map, home, None if to_map else in_folder)
+        in_folder = np.flatnonzero(vi_map.resources.folder == store.MAP_FOLDER)
+        files = store.existing_files(vi_map, home, None if to_map else in_folder)
         if to_map:
-            vi_map = in_map_folder(vi_map)
+            vi_map = store.in_map_folder(vi_map)
         inside = (folder / "resources").resolve()
         leaving = [path for path, _ in files if not path.resolve().is_relative_to(inside)]
         return vi_map, files, leaving if self.move_resources_to_map_folder else []

@@ -9,20 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.self_calibration import reports
 from maplab_py.algorithms.self_calibration.device import device_of, with_device_of
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.options import GROUPS, SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import (
-    CollectionReport,
-    DatabaseParameter,
-    DatabaseReport,
-    DatabaseTable,
-    InformationReport,
-    KeptSegment,
-    ParameterReference,
-    SegmentScore,
-)
 from maplab_py.algorithms.self_calibration.segments.database import (
     Key,
     SegmentDatabase,
@@ -166,14 +157,14 @@ def segment_information(
     *,
     missions: NDArray[np.integer] | None = None,
     progress: Progress = SILENT,
-) -> tuple[InformationReport, list[I64]]:
+) -> tuple[reports.InformationReport, list[I64]]:
     """Score every segment alone; return the report and the segments' vertex rows."""
     by_group = dataclasses.replace(options, groups=",".join(GROUPS))
     evaluation = evaluate(vi_map, by_group, missions=missions, progress=progress)
     sigma_ref = evaluation.sigma_ref()
     time_ns = vi_map.vertices.timestamp_ns
     scores = tuple(
-        SegmentScore(
+        reports.SegmentScore(
             mission=record.mission,
             start_ns=record.begin_ns,
             end_ns=int(time_ns[segment.rows[-1]]),
@@ -187,10 +178,10 @@ def segment_information(
         )
     )
     reference = tuple(
-        ParameterReference(parameter.name, parameter.unit, sigma)
+        reports.ParameterReference(parameter.name, parameter.unit, sigma)
         for parameter, sigma in zip(evaluation.parameters.each, sigma_ref.tolist(), strict=True)
     )
-    report = InformationReport(options.metric, scores, reference, evaluation.seconds_each)
+    report = reports.InformationReport(options.metric, scores, reference, evaluation.seconds_each)
     return report, [segment.rows for segment in evaluation.segments]
 
 
@@ -201,7 +192,7 @@ def collect(
     *,
     missions: NDArray[np.integer] | None = None,
     progress: Progress = SILENT,
-) -> tuple[SegmentDatabase, CollectionReport]:
+) -> tuple[SegmentDatabase, reports.CollectionReport]:
     """Evaluate a map's segments and keep the best of them and of the database.
 
     New segments of a mission replace those in the database. A map whose calibration differs from the
@@ -236,7 +227,7 @@ def collect(
     )
     kept = added.with_only(best)
     new = {record.key for record in records}
-    report = CollectionReport(
+    report = reports.CollectionReport(
         segments_evaluated=len(records),
         segments_kept=len(kept),
         from_this_map=sum(record.key in new for record in kept.records),
@@ -295,14 +286,14 @@ def _best(
     return set(every.members())
 
 
-def kept_segments(database: SegmentDatabase) -> tuple[KeptSegment, ...]:
+def kept_segments(database: SegmentDatabase) -> tuple[reports.KeptSegment, ...]:
     """Return the rows of a report on the segments of a database, in the order of time."""
     members = database.members()
     begin: dict[str, int] = {}
     for record in database.records:
         begin[record.mission] = min(begin.get(record.mission, record.begin_ns), record.begin_ns)
     return tuple(
-        KeptSegment(
+        reports.KeptSegment(
             mission=record.mission[:8],
             begin_s=(record.begin_ns - begin[record.mission]) * 1e-9,
             duration_s=record.duration_s,
@@ -317,13 +308,13 @@ def kept_segments(database: SegmentDatabase) -> tuple[KeptSegment, ...]:
     )
 
 
-def describe_database(database: SegmentDatabase, file: Path) -> DatabaseReport:
+def describe_database(database: SegmentDatabase, file: Path) -> reports.DatabaseReport:
     """Return tables, scores, parameters and segments of a database that was read from a file."""
     tables = []
     for name in database.tables:
         scores = [record.scores[name] for record in database.ranked(name)]
         best, worst = (min(scores), max(scores)) if scores else (float("nan"), float("nan"))
-        tables.append(DatabaseTable(name, len(scores), best, worst))
+        tables.append(reports.DatabaseTable(name, len(scores), best, worst))
     sigma = [record.sigma for record in database.records] or [
         (float("nan"),) * len(database.sigma_ref)
     ]
@@ -334,7 +325,7 @@ def describe_database(database: SegmentDatabase, file: Path) -> DatabaseReport:
         strict=True,
     )
     vi_map = database.vi_map
-    return DatabaseReport(
+    return reports.DatabaseReport(
         file=file,
         metric=database.metric,
         selection=database.selection,
@@ -344,6 +335,6 @@ def describe_database(database: SegmentDatabase, file: Path) -> DatabaseReport:
         landmarks=len(vi_map.landmarks),
         imu_samples=len(vi_map.imu_samples),
         tables=tuple(tables),
-        parameters=tuple(DatabaseParameter(*column) for column in columns),
+        parameters=tuple(reports.DatabaseParameter(*column) for column in columns),
         segments=kept_segments(database),
     )
