@@ -22,8 +22,7 @@ from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import VIMap, ids
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import VIMap, ids, ragged_rows
 from maplab_py.vimap.tables import LandmarkQuality
 
 _VERTICES = (

@@ -20,9 +20,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.input_files import LARGEST, read_text
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
-from maplab_py.vimap import LoopClosureEdges, VIMap
+from maplab_py.vimap import LoopClosureEdges, VIMap, random_ids
 from maplab_py.vimap.edits import content_rng
-from maplab_py.vimap.ids import random_ids
 
 _MAX_TIME_NS = 20_000_000
 """Maximum time between an entry and a vertex, as in maplab; other entries are skipped."""

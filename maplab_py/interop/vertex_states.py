@@ -20,8 +20,7 @@ from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vect
 from maplab_py.interop.text_table import format_rows
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.output_files import write_text
-from maplab_py.vimap import VIMap, ids
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import VIMap, ids, ragged_rows
 from maplab_py.vimap.tables import MissionSensor
 
 ASL_FILE, RPG_FILE = "vertex_poses_velocities_biases.csv", "stamped_traj_estimate.txt"

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex_list
+from maplab_py.vimap import VIMap, to_hex_list
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,8 +14,7 @@ from maplab_py.errors import EstimationError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.plotting.figure import label, legend, mission_colour, mission_names, new_figure
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import mission_mask
+from maplab_py.vimap import VIMap, mission_mask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,8 +14,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project, project_with_jacobians
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 
 _LONGEST_GAP = 2
 """Largest number of vertices from one observation of a track to the next."""

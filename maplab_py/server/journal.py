@@ -18,9 +18,8 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.server.merging import Stretch, stretches_of
 from maplab_py.server.spool import Entry, Spool
 from maplab_py.storage.native import is_map_folder, load_map
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, to_hex_list
 from maplab_py.vimap.edits import remove_missions
-from maplab_py.vimap.ids import to_hex_list
 
 _FORMAT = 1
 

@@ -34,9 +34,8 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.server.alignments import OpenAlignments, with_cloud_loops
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.spool import with_resources_taken_in
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdArray, VIMap, from_hex, to_hex, to_hex_list
 from maplab_py.vimap.excerpts import Excerpt, excerpt
-from maplab_py.vimap.ids import IdArray, from_hex, to_hex, to_hex_list
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.submaps import append_submap
 

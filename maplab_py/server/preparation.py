@@ -29,8 +29,7 @@ from maplab_py.server.status import Events
 from maplab_py.server.worker import SubmapOrder
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import is_map_folder, load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 from maplab_py.vimap.queries import has_link
 
 _MAX_IMU_STEP_NS = 1_000_000_000

@@ -45,9 +45,8 @@ from maplab_py.server.publishing import Display, Publisher, pause_s
 from maplab_py.server.service import Service, answers
 from maplab_py.server.spool import Spool, locked_spool
 from maplab_py.server.status import Events, status_of
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, to_hex_list
 from maplab_py.vimap.edits import remove_missions
-from maplab_py.vimap.ids import to_hex_list
 
 logger = logging.getLogger(__name__)
 

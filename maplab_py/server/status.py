@@ -12,8 +12,7 @@ from maplab_py.progress import Progress
 from maplab_py.server.journal import Journal, read_journal
 from maplab_py.server.options import EventLine, RobotLine, ServerStatus
 from maplab_py.server.spool import Spool
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex_list
+from maplab_py.vimap import VIMap, to_hex_list
 
 if TYPE_CHECKING:
     from maplab_py.server.server import MapServer

@@ -20,9 +20,8 @@ from maplab_py.server.spool import Spool, push
 from maplab_py.storage.mission_names import with_folder_names
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.resources.store import existing_files, in_map_folder
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdArray, VIMap
 from maplab_py.vimap.excerpts import cut_by_time, mission_maps
-from maplab_py.vimap.ids import IdArray
 
 
 class SubmapWriter:

@@ -21,8 +21,7 @@ from maplab_py.simulation.session import session_map
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import from_hex, random_ids, to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, random_ids, to_hex
 
 _WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR = range(7)
 """Streams of random numbers; a session's number selects within a stream."""

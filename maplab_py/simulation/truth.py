@@ -23,8 +23,7 @@ from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_
 from maplab_py.simulation.recording import Recording
 from maplab_py.simulation.sensors import Device, mission_frame
 from maplab_py.simulation.world import World
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex, from_hex
+from maplab_py.vimap import IdIndex, VIMap, from_hex
 
 STATIONARY_MPS, STATIONARY_RADPS = 1e-3, 1e-3
 """Speed limits below which the body is at rest."""

@@ -23,9 +23,8 @@ from maplab_py.storage.protobuf.map_files import (
     FileKind,
 )
 from maplab_py.storage.protobuf.tables_from_messages import Content
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdIndex, VIMap, to_hex
 from maplab_py.vimap.consistency import Violation, check_loaded, check_saved
-from maplab_py.vimap.ids import IdIndex, to_hex
 
 _FIELDS = {
     FileKind.MISSIONS: ("missions", "mission_ids", "baseframes", "baseframe_ids"),

@@ -44,10 +44,8 @@ from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
 from maplab_py.storage.protobuf.vertex_parts import NO_TIME, JoinedParts, VertexPart
 from maplab_py.storage.reading_processes import parts_ahead
-from maplab_py.vimap import TransformationKind, VIMap
-from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
+from maplab_py.vimap import IdIndex, TransformationKind, VIMap, is_valid, starts_of_counts, to_hex
 from maplab_py.vimap.number_repair import without_bad_numbers
-from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.tables import Frames
 
 _TRANSFORMATIONS = {

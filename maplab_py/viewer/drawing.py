@@ -14,9 +14,7 @@ from maplab_py.geometry import so3
 from maplab_py.viewer import colours
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import Extent, Points, Scene, Segments
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex_list
-from maplab_py.vimap.queries import mission_labels
+from maplab_py.vimap import VIMap, mission_labels, to_hex_list
 
 _OUTLINE_POINTS = 1500
 _FAR_M = 2000.0

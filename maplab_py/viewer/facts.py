@@ -15,10 +15,7 @@ from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.report import counted
 from maplab_py.viewer.scene import Entity
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.ids import IdArray, to_hex
-from maplab_py.vimap.queries import mission_labels
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import IdArray, LandmarkQuality, VIMap, mission_labels, ragged_rows, to_hex
 
 Facts = tuple[tuple[str, str], ...]
 """Names and values, in the order in which they are shown."""

@@ -23,9 +23,7 @@ from maplab_py.viewer.layers.cameras import mission_cameras
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PointCloudOptions
 from maplab_py.viewer.scene import WHOLE_MAP
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_id, to_hex
 
 _MM = 1e-3
 _MAX_DEPTH_PIXELS = 20_000

@@ -1,5 +1,33 @@
 """The visual-inertial map: an immutable value made of columnar tables."""
 
+from maplab_py.vimap.descriptors import (
+    DescriptorBlock,
+    DescriptorDepth,
+    FeatureType,
+    type_name,
+    type_of_name,
+)
+from maplab_py.vimap.ids import (
+    IdArray,
+    IdIndex,
+    as_keys,
+    from_hex,
+    is_valid,
+    random_ids,
+    to_hex,
+    to_hex_list,
+)
+from maplab_py.vimap.queries import (
+    find_mission,
+    mission_labels,
+    mission_mask,
+    mission_sensor_id,
+    mission_time_spans_ns,
+    observation_counts,
+    observer_counts,
+)
+from maplab_py.vimap.resource_queries import resources_of, without_resources
+from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import (
     NO_ROW,
     AbsolutePoses,
@@ -27,7 +55,12 @@ __all__ = [
     "AbsolutePoses",
     "Backbone",
     "BaseFrames",
+    "DescriptorBlock",
+    "DescriptorDepth",
+    "FeatureType",
     "Frames",
+    "IdArray",
+    "IdIndex",
     "ImuEdges",
     "ImuSamples",
     "Keypoints",
@@ -43,4 +76,23 @@ __all__ = [
     "TransformationKind",
     "VIMap",
     "Vertices",
+    "as_keys",
+    "find_mission",
+    "from_hex",
+    "is_valid",
+    "mission_labels",
+    "mission_mask",
+    "mission_sensor_id",
+    "mission_time_spans_ns",
+    "observation_counts",
+    "observer_counts",
+    "ragged_rows",
+    "random_ids",
+    "resources_of",
+    "starts_of_counts",
+    "to_hex",
+    "to_hex_list",
+    "type_name",
+    "type_of_name",
+    "without_resources",
 ]

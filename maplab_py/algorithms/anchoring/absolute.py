@@ -19,9 +19,7 @@ from maplab_py.array_types import F64, I32, I64, U64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.options import Options
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, to_hex
 
 _PARTS = (slice(0, 3), slice(3, 6))
 """Position and orientation in a covariance."""

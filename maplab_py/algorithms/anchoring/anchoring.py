@@ -48,8 +48,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.geometry import yaw
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 
 _DEFAULT = AnchoringOptions()
 _ABSOLUTE = AbsoluteAnchoringOptions()

@@ -39,8 +39,7 @@ from maplab_py.algorithms.loop_closure.workflow import missions_joined
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import LoopClosureEdges, VIMap
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap
 from maplab_py.vision.absolute_pose import PoseSolutions
 
 

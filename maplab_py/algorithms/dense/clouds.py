@@ -23,8 +23,7 @@ from maplab_py.report import Report
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project, is_inside_image, project
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of
 
 
 @dataclasses.dataclass(frozen=True)

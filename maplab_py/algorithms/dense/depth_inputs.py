@@ -18,9 +18,7 @@ from maplab_py.interop.ply import parse_ply
 from maplab_py.progress import Progress
 from maplab_py.report import counted
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex
 
 _INPUT_TYPES = (9, 8, 17, 16, 21)
 """Resource types of depth, the preferred first: optimised, raw, clouds."""

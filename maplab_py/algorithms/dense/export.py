@@ -27,9 +27,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project
-from maplab_py.vimap import LandmarkQuality, ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import LandmarkQuality, ResourceOwner, VIMap, resources_of, to_hex
 
 _GREY = 128
 _SOURCES = 20

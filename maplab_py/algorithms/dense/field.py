@@ -24,9 +24,7 @@ from maplab_py.report import Report, counted
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of, without_resources
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex, without_resources
 
 _BLOCKS_AT_A_TIME = 128
 _BYTES_PER_BLOCK = 4 * BLOCK_SIDE**3 + 12

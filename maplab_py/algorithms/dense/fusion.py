@@ -34,9 +34,7 @@ from maplab_py.report import Report, counted
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import as_keys, to_hex
-from maplab_py.vimap.resource_queries import resources_of, without_resources
+from maplab_py.vimap import ResourceOwner, VIMap, as_keys, resources_of, to_hex, without_resources
 
 GRID_TYPE = 18
 """Number of the resource type of grids of truncated signed distances."""

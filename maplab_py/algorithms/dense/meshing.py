@@ -18,8 +18,7 @@ from maplab_py.interop.mesh_files import write_mesh
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.projection import is_inside_image, project
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of
 
 
 @dataclasses.dataclass(frozen=True)

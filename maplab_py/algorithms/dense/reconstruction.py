@@ -31,9 +31,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of, without_resources
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex, without_resources
 
 OUTPUT_TYPES = (RAW_DEPTH_MAPS, COLOUR_CLOUDS)
 _NEIGHBOURS_EACH_WAY = 3

@@ -12,9 +12,8 @@ from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig
 from maplab_py.sensors.sensor_set import Sensor
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdArray, VIMap, as_keys, is_valid
 from maplab_py.vimap.comparison import is_same
-from maplab_py.vimap.ids import IdArray, as_keys, is_valid
 from maplab_py.vimap.sensor_merge import same_calibration
 
 _TABLES = (

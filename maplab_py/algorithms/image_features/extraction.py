@@ -18,10 +18,7 @@ from maplab_py.array_types import I64, U8, Mask
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.descriptors import type_name
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex, type_name
 from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures, checked, plugin_extractor
 from maplab_py.vision.features.extractors import KINDS, extract

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import DescriptorBlock
+from maplab_py.vimap import DescriptorBlock, VIMap
 from maplab_py.vimap.keypoint_removal import remove_keypoints
 from maplab_py.vimap.table import object_column, starts_of_counts
 from maplab_py.vimap.tables import DescriptorLayout, FrameField, Keypoints

@@ -15,9 +15,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import type_name
-from maplab_py.vimap.queries import mission_mask
+from maplab_py.vimap import VIMap, mission_mask, type_name
 from maplab_py.vimap.tables import FrameField
 from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images

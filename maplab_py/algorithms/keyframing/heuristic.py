@@ -11,9 +11,7 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions, Keyframin
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import mission_mask, observation_counts
-from maplab_py.vimap.table import starts_of_counts
+from maplab_py.vimap import VIMap, mission_mask, observation_counts, starts_of_counts
 from maplab_py.vimap.vertex_removal import remove_vertices_counted
 
 

@@ -13,9 +13,7 @@ from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.sensors import Camera, Projection
 from maplab_py.sensors.camera import Distortion
 from maplab_py.sensors.projection import back_project
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import MissionSensor, VIMap, ragged_rows, to_hex
 from maplab_py.vision.point_covariance import covariance_by_rays
 
 _TILE_PX = 4.0

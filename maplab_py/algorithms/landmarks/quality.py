@@ -16,10 +16,8 @@ from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import LandmarkQuality, VIMap, ragged_rows, starts_of_counts, to_hex
 from maplab_py.vimap.queries import landmark_mask
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 _USUAL_SIGMA_PX = 1.0
 """Standard deviation of keypoints of which the map has none."""

@@ -12,8 +12,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Projection
 from maplab_py.sensors.projection import back_project, project
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 LIDAR_FEATURE_TYPES = (21,)
 """Feature types (proto values) whose keypoints carry a 3-D position."""

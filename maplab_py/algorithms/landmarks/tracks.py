@@ -10,11 +10,9 @@ from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangul
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, mission_mask, ragged_rows, starts_of_counts
 from maplab_py.vimap.descriptors import NO_DESCRIPTOR, FeatureType
 from maplab_py.vimap.edits import add_landmarks
-from maplab_py.vimap.queries import mission_mask
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 
 def init_tracks(

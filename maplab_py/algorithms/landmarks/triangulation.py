@@ -11,10 +11,9 @@ from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residu
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import triangulation
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vimap.edits import with_p_G
 from maplab_py.vimap.queries import landmark_mask
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 
 def retriangulate(

@@ -22,10 +22,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, starts_of_counts, to_hex_list
 from maplab_py.vimap.descriptors import sizes_of_type
-from maplab_py.vimap.ids import to_hex_list
-from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.projection import DescriptorProjection
 
 _ROUNDS = 15

@@ -17,8 +17,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.array_types import I32, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 
 _MIN_SHARED_LANDMARKS = 5
 """Number of common landmarks above which vertices belong to the same place."""

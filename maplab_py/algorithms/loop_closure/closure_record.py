@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.errors import MapError
 from maplab_py.storage import extension_fields
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex, to_hex_list
+from maplab_py.vimap import IdIndex, VIMap, to_hex_list
 from maplab_py.vimap.table import Table, column
 
 FIELD_NUMBER = extension_fields.LOOP_RECORD

@@ -11,9 +11,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import so3
-from maplab_py.vimap import LoopClosureEdges, VIMap
-from maplab_py.vimap.ids import IdArray
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import IdArray, LoopClosureEdges, VIMap, ragged_rows, starts_of_counts
 
 VERDICTS = tuple(Verdict)
 """Codes of the `verdict` column are indices into this tuple."""

@@ -30,8 +30,7 @@ from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 from maplab_py.vision.index import MatchRule
 from maplab_py.vision.projection import DescriptorProjection

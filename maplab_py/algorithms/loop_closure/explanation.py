@@ -21,8 +21,7 @@ from maplab_py.array_types import I64, Mask
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex, to_hex_list
+from maplab_py.vimap import VIMap, to_hex, to_hex_list
 
 _NEAREST = 5
 

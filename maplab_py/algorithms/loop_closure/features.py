@@ -13,7 +13,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
 from maplab_py.memory import require_memory
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap, to_hex
 from maplab_py.vimap.descriptors import (
     DescriptorDepth,
     FeatureType,
@@ -21,7 +21,6 @@ from maplab_py.vimap.descriptors import (
     type_name,
     types_of,
 )
-from maplab_py.vimap.ids import to_hex
 from maplab_py.vision.descriptor_kind import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.kmeans import kmeans, nearest_centre

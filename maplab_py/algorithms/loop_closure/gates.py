@@ -40,8 +40,7 @@ from maplab_py.algorithms.loop_closure.record_updates import banned
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 from maplab_py.vision.absolute_pose import PoseSolutions
 
 _DRIFT_OFFSET_M = 0.5

@@ -19,8 +19,7 @@ from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3, symmetric
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import differences
 from maplab_py.vision.rays_and_points import Rays, points_near_rays
 

@@ -22,8 +22,7 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.output_files import write_text
 from maplab_py.report import to_json
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdArray, IdIndex, to_hex, to_hex_list
+from maplab_py.vimap import IdArray, IdIndex, VIMap, to_hex, to_hex_list
 
 
 def list_closures(

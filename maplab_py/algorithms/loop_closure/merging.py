@@ -18,10 +18,8 @@ from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, observer_counts, ragged_rows, starts_of_counts
 from maplab_py.vimap.edits import merge_landmarks, with_p_G
-from maplab_py.vimap.queries import observer_counts
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vision.point_covariance import ClosurePoses, LandmarkPairs, squared_sigmas
 from maplab_py.vision.track_union import unite_tracks
 

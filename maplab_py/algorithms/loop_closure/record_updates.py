@@ -23,9 +23,8 @@ from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verd
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdArray, IdIndex, VIMap, to_hex_list
 from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges, with_p_G
-from maplab_py.vimap.ids import IdArray, IdIndex, to_hex_list
 
 REMOVED = VERDICTS.index(Verdict.REMOVED)
 _BAN_REACH_M = 2.0

@@ -18,8 +18,7 @@ from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
-from maplab_py.vimap import LoopClosureEdges, VIMap
-from maplab_py.vimap.ids import IdIndex, to_hex
+from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap, to_hex
 
 _DEFAULT = LoopClosureOptions()
 _EVERYTHING = SearchScope()

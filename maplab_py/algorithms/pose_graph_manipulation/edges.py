@@ -11,8 +11,7 @@ from maplab_py.algorithms.pose_graph_manipulation.stationary_options import Stat
 from maplab_py.array_types import F64
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import LoopClosureEdges, TransformationKind, VIMap
-from maplab_py.vimap.ids import IdIndex, to_hex
+from maplab_py.vimap import IdIndex, LoopClosureEdges, TransformationKind, VIMap, to_hex
 
 
 class EdgeType(Enum):

@@ -40,8 +40,7 @@ from maplab_py.estimation.problem.cluster_robust import cluster_robust_covarianc
 from maplab_py.estimation.states import States
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 
 _MAX_PRIOR_SHARE = 0.3**2
 """Data that leave more of the prior's variance in a direction are refused: if a device is one prior

@@ -12,9 +12,7 @@ from maplab_py.geometry import se3
 from maplab_py.interop.calibration_import import CalibrationFile
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.calibration_transfer import Device, corresponding_device, with_calibration_of
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.ids import from_hex
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, from_hex, mission_sensor_id
 
 _USUAL_IMU_RATE_HZ = 200.0
 

@@ -14,9 +14,8 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap, observation_counts, observer_counts
 from maplab_py.vimap.edits import remove_landmarks
-from maplab_py.vimap.queries import observation_counts, observer_counts
 from maplab_py.vision.projection import DIMENSIONS
 
 

@@ -17,8 +17,7 @@ from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import CameraRig
 from maplab_py.storage.summary_map import SummaryMap
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import FeatureType, type_name
+from maplab_py.vimap import FeatureType, VIMap, type_name
 from maplab_py.vision.projection import DescriptorProjection
 
 _FLAT_DIRECTION_SIGMA_M = 10.0

@@ -17,8 +17,7 @@ from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, Projection, SensorSet
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.wheels import with_wheel_scale
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from maplab_py.estimation.terms.inertial_calibration import ACCEL, GYRO, ROTATIO
 from maplab_py.estimation.terms.pose import MOUNTING
 from maplab_py.estimation.terms.wheel import WHEEL_SCALE
 from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 
 _MATRIX = ["[0,0]", "[1,1]", "[2,2]", "[0,1]", "[0,2]", "[1,2]"]
 _ROTATION = ["rotation x [rad]", "rotation y [rad]", "rotation z [rad]"]

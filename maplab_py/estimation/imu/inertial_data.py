@@ -12,9 +12,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.kernels.imu import EdgeSamples
 from maplab_py.sensors import Imu
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts, to_hex
 from maplab_py.vimap.tables import MissionSensor
 
 

@@ -32,9 +32,7 @@ from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import back_project, project
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import from_hex
-from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
+from maplab_py.vimap import ResourceOwner, VIMap, from_hex, mission_labels, mission_time_spans_ns
 
 if TYPE_CHECKING:
     from maplab_py.interop.recordings.bag_files import BagReader

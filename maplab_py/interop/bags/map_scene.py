@@ -16,8 +16,7 @@ from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings import bag_writing
 from maplab_py.interop.recordings.bag_layouts import pose_messages
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.queries import mission_labels
+from maplab_py.vimap import LandmarkQuality, VIMap, mission_labels
 
 _FRAME = "map"
 _POSE = "geometry_msgs/msg/PoseStamped"

@@ -19,8 +19,7 @@ from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
 from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import mission_labels, mission_time_spans_ns
+from maplab_py.vimap import VIMap, mission_labels, mission_time_spans_ns
 
 TF_TOPIC, TF_TYPE = "/tf", "tf2_msgs/msg/TFMessage"
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"

@@ -28,8 +28,7 @@ from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex_list
+from maplab_py.vimap import VIMap, to_hex_list
 from maplab_py.vimap.scale_marks import is_metric
 
 

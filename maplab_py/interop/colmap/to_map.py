@@ -21,11 +21,9 @@ from maplab_py.interop.colmap.model import (
 )
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
-from maplab_py.vimap import MissionSensor, VIMap, tables
+from maplab_py.vimap import MissionSensor, VIMap, from_hex, ragged_rows, random_ids, tables, to_hex
 from maplab_py.vimap.descriptors import no_blocks
-from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 from maplab_py.vimap.scale_marks import KEY
-from maplab_py.vimap.table import ragged_rows
 
 _PRESENT = tables.FrameField.SIGMA | tables.FrameField.SCALE | tables.FrameField.LANDMARK_ID
 

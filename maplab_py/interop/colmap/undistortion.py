@@ -13,9 +13,7 @@ from maplab_py.interop.colmap.model import NO_POINT, ColmapCamera, ColmapModel, 
 from maplab_py.sensors import Camera, CameraRig, SensorSet
 from maplab_py.sensors.camera import Distortion, Projection
 from maplab_py.sensors.projection import back_project
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows, starts_of_counts
 
 _PINHOLE = 1
 _LARGEST_TANGENT = 10.0

@@ -9,10 +9,7 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.interop.recordings import protocol
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import VIMap, mission_sensor_id, ragged_rows, to_hex
 from maplab_py.vimap.tables import MissionSensor
 
 

@@ -22,8 +22,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 
 RAW_DEPTH_MAPS = 8
 """Number of the resource type of depth maps as measured."""

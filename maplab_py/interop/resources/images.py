@@ -20,9 +20,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex
 
 RAW_GREY, RAW_COLOUR = 0, 4
 """Numbers of the resource types of images as recorded."""

@@ -10,8 +10,7 @@ from maplab_py.array_types import I64
 from maplab_py.errors import UserError
 from maplab_py.geometry.association import nearest_rows
 from maplab_py.sensors import CameraRig
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_id
 
 MS_TO_NS = 1_000_000
 

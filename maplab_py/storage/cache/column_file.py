@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.cancellation import check_cancelled
 from maplab_py.storage.checksums import map_in_threads
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import DescriptorBlock
+from maplab_py.vimap import DescriptorBlock, VIMap
 from maplab_py.vimap.table import Table, object_column, ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import Missions
 

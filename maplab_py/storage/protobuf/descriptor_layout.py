@@ -18,9 +18,7 @@ import numpy as np
 
 from maplab_py.array_types import U8
 from maplab_py.errors import MapError, UserError
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, FeatureType
-from maplab_py.vimap.ids import is_valid, to_hex
+from maplab_py.vimap import DescriptorBlock, DescriptorDepth, FeatureType, VIMap, is_valid, to_hex
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import DescriptorLayout
 

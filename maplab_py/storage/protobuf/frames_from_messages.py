@@ -17,8 +17,7 @@ from maplab_py.storage.protobuf.descriptor_layout import Blocks, read_blocks, un
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_field, unknown_bytes
 from maplab_py.storage.protobuf.map_files import COPY_AGAIN
 from maplab_py.storage.protobuf.message_numbers import Name
-from maplab_py.vimap import tables
-from maplab_py.vimap.ids import IdIndex, is_valid, to_hex
+from maplab_py.vimap import IdIndex, is_valid, tables, to_hex
 from maplab_py.vimap.table import object_column, starts_of_counts
 
 _OPTIONAL = {

@@ -16,8 +16,7 @@ from maplab_py.errors import MapError
 from maplab_py.storage.protobuf import message_numbers
 from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
 from maplab_py.storage.protobuf.message_numbers import Name
-from maplab_py.vimap import tables
-from maplab_py.vimap.ids import IdIndex, as_keys, is_valid, to_hex
+from maplab_py.vimap import IdIndex, as_keys, is_valid, tables, to_hex
 
 SENSOR_FIELDS = {
     tables.MissionSensor.NCAMERA: "ncamera_id",

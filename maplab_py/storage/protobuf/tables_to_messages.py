@@ -23,9 +23,7 @@ from maplab_py.storage.protobuf.file_contents import (
 from maplab_py.storage.protobuf.map_files import FileKind
 from maplab_py.storage.protobuf.tables_from_messages import SENSOR_FIELDS
 from maplab_py.storage.protobuf.vertices_to_messages import id_rows, tag_of, vertices_to_bytes
-from maplab_py.vimap import ResourceOwner, TransformationKind, VIMap
-from maplab_py.vimap.ids import is_valid
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import ResourceOwner, TransformationKind, VIMap, is_valid, ragged_rows
 
 
 @dataclasses.dataclass(frozen=True)

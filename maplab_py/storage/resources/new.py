@@ -19,8 +19,7 @@ from maplab_py.atomic.targets import make_folders, remove_folders
 from maplab_py.cancellation import check_cancelled, cleaned_up, lasting_effect, provisional_effects
 from maplab_py.storage.resources.store import MAP_FOLDER, path_in_folder
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import IdArray, to_hex
+from maplab_py.vimap import IdArray, ResourceOwner, VIMap, to_hex
 from maplab_py.vimap.staged_folder import StagedFolder
 from maplab_py.vimap.tables import Resources
 

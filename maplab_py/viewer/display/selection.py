@@ -23,9 +23,8 @@ from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, ragged_rows
 from maplab_py.vimap.descriptors import binary_descriptor_sizes
-from maplab_py.vimap.table import ragged_rows
 
 ImageOf = Callable[[int], "U8 | None"]
 """Gives the image (H, W, 3) of a vertex (row), if there is one."""

@@ -14,8 +14,7 @@ from maplab_py.sensors.projection import back_project
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
 from maplab_py.viewer.scene import Axes, Layer, Part
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 _FRUSTA_PER_MISSION = 250
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])

@@ -20,8 +20,7 @@ from maplab_py.viewer.drawing import (
 )
 from maplab_py.viewer.layers.landmarks import point_size
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.ids import to_hex_list
+from maplab_py.vimap import LandmarkQuality, VIMap, to_hex_list
 
 _GAP = 0.15
 """Between both, as a part of the room that they take across."""

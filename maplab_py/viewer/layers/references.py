@@ -21,8 +21,7 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.layers.comparison import reference_landmarks
 from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import find_mission
+from maplab_py.vimap import VIMap, find_mission
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import VIMap, ragged_rows
 
 
 def correct_interpolation_bias(vi_map: VIMap) -> VIMap:

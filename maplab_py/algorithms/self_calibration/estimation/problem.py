@@ -25,10 +25,8 @@ from maplab_py.estimation.terms.inertial import BiasWalkTerm
 from maplab_py.estimation.terms.prior import VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm, FixedMeasurements
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, observer_counts, random_ids
 from maplab_py.vimap.edits import content_rng
-from maplab_py.vimap.ids import random_ids
-from maplab_py.vimap.queries import observer_counts
 from maplab_py.vimap.selection import keep_rows
 from maplab_py.vimap.tables import NO_ROW
 from maplab_py.vimap.vertex_removal import move_landmarks

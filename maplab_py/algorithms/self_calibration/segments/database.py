@@ -19,8 +19,7 @@ from maplab_py.input_files import DEFAULT_MAX_BYTES, RAISE_THE_BOUND, read_npz
 from maplab_py.output_files import write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, read_sensors, write_sensors
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex, from_hex
+from maplab_py.vimap import IdIndex, VIMap, from_hex
 from maplab_py.vimap.selection import sorted_by_time
 from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.table import Table

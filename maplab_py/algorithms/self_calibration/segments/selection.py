@@ -27,9 +27,7 @@ from maplab_py.algorithms.self_calibration.uncertainty import posterior_covarian
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.table import ragged_rows
+from maplab_py.vimap import VIMap, ragged_rows, to_hex
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
