@@ -95,20 +95,20 @@ class _Doctor:
 
     def __init__(self, recording: Recording, mapping: Mapping, progress: Progress) -> None:
         self._recording, self._options, self._progress = recording, mapping.options, progress
-        self._found: list[Diagnosis | None] = []
+        self._diagnoses: list[Diagnosis | None] = []
 
     def diagnosis(self) -> Diagnosis | None:
         """Return the diagnosis; None where a table of the recording is damaged."""
-        if not self._found:
+        if not self._diagnoses:
             try:
                 stream = self._options.stream
-                self._found = [diagnose(self._recording, stream, progress=self._progress)]
+                self._diagnoses = [diagnose(self._recording, stream, progress=self._progress)]
             except MapError:
-                self._found = [None]
-        return self._found[0]
+                self._diagnoses = [None]
+        return self._diagnoses[0]
 
     def mended(self) -> MendedRecording | None:
         """Return the recording with what was found, unless the user does not want that."""
-        if not self._options.odometry.apply_calibration or (found := self.diagnosis()) is None:
+        if not self._options.odometry.apply_calibration or (diagnosis := self.diagnosis()) is None:
             return None
-        return mended(self._recording, found, self._options.stream)
+        return mended(self._recording, diagnosis, self._options.stream)

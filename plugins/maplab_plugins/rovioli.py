@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.server.submap_sources import SubmapWriter
     from maplab_py.viewer.display.viewer import Viewer
-    from maplab_py.vimap import VIMap
 
 _DEFAULT_KEY = "rovioli"
 _SECONDS_TO_DRAW = 20.0
@@ -95,15 +94,12 @@ def rovioli(
     folder = run.output.save_map_folder
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
-    observers: list[Observer] = []
     pictures = _pictures(context, key, map_publish_interval_s) if rovioli_visualize_map else None
-    if pictures is not None:
-        observers.append(pictures)
     is_live, writer = data.type in TRANSPORTS, None
     if submaps.submap_spool is not None:
         # runs of hours: the map is at the server, and what is there need not stay in memory
         writer = SubmapWriter(submaps, forgets=is_live and folder is None)
-        observers.append(writer)
+    observers: list[Observer] = [each for each in (pictures, writer) if each is not None]
     with contextlib.ExitStack() as stack:
         is_to_end = stack.enter_context(ending_early())
         recording: Recording
@@ -133,8 +129,8 @@ def rovioli(
         _tell_end(context, finished, mapping.statistics.elapsed_s)
     is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
     _keep_map(context, key, finished, is_at_server=is_at_server)
-    if pictures is not None and finished.vi_map is not None:
-        pictures.after_run(finished.vi_map, finished.report.map_folder)
+    if pictures is not None:
+        pictures.after_run(finished)
     return finished.report
 
 
@@ -258,11 +254,12 @@ class _Pictures:
                     run = LocalizedRun(localization.p_G, live.p_G_I, live.rays_G)
                 self._viewer.follow(Subject(vi_map, self._title, localized=run))
 
-    def after_run(self, vi_map: VIMap, folder: Path | None) -> None:
+    def after_run(self, finished: FinishedRun) -> None:
         """Show the finished map, and how to come back to it; wait, for the program may end now."""
         from maplab_py.viewer.building import Subject
 
-        if self._viewer.is_stopped:
+        vi_map, folder = finished.vi_map, finished.report.map_folder
+        if vi_map is None or self._viewer.is_stopped:
             return
         note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
         self._viewer.follow(Subject(vi_map, self._title, note=note))

@@ -158,8 +158,8 @@ def check_map(vi_map: VIMap) -> tuple[Finding, ...]:
     if cannot_work(signals, is_whole=True):
         return ()
     cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
-    found = _check_motion(signals, cameras)
-    return tuple(f for f in found if f.verdict in (Verdict.WRONG, Verdict.NOTE))
+    findings = _check_motion(signals, cameras)
+    return tuple(f for f in findings if f.verdict in (Verdict.WRONG, Verdict.NOTE))
 
 
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
