@@ -52,15 +52,17 @@ def run_checked(
     if first is not None:
         mapping = make(first)
     error = _run(mapping, progress, is_to_end)
-    is_bent = first is None and any(not f.check.startswith("noise") for f in mapping.doubts or ())
+    is_contradicted = first is None and any(
+        not f.check.startswith("noise") for f in mapping.doubts or ()
+    )
     if not mapping.is_ended_early and (
-        error is not None or (is_repeatable and (_share(mapping) < _LEAST_SHARE or is_bent))
+        error is not None or (is_repeatable and (_share(mapping) < _LEAST_SHARE or is_contradicted))
     ):
         again = doctor.mended() if first is None else recording
         if again is not None:
             progress.line("read once more: recording and calibration do not agree")
             second = make(again)
-            least = _AS_MANY * _share(mapping) if is_bent else _share(mapping)
+            least = _AS_MANY * _share(mapping) if is_contradicted else _share(mapping)
             if _run(second, progress, is_to_end) is None and _share(second) > least:
                 return second
     if error is not None:
