@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64, U8, Mask
 from maplab_py.compilation import compiled
 from maplab_py.vision.features.options import FeatureOptions
 
@@ -136,9 +136,8 @@ def occupy(free, u, v, radius_px):  # type: ignore[no-untyped-def]
     height, width = free.shape
     reach = int(radius_px)
     for row in range(max(v - reach, 0), min(v + reach + 1, height)):
-        for column in range(max(u - reach, 0), min(u + reach + 1, width)):
-            if (row - v) ** 2 + (column - u) ** 2 <= radius_px * radius_px:
-                free[row, column] = 0
+        half = int(np.sqrt(radius_px * radius_px - (row - v) ** 2))
+        free[row, max(u - half, 0) : max(min(u + half + 1, width), 0)] = 0
 
 
 @compiled()
@@ -171,6 +170,32 @@ def select_corners(selection, uv, order, is_selected):  # type: ignore[no-untype
         occupy(selection.free, u, v, selection.radius_px)
         count += 1
     return count
+
+
+@compiled()
+def _find_apart(uv, others, distance_px, is_after, is_apart):  # type: ignore[no-untyped-def]
+    """Fill in (K,) whether no other keypoint (L, 2), or none before it, is within a distance."""
+    for k in range(len(uv)):
+        is_apart[k] = True
+        for other in range(k if is_after else len(others)):
+            du, dv = uv[k, 0] - others[other, 0], uv[k, 1] - others[other, 1]
+            if np.sqrt(du * du + dv * dv) <= distance_px:
+                is_apart[k] = False
+                break
+
+
+def are_apart(uv: F64, others_uv: F64, distance_px: float) -> Mask:
+    """Tell which keypoints (K, 2) are farther than a distance from all others (L, 2)."""
+    is_apart: Mask = np.empty(len(uv), dtype=np.bool_)
+    _find_apart(uv, others_uv, distance_px, False, is_apart)
+    return is_apart
+
+
+def are_apart_before(uv: F64, distance_px: float) -> Mask:
+    """Tell which keypoints (K, 2) are farther than a distance from all before them."""
+    is_apart: Mask = np.empty(len(uv), dtype=np.bool_)
+    _find_apart(uv, uv, distance_px, True, is_apart)
+    return is_apart
 
 
 def make_selection(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64, U8, Mask
+from maplab_py.array_types import F64, U8, Mask
 
 _ITERATIONS, _CONVERGED_PX = 20, 0.01
 _MIN_EIGENVALUE = 1e-4
@@ -42,19 +42,26 @@ def follow(
         Keypoints (K, 2) in the second image, and whether they were found (K,): inside the image,
         and tracked back to where they came from.
     """
-    if not len(uv):
-        return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
-    start = uv.astype(np.float32)
-    there, is_tracked = _flow(
-        first, second, start, predicted_uv.astype(np.float32), options, options.levels
-    )
-    # the way back starts at its end: it needs no pyramid
-    back, is_back = _flow(second, first, there, start.copy(), options, 0)
-    error = np.linalg.norm(back - start, axis=1)
+    there, is_tracked = search(first, second, uv, predicted_uv, options)
+    return there, is_tracked & is_tracked_back(first, second, uv, there, options)
+
+
+def search(
+    first: U8, second: U8, uv: F64, predicted_uv: F64, options: FlowOptions
+) -> tuple[F64, Mask]:
+    """Find keypoints as `follow` does, without the way back."""
+    there, is_tracked = _flow(first, second, uv, predicted_uv, options, options.levels)
     height, width = second.shape
     inside = np.all((there >= 0.0) & (there <= np.array([width - 1, height - 1])), axis=1)
-    is_tracked &= is_back & inside & (error <= options.forward_backward_px)
-    return np.asarray(there, dtype=np.float64), is_tracked
+    return there, is_tracked & inside
+
+
+def is_tracked_back(first: U8, second: U8, uv: F64, there: F64, options: FlowOptions) -> Mask:
+    """Tell which keypoints (K, 2) are tracked from the second image back to where they came from."""
+    # the way back starts at its end: it needs no pyramid
+    back, is_back = _flow(second, first, there, uv, options, 0)
+    error = np.linalg.norm(back - uv, axis=1)
+    return is_back & np.asarray(error <= options.forward_backward_px)
 
 
 def in_plane_turn(R_C1_C0: F64) -> float:
@@ -85,24 +92,26 @@ def turned_in_plane(image: U8, uv: F64, centre: F64, angle_rad: float) -> tuple[
 
 
 def _flow(
-    first: U8, second: U8, uv: F32, guess_uv: F32, options: FlowOptions, levels: int
-) -> tuple[F32, Mask]:
+    first: U8, second: U8, uv: F64, guess_uv: F64, options: FlowOptions, levels: int
+) -> tuple[F64, Mask]:
     import cv2
 
+    if not len(uv):
+        return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
     flags: Any = cv2.OPTFLOW_USE_INITIAL_FLOW
     end: Any = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
     end_uv: Any
     end_uv, status, _ = cv2.calcOpticalFlowPyrLK(
         first,
         second,
-        uv.reshape(-1, 1, 2),
-        guess_uv.reshape(-1, 1, 2),
+        np.array(uv, dtype=np.float32, order="C").reshape(-1, 1, 2),
+        np.array(guess_uv, dtype=np.float32, order="C").reshape(-1, 1, 2),
         winSize=(options.patch_size_px, options.patch_size_px),
         maxLevel=levels,
         criteria=(end, _ITERATIONS, _CONVERGED_PX),
         flags=flags,
         minEigThreshold=_MIN_EIGENVALUE,
     )
-    end_uv = end_uv.reshape(-1, 2)
-    is_tracked = (status.ravel() > 0) & np.all(np.isfinite(end_uv), axis=1)
+    end_uv = end_uv[:, 0].astype(np.float64)
+    is_tracked = (status[:, 0] > 0) & np.isfinite(end_uv).all(axis=1)
     return np.where(is_tracked[:, None], end_uv, uv), is_tracked

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.compilation import compiled
+from maplab_py.compilation import compiled, prange
 
 HALF_PX = 7
 """Half the side of a patch; one more pixel on each side serves for gradients."""
@@ -22,21 +22,35 @@ _FAST = {"fastmath": {"contract", "nsz", "arcp", "reassoc"}}
 """Sums are formed in several parts at a time."""
 _ZERO, _HALF, _UNITY = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _CONVERGED_PX = 0.01
+_MIN_SIMILARITY = 0.8
+"""Correlation of a patch and the image below which the image does not show it."""
+_LARGEST_STEP_PX = 1.5
+"""Farthest that a keypoint is moved from where Lucas-Kanade has put it."""
+_LARGEST_STRETCH = 1.8
+"""Change of scale, in any direction, from which on the latest image takes the place of the first one."""
+_BLOCK = 16
+"""Patches that a thread takes at a time."""
 
 
 @compiled(**_FAST)
 def sample_patches(image, uv, patch):  # type: ignore[no-untyped-def]
     """Fill in the patches (K, S, S) about keypoints uv (K, 2) of an image (H, W), continued at its border."""
+    for k in range(len(uv)):
+        _sample_patch(image, uv[k, 0], uv[k, 1], patch[k])
+
+
+@compiled(**_FAST)
+def _sample_patch(image, centre_u, centre_v, patch):  # type: ignore[no-untyped-def]
+    """Fill in the patch (S, S) about a place."""
     height, width = image.shape
     reach = HALF_PX + 1
-    for k in range(len(uv)):
-        for row in range(SIDE_PX):
-            for column in range(SIDE_PX):
-                u, v = uv[k, 0] + column - reach, uv[k, 1] + row - reach
-                # of places that are no numbers, too, as nothing may be read outside the image
-                u = min(u, width - 1.001) if u > 0.0 else 0.0
-                v = min(v, height - 1.001) if v > 0.0 else 0.0
-                patch[k, row, column] = _bilinear(image, u, v)
+    for row in range(SIDE_PX):
+        for column in range(SIDE_PX):
+            u, v = centre_u + column - reach, centre_v + row - reach
+            # of places that are no numbers, too, as nothing may be read outside the image
+            u = min(u, width - 1.001) if u > 0.0 else 0.0
+            v = min(v, height - 1.001) if v > 0.0 else 0.0
+            patch[row, column] = _bilinear(image, u, v)
 
 
 @compiled(**_FAST)
@@ -51,28 +65,50 @@ def _bilinear(image, u, v):  # type: ignore[no-untyped-def]
     return (_UNITY - b) * above + b * below
 
 
-@compiled(**_FAST)
-def align_patches(image, patch, uv, warp, similarity):  # type: ignore[no-untyped-def]
-    """Align patches with an image under affine warps, gain and offset of the brightness.
+@compiled(parallel=True, **_FAST)
+def align_patches(image, uv, patch, warp, is_shown):  # type: ignore[no-untyped-def]
+    """Align keypoints with their patches, under affine warps, gain and offset of the brightness.
+
+    Where the image does not show a patch, the keypoint stays where it is, and the patch is taken from this
+    image; it is, too, where the change of scale has become large.
 
     Args:
         image: Grey values (H, W).
-        patch: Patches (K, S, S) of earlier images.
-        uv: Where their centres are expected (K, 2); changed to where they are.
+        uv: Where the keypoints are expected (K, 2); changed to where they are.
+        patch: Patches (K, S, S) of earlier images; changed where they are taken from this one.
         warp: Expected change (K, 2, 2) from offsets in the patch to offsets in the image; changed.
-        similarity: Filled in (K,): the correlation of patch and image, -1 where there is none.
+        is_shown: Filled in (K,): the image shows the patch.
     """
     side = 2 * HALF_PX + 1
-    count = side * side
-    slope = np.empty((_PARAMETERS, count), dtype=np.float32)
-    template = np.empty(count, dtype=np.float32)
-    sampled = np.empty(count, dtype=np.float32)
-    square = np.empty((_PARAMETERS, _PARAMETERS))
-    right = np.empty(_PARAMETERS)
-    for k in range(len(uv)):
-        similarity[k] = _align(
-            image, patch[k], uv[k], warp[k], slope, template, sampled, square, right
-        )
+    for block in prange(-(-len(uv) // _BLOCK)):
+        slope = np.empty((_PARAMETERS, side * side), dtype=np.float32)
+        template = np.empty(side * side, dtype=np.float32)
+        sampled = np.empty(side * side, dtype=np.float32)
+        square, right = np.empty((_PARAMETERS, _PARAMETERS)), np.empty(_PARAMETERS)
+        for k in range(block * _BLOCK, min((block + 1) * _BLOCK, len(uv))):
+            u, v = uv[k, 0], uv[k, 1]
+            similarity = _align(
+                image, patch[k], uv[k], warp[k], slope, template, sampled, square, right
+            )
+            step_px = np.sqrt((uv[k, 0] - u) ** 2 + (uv[k, 1] - v) ** 2)
+            least, largest = _stretch(warp[k])
+            # comparisons with what is no number are false
+            is_shown[k] = similarity >= _MIN_SIMILARITY and step_px <= _LARGEST_STEP_PX
+            is_shown[k] = is_shown[k] and largest < np.inf
+            if not is_shown[k]:
+                uv[k, 0], uv[k, 1] = u, v
+            if is_shown[k] and largest <= _LARGEST_STRETCH and least * _LARGEST_STRETCH >= 1.0:
+                continue
+            warp[k, 0, 0], warp[k, 0, 1], warp[k, 1, 0], warp[k, 1, 1] = 1.0, 0.0, 0.0, 1.0
+            _sample_patch(image, uv[k, 0], uv[k, 1], patch[k])
+
+
+@compiled()
+def _stretch(warp):  # type: ignore[no-untyped-def]
+    """Return the singular values of a warp (2, 2), ascending."""
+    turned = np.hypot(warp[0, 0] + warp[1, 1], warp[1, 0] - warp[0, 1])
+    mirrored = np.hypot(warp[0, 0] - warp[1, 1], warp[1, 0] + warp[0, 1])
+    return 0.5 * abs(turned - mirrored), 0.5 * (turned + mirrored)
 
 
 @compiled(**_FAST)
@@ -95,8 +131,7 @@ def _align(image, patch, uv, warp, slope, template, sampled, square, right):  # 
         _compose(uv, warp, right)
         if right[0] ** 2 + right[1] ** 2 < _CONVERGED_PX**2:
             break
-    if not _sample(image, uv, warp, contrast, sampled):
-        return -1.0
+    # as of the last step but one, which is as similar
     total = _ZERO
     for n in range(len(template)):
         total += sampled[n] * template[n]

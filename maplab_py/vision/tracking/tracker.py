@@ -13,11 +13,18 @@ from maplab_py.array_types import F32, F64, I64, U8, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.vision.features.detection import GridDetector, refined
+from maplab_py.vision.features.detection import (
+    GridDetector,
+    are_apart,
+    are_apart_before,
+    refined,
+)
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
     follow,
     in_plane_turn,
+    is_tracked_back,
+    search,
     turn_matrix,
     turned_in_plane,
 )
@@ -30,6 +37,7 @@ from maplab_py.vision.tracking.motion import (
 )
 from maplab_py.vision.tracking.options import TrackingOptions
 from maplab_py.vision.tracking.patch_kernels import SIDE_PX, align_patches, sample_patches
+from maplab_py.vision.tracking.stereo_kernels import check_matches, expect_distances
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
@@ -122,16 +130,17 @@ class FrameTracker:
             motions += [motion] if motion is not None else []
         output: list[CameraTracks] = []
         for row, image in enumerate(prepared):
-            shared = LiveTracks.none()
+            shared = StereoMatches.none()
             leader = self._leaders[row]
             if leader != row:
                 with watch("stereo"):
                     pair = prepared[leader], image
                     live[leader], shared = self._shared(leader, row, pair, live[leader])
-                    live[row] = live[row][_is_apart(live[row].uv, shared.uv)]
+                    is_apart = are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
+                    live[row] = live[row][is_apart]
             with watch("detect"):
                 live[row] = self._with_new(row, image, live[row], shared)
-            output.append(self._output(row, shared.joined(live[row])))
+            output.append(self._output(row, shared, live[row]))
         self._states = tuple(
             _CameraState(image, tracks) for image, tracks in zip(prepared, live, strict=True)
         )
@@ -163,70 +172,62 @@ class FrameTracker:
                 turn = turn_matrix(angle_rad)
                 if abs(angle_rad) > _MIN_IN_PLANE_TURN_RAD:
                     before, start = turned_in_plane(before, start, view.centre, angle_rad)
-            uv, is_tracked = follow(before, image, start, guess, self._flow)
-            tracks, uv, guess = tracks[is_tracked], uv[is_tracked], guess[is_tracked]
+            uv, is_tracked = search(before, image, start, guess, self._flow)
             aligned = align(image, uv, tracks.patch, turn @ tracks.warp)
-            uv, tracks = aligned.uv, tracks.compared_with(aligned.patch, aligned.warp)
-            ray, exists = view.rays(uv)
-            left = exists & view.is_usable(uv)
-            tracks, uv, ray, guess = tracks[left], uv[left], ray[left], guess[left]
+            # what the first image of its track confirms need not be tracked back
+            doubtful = np.flatnonzero(is_tracked & ~aligned.is_shown)
+            is_tracked[doubtful] = is_tracked_back(
+                before, image, start[doubtful], uv[doubtful], self._flow
+            )
+            ray, exists = view.rays(aligned.uv)
+            rows = np.flatnonzero(is_tracked & exists & view.is_usable(aligned.uv))
         with watch("outliers"):
             motion = image_motion(
                 view.camera,
-                (tracks.ray, ray),
-                view.preparation.to_recorded(uv),
+                (tracks.ray[rows], ray[rows]),
+                view.preparation.to_recorded(aligned.uv[rows]),
                 R_C1_C0,
                 limits_of(self._options, view.focal_px),
                 seed,
-                view.preparation.to_recorded(guess),
+                view.preparation.to_recorded(guess[rows]),
             )
-            rows = motion.is_inlier
-        return tracks[rows].at(uv[rows], ray[rows]), motion
+            rows = rows[motion.is_inlier]
+        tracks = tracks.compared_with(aligned.patch, aligned.warp)[rows]
+        return tracks.at(aligned.uv[rows], ray[rows]), motion
 
     def _shared(
         self, leader: int, row: int, images: tuple[U8, U8], tracks: LiveTracks
-    ) -> tuple[LiveTracks, LiveTracks]:
-        """Find the tracks of the leader in a camera; return both, the leader's with distances."""
+    ) -> tuple[LiveTracks, StereoMatches]:
+        """Find the tracks of the leader in a camera; return these with distances, and the matches."""
         matches = match(self._views[leader], self._views[row], images, tracks, self._stereo)
         is_known = np.isfinite(matches.distance_m)
         distance = np.where(is_known, matches.distance_m, tracks.distance_m)
-        rows = matches.is_matched
-        shared = dataclasses.replace(tracks[rows], uv=matches.uv[rows], ray=matches.ray[rows])
-        return dataclasses.replace(tracks, distance_m=distance), shared
+        return dataclasses.replace(tracks, distance_m=distance), matches
 
-    def _with_new(self, row: int, image: U8, tracks: LiveTracks, shared: LiveTracks) -> LiveTracks:
+    def _with_new(
+        self, row: int, image: U8, tracks: LiveTracks, shared: StereoMatches
+    ) -> LiveTracks:
         """Add new tracks where the image has room beside those of the camera and of its leader."""
         uv = self._detectors[row].detect(image, np.concatenate([shared.uv, tracks.uv]))
         uv = refined(image, uv)
-        uv = uv[self._views[row].is_usable(uv) & _is_apart(uv, tracks.uv) & _is_apart_before(uv)]
+        is_apart = are_apart(uv, tracks.uv, _SAME_POINT_PX)
+        uv = uv[self._views[row].is_usable(uv) & is_apart & are_apart_before(uv, _SAME_POINT_PX)]
         ray, exists = self._views[row].rays(uv)
         new = LiveTracks.new(uv[exists], ray[exists], self._next_id)
         new = new.compared_with(patches(image, new.uv), new.warp)
         self._next_id += len(new)
         return tracks.joined(new)
 
-    def _output(self, row: int, tracks: LiveTracks) -> CameraTracks:
-        count, options = len(tracks), self._options
+    def _output(self, row: int, shared: StereoMatches, tracks: LiveTracks) -> CameraTracks:
+        options = self._options
+        uv = np.concatenate([shared.uv, tracks.uv])
         return CameraTracks(
-            uv_px=self._views[row].preparation.to_recorded(tracks.uv),
-            track_id=tracks.track_id,
-            sigma_px=np.full(count, options.keypoint_sigma_px),
-            scale=np.full(count, options.descriptor_size_px),
-            num_frames=tracks.num_frames,
+            uv_px=self._views[row].preparation.to_recorded(uv),
+            track_id=np.concatenate([shared.track_id, tracks.track_id]),
+            sigma_px=np.full(len(uv), options.keypoint_sigma_px),
+            scale=np.full(len(uv), options.descriptor_size_px),
+            num_frames=np.concatenate([shared.num_frames, tracks.num_frames]),
         )
-
-
-def _is_apart(uv: F64, others_uv: F64) -> Mask:
-    """Tell which keypoints (K, 2) are not where another (L, 2) is."""
-    distance = np.linalg.norm(uv[:, None] - others_uv[None], axis=2)
-    return np.asarray(np.all(distance > _SAME_POINT_PX, axis=1))
-
-
-def _is_apart_before(uv: F64) -> Mask:
-    """Tell which keypoints (K, 2) are not where one before them is."""
-    distance = np.linalg.norm(uv[:, None] - uv[None], axis=2)
-    is_same = np.tril(distance <= _SAME_POINT_PX, k=-1)
-    return np.asarray(~is_same.any(axis=1))
 
 
 class _Stopwatch:
@@ -265,13 +266,6 @@ def compile_kernels() -> None:
 # then triangulated at a wrong depth, whatever the number of observations. Comparison with the first image
 # under an affine warp (J. Shi, C. Tomasi, Good Features to Track, CVPR 1994) has an error that does not grow.
 
-_MIN_SIMILARITY = 0.8
-"""Correlation of a patch and the image below which the image does not show it."""
-_LARGEST_STEP_PX = 1.5
-"""Farthest that a keypoint is moved from where Lucas-Kanade has put it."""
-_LARGEST_STRETCH = 1.8
-"""Change of scale, in any direction, from which on the latest image takes the place of the first one."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AlignedKeypoints:
@@ -280,6 +274,7 @@ class AlignedKeypoints:
     uv: F64  # (K, 2)
     patch: F32  # (K, S, S)
     warp: F64  # (K, 2, 2) from offsets in the patch to offsets in the image
+    is_shown: Mask  # (K,) the image shows the patch
 
 
 def align(image: U8, uv: F64, patch: F32, warp: F64) -> AlignedKeypoints:
@@ -294,19 +289,10 @@ def align(image: U8, uv: F64, patch: F32, warp: F64) -> AlignedKeypoints:
         patch: Their patches (K, S, S).
         warp: Expected warps (K, 2, 2).
     """
-    aligned_uv, aligned_warp, similarity = uv.copy(), warp.copy(), np.empty(len(uv))
-    align_patches(image, patch, aligned_uv, aligned_warp, similarity)
-    with np.errstate(invalid="ignore"):  # of places that are no numbers
-        step_px = np.linalg.norm(aligned_uv - uv, axis=1)
-    is_finite = np.isfinite(step_px) & np.isfinite(aligned_warp).all(axis=(1, 2))
-    shows = is_finite & (similarity >= _MIN_SIMILARITY) & (step_px <= _LARGEST_STEP_PX)
-    aligned_uv[~shows], aligned_warp[~shows] = uv[~shows], np.eye(2)
-    stretch = np.linalg.svd(aligned_warp, compute_uv=False)
-    is_stretched = (stretch[:, 0] > _LARGEST_STRETCH) | (stretch[:, 1] < 1.0 / _LARGEST_STRETCH)
-    is_new = ~shows | is_stretched
-    patch = patch.copy()
-    patch[is_new], aligned_warp[is_new] = patches(image, aligned_uv[is_new]), np.eye(2)
-    return AlignedKeypoints(aligned_uv, patch, aligned_warp)
+    uv, patch, warp = uv.copy(), patch.copy(), np.array(warp, order="C")
+    is_shown = np.empty(len(uv), dtype=np.bool_)
+    align_patches(image, uv, patch, warp, is_shown)
+    return AlignedKeypoints(uv, patch, warp, is_shown)
 
 
 def patches(image: U8, uv: F64) -> F32:
@@ -316,9 +302,6 @@ def patches(image: U8, uv: F64) -> F32:
     return result
 
 
-_MIN_DISTANCE_M, _FAR_M = 0.05, 1000.0
-_NEIGHBOURS = 3
-"""A point of unknown distance is sought at the median inverse distance of so many neighbours."""
 _RETRY_FRAMES = 4
 """Interval in which a point of unknown distance is sought again."""
 
@@ -334,12 +317,18 @@ class StereoOptions:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StereoMatches:
-    """Observations of K tracks by another camera."""
+    """M observations of K tracks by another camera."""
 
-    uv: F64  # (K, 2) of its prepared image
-    ray: F64  # (K, 3)
-    is_matched: Mask  # (K,)
+    uv: F64  # (M, 2) of its prepared image
+    track_id: I64  # (M,)
+    num_frames: I64  # (M,)
     distance_m: F64  # (K,) from the first camera, NaN where it is not known
+
+    @classmethod
+    def none(cls) -> StereoMatches:
+        """Return no observations."""
+        ids = np.zeros(0, dtype=np.int64)
+        return cls(np.zeros((0, 2)), ids, ids, np.zeros(0))
 
 
 def match(
@@ -356,59 +345,20 @@ def match(
     it came from, lie on its epipolar line, and in front of both cameras.
     """
     R_A_B, p_A_B = first.R_I_C.T @ second.R_I_C, first.R_I_C.T @ (second.p_I_C - first.p_I_C)
-    expected_m = _expected_distances(tracks, options.distance_m)
+    expected_m = np.empty(len(tracks))
+    expect_distances(tracks.uv, tracks.distance_m, options.distance_m, expected_m)
     guess, visible = second.pixels((expected_m[:, None] * tracks.ray - p_A_B) @ R_A_B)
     is_due = np.isfinite(tracks.distance_m) | (tracks.num_frames % _RETRY_FRAMES == 1)
     rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
-    uv_second, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow)
-    ray_second, exists = second.rays(uv_second)
-    off, distance, is_ahead = _triangulate(tracks.ray[rows], ray_second @ R_A_B.T, p_A_B)
-    gate = options.gate_px / second.focal_px
-    is_match &= exists & second.is_usable(uv_second) & (np.abs(off) <= gate)
-    # where the rays are nearly parallel, noise decides on which side they meet
-    chord = np.linalg.norm(tracks.ray[rows] - ray_second @ R_A_B.T, axis=1)
-    is_far = chord <= gate
-    is_match &= is_far | (is_ahead & (distance >= _MIN_DISTANCE_M))
-    distance = np.where(is_ahead, np.clip(distance, _MIN_DISTANCE_M, _FAR_M), _FAR_M)
-
-    count = len(tracks)
-    uv, ray = np.zeros((count, 2)), np.zeros((count, 3))
-    is_matched, distance_m = np.zeros(count, dtype=np.bool_), np.full(count, np.nan)
-    uv[rows], ray[rows], is_matched[rows] = uv_second, ray_second, is_match
-    distance_m[rows] = np.where(is_match, distance, np.nan)
-    return StereoMatches(uv, ray, is_matched, distance_m)
-
-
-def _expected_distances(tracks: LiveTracks, default_m: float) -> F64:
-    """Return the distances (K,) at which tracks are sought."""
-    known = np.isfinite(tracks.distance_m)
-    if np.count_nonzero(known) < _NEIGHBOURS:
-        return np.where(known, tracks.distance_m, default_m)
-    rows = np.flatnonzero(~known)
-    offset = tracks.uv[rows, None] - tracks.uv[known][None]
-    squares = np.sum(offset * offset, axis=2)
-    nearest = np.argsort(squares, axis=1, kind="stable")[:, :_NEIGHBOURS]
-    expected = tracks.distance_m.copy()
-    expected[rows] = 1.0 / np.median(1.0 / tracks.distance_m[known][nearest], axis=1)
-    return expected
-
-
-def _triangulate(a: F64, b: F64, p: F64) -> tuple[F64, F64, Mask]:
-    """Intersect rays a (K, 3) from the origin with rays b (K, 3) from p (3,).
-
-    Returns:
-        Distances (K,) of b to the plane of a and p, distances along a, and whether the point is in
-        front of both.
-    """
-    normal = np.cross(p, a)
-    length = np.linalg.norm(normal, axis=1)
-    is_beside = length > 1e-9
-    off = np.sum(normal * b, axis=1) / np.where(is_beside, length, 1.0)
-    axis = np.cross(a, b)
-    square = np.maximum(np.sum(axis * axis, axis=1), 1e-18)
-    along_a = np.sum(np.cross(p, b) * axis, axis=1) / square
-    along_b = np.sum(np.cross(p, a) * axis, axis=1) / square
-    return off, along_a, (along_a > 0.0) & (along_b > 0.0)
+    uv, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow)
+    ray, exists = second.rays(uv)
+    is_match &= exists & second.is_usable(uv)
+    gate, distance_m = options.gate_px / second.focal_px, np.full(len(tracks), np.nan)
+    of_rows = np.empty(len(rows))
+    check_matches(tracks.ray[rows], ray @ R_A_B.T, p_A_B, gate, is_match, of_rows)
+    distance_m[rows] = of_rows
+    rows, uv = rows[is_match], uv[is_match]
+    return StereoMatches(uv, tracks.track_id[rows], tracks.num_frames[rows], distance_m)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

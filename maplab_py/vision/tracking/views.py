@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64, U8, Mask
+from maplab_py.compilation import compiled
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import back_project, is_inside_image, project
@@ -58,11 +59,19 @@ class CameraView:
 
     def is_usable(self, uv: F64) -> Mask:
         """Tell which pixels (K, 2) lie where keypoints may be."""
-        width, height = self.preparation.size
-        whole = np.round(uv).astype(np.int64)
-        inside = np.all((whole >= 0) & (whole < [width, height]), axis=1)
-        whole = np.where(inside[:, None], whole, 0)
-        return np.asarray(inside & (self.preparation.usable[whole[:, 1], whole[:, 0]] > 0))
+        result: Mask = np.empty(len(uv), dtype=np.bool_)
+        _find_usable(self.preparation.usable, uv, result)
+        return result
+
+
+@compiled()
+def _find_usable(usable, uv, result):  # type: ignore[no-untyped-def]
+    """Fill in (K,) whether the nearest pixels of uv (K, 2) are usable."""
+    height, width = usable.shape
+    for k in range(len(uv)):
+        u, v = np.rint(uv[k, 0]), np.rint(uv[k, 1])
+        inside = 0.0 <= u < width and 0.0 <= v < height
+        result[k] = inside and usable[int(v), int(u)] > 0
 
 
 def focal_length_px(camera: Camera) -> float:
