@@ -7,6 +7,7 @@ Visual-Inertial Estimation, ICRA 2020, which has no line delay.
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 
@@ -109,6 +110,13 @@ class WindowCalibration:
 
     def of_kernels(self, values: F64) -> WindowCameras:
         """Return the cameras with some values (K,) of the states."""
+        return self._with(values) if len(self) else self._known
+
+    @cached_property
+    def _known(self) -> WindowCameras:
+        return self._with(self.mean)
+
+    def _with(self, values: F64) -> WindowCameras:
         changes = self.changes(values)
         turn = changes[:, _ROTATION : _ROTATION + 3]
         T_I_C, slope = self.T_I_C, np.tile(np.eye(3), (len(self.cameras), 1, 1))

@@ -237,6 +237,7 @@ class GridDetector:
         import cv2
 
         self._usable, self._options = usable, options
+        self._part = _bounds(usable)
         factor = options.image_resize_factor
         self._radius_px = max(options.detector_nms_radius * factor, 1.0)
         library: Any = cv2
@@ -265,7 +266,7 @@ class GridDetector:
         limit = int(np.ceil(scaler * self._equal_share))
         selection = make_selection(self._usable, self._cells, limit, self._radius_px)
         occupy_all(selection, np.round(tracked_uv).astype(np.int64))
-        selected = _select(image, self._corners(self._detector, image), selection, room)
+        selected = _select(image, self._corners(self._detector, image, self._part), selection, room)
         room -= len(selected)
         poor = selection.cell_count < 0.5 * self._equal_share
         cells = [self._cell(row, column) for row, column in np.argwhere(poor).tolist()]
@@ -285,21 +286,28 @@ class GridDetector:
         u0, u1 = -(-column * width // columns), -(-(column + 1) * width // columns)
         return slice(v0, v1), slice(u0, u1)
 
-    def _corners(self, detector: Any, image: U8, cell: tuple[slice, slice] | None = None) -> I64:
-        """Return the corners (N, 2), whole pixels, of an image or of a cell of it."""
+    def _corners(self, detector: Any, image: U8, part: tuple[slice, slice]) -> I64:
+        """Return the corners (N, 2), whole pixels, of a part of an image."""
         import cv2
 
-        u0, u1, v0, v1 = 0, image.shape[1], 0, image.shape[0]
-        if cell is not None:
-            reach = _SEGMENT_TEST_REACH_PX + 1  # non-maximum suppression compares neighbours
-            u0, v0 = max(cell[1].start - reach, 0), max(cell[0].start - reach, 0)
-            u1, v1 = min(cell[1].stop + reach, u1), min(cell[0].stop + reach, v1)
+        reach = _SEGMENT_TEST_REACH_PX + 1  # non-maximum suppression compares neighbours
+        u0, v0 = max(part[1].start - reach, 0), max(part[0].start - reach, 0)
+        u1 = min(part[1].stop + reach, image.shape[1])
+        v1 = min(part[0].stop + reach, image.shape[0])
         keypoints = detector.detect(image[v0:v1, u0:u1])
         if not keypoints:
             return np.zeros((0, 2), dtype=np.int64)
         library: Any = cv2
         uv = np.asarray(library.KeyPoint_convert(keypoints)) + np.array([u0, v0])
         return np.asarray(np.round(uv), dtype=np.int64)
+
+
+def _bounds(usable: U8) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that have usable pixels."""
+    rows, columns = (np.flatnonzero(usable.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return slice(0, 0), slice(0, 0)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _select(image: U8, uv: I64, selection: Selection, room: int) -> I64:

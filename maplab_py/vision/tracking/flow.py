@@ -61,7 +61,7 @@ def is_tracked_back(first: U8, second: U8, uv: F64, there: F64, options: FlowOpt
     # the way back starts at its end: it needs no pyramid
     back, is_back = _flow(second, first, there, uv, options, 0)
     error = np.linalg.norm(back - uv, axis=1)
-    return is_back & np.asarray(error <= options.forward_backward_px)
+    return np.asarray(is_back & (error <= options.forward_backward_px))
 
 
 def in_plane_turn(R_C1_C0: F64) -> float:

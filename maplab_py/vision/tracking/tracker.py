@@ -246,17 +246,19 @@ class _Stopwatch:
 
 
 def compile_kernels() -> None:
-    """Compile detection and the two-point RANSAC, with known and with unknown turn."""
+    """Compile detection, tracking, stereo and the two-point RANSAC, with known and with unknown turn."""
     size_px = 160
     intrinsics = np.array([100.0, 100.0, 80.0, 80.0])
     camera = Camera(
         "0" * 32, Projection.PINHOLE, Distortion.NONE, intrinsics, np.zeros(0), size_px, size_px
     )
-    tracker = FrameTracker((camera,), se3.identity(1))
+    T_I_C = se3.identity(2)
+    T_I_C[1, 4] = 0.1
+    tracker = FrameTracker((camera, camera), T_I_C)
     grey = np.random.default_rng(0).integers(0, 256, (size_px // 8, size_px // 8), dtype=np.uint8)
     image = np.kron(grey, np.ones((8, 8), dtype=np.uint8))
     for time_ns, turn in enumerate((None, np.eye(3), None)):
-        tracker.track(time_ns, (image,), turn)
+        tracker.track(time_ns, (image, image), turn)
 
 
 # Keypoints without drift: each is aligned with the patch about it in the first image of its track.
