@@ -255,11 +255,14 @@ class _Pictures:
                 self._viewer.follow(Subject(vi_map, self._title, localized=run))
 
     def after_run(self, finished: FinishedRun) -> None:
-        """Show the finished map, and how to come back to it; wait, for the program may end now."""
+        """Show the finished map, and how to come back to it; wait, for the program may end now.
+
+        A localised run stays as it is drawn, in the frame of the map that it is localised in.
+        """
         from maplab_py.viewer.building import Subject
 
         vi_map, folder = finished.vi_map, finished.report.map_folder
-        if vi_map is None or self._viewer.is_stopped:
+        if vi_map is None or self._localized.T_G_M is not None or self._viewer.is_stopped:
             return
         note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
         self._viewer.follow(Subject(vi_map, self._title, note=note))
