@@ -94,6 +94,7 @@ def compile_kernels() -> None:
     solver = BlockCholesky(np.array([0, 1, 1]), np.array([0, 0, 1]), 2, 3)
     solver.factor(np.stack([4.0 * np.eye(3), np.eye(3), 4.0 * np.eye(3)]))
     solver.solve(np.ones(6))
+    solver.solve(np.ones((6, 2)))
     node = np.zeros(1, dtype=np.int32)
     matrix = SupernodalCholesky(node, node, 1, 3)
     matrix.clear()
