@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 from maplab_py.algorithms.recording_check.doctor import (
@@ -19,6 +20,8 @@ from maplab_py.progress import SILENT, Progress
 
 _LEAST_SHARE, _AS_MANY = 0.5, 0.9
 """Shares of the frames: of a run that is not lost, and of those of the first run, for the second to count."""
+_READ_AGAIN = "read once more: recording and calibration do not agree"
+_READ_AS_GIVEN = "read once more as it is given: with what check_recording finds it does not run"
 
 
 def run_checked(
@@ -52,18 +55,13 @@ def run_checked(
     if first is not None:
         mapping = make(first)
     error = _run(mapping, progress, is_to_end)
-    is_contradicted = first is None and any(
-        not f.check.startswith("noise") for f in mapping.doubts or ()
-    )
-    if not mapping.is_ended_early and (
-        error is not None or (is_repeatable and (_share(mapping) < _LEAST_SHARE or is_contradicted))
-    ):
+    is_doubtful = _share(mapping) < _LEAST_SHARE or (first is None and bool(mapping.doubts))
+    if not mapping.is_ended_early and (error is not None or (is_repeatable and is_doubtful)):
         again = doctor.mended() if first is None else recording
         if again is not None:
-            progress.line("read once more: recording and calibration do not agree")
+            progress.line(_READ_AGAIN if first is None else _READ_AS_GIVEN)
             second = make(again)
-            least = _AS_MANY * _share(mapping) if is_contradicted else _share(mapping)
-            if _run(second, progress, is_to_end) is None and _share(second) > least:
+            if _run(second, progress, is_to_end) is None and _is_better(second, mapping):
                 return second
     if error is not None:
         if mapping.is_ended_early:
@@ -72,6 +70,14 @@ def run_checked(
         raise EstimationError(reason) from error
     mapping.statistics.notes.extend(notes if first is None else ())
     return mapping
+
+
+def _is_better(second: Mapping, first: Mapping) -> bool:
+    """Tell whether a run estimates more frames; where the first is contradicted, about as many will do."""
+    if not first.doubts:
+        return _share(second) > _share(first)
+    is_less_doubtful = len(second.doubts or ()) <= len(first.doubts)
+    return is_less_doubtful and _share(second) > _AS_MANY * _share(first)
 
 
 def _share(mapping: Mapping) -> float:
@@ -85,10 +91,12 @@ def _run(
     """Run, and check the map; return why it has not started, None if it has."""
     try:
         mapping.run(progress, is_to_end=is_to_end)
-        mapping.doubts = check_map(mapping.builder.make_map()) if mapping.builder else ()
     except EstimationError as error:
-        if not mapping.statistics.estimated_frames:
-            return error
+        return error
+    mapping.doubts = ()
+    if mapping.builder is not None:
+        with contextlib.suppress(EstimationError):  # fewer than two vertices are no map
+            mapping.doubts = check_map(mapping.builder.make_map())
     return None
 
 

@@ -196,9 +196,8 @@ def mission_map(
     """
     states = BodyStates.concatenate(mission.states)
     seed = np.random.default_rng(_id_seed(device, int(states.times_ns[0])))
-    rng, edge_rng, frame_rng, vertex_rng, set_rng = seed.spawn(
-        5
-    )  # an id stays while the mission grows
+    # one for each table, so that an id stays while the mission grows
+    rng, edge_rng, frame_rng, vertex_rng, set_rng = seed.spawn(5)
     count = len(states)
     sensor_id = np.zeros((1, len(MissionSensor), 2), dtype=np.uint64)
     sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
