@@ -246,8 +246,9 @@ def make_runner(arguments: Arguments, terminal: ConsoleTerminal, registry: Regis
 def _run_batches(arguments: Arguments, terminal: ConsoleTerminal, registry: Registry) -> Status:
     from maplab_py.console.scripts.pipelines import run_as_pipeline, split_flags
 
-    options, arguments.flags = split_flags(arguments.flags, registry.all_flags())
-    given, _ = parse_words(arguments.flags, registry.all_flags(), "")
+    known = registry.all_flags() if arguments.flags else {}
+    options, arguments.flags = split_flags(arguments.flags, known)
+    given, _ = parse_words(arguments.flags, known, "")
     folder = next((Path(g.text).expanduser() for g in given if g.name == _MAPS_FOLDER), None)
     batches = [read_batch(path, folder) for path in arguments.files]
     first = Status.OK

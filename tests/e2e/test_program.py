@@ -108,11 +108,13 @@ def test_start_up_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The console starts about as soon as a Python that imports numpy, scipy and a prompt."""
     monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)  # installed, it is compiled
     run_program(tmp_path, "-c", "help")
-    starts, peers = [], []
+    starts, refusals, peers = [], [], []
     for _ in range(4):
         starts.append(child_cpu_s(lambda: run_program(tmp_path, "-c", "help")))
+        refusals.append(child_cpu_s(lambda: run_program(tmp_path, "-c", "load a; optvi --x; lod")))
         peers.append(libraries_start_s())
     assert min(starts) <= 1.25 * min(peers)
+    assert min(refusals) <= 0.75 * min(peers)  # imports nothing but the plugins of its commands
 
 
 def test_an_error_is_an_object_with_json(tmp_path: Path) -> None:

@@ -7,8 +7,13 @@ import functools
 import gc
 import logging
 import os
-from collections.abc import Iterable
+import re
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
@@ -20,6 +25,10 @@ ENTRY_POINT_GROUP = "maplab_py.plugins"
 PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
 ALWAYS_LOADED = "console"
 BUILT_IN = "maplab_plugins."
+_DECLARATION = re.compile(
+    r'^(?:@command\(\s*((?:"[^"\s]+"[,\s]*)+)|(\w+) = \w+\(\s*"\2")', re.MULTILINE
+)
+"""A decorator with the names of a command, or a command that is made under the name of its variable."""
 
 logger = logging.getLogger(__name__)
 
@@ -37,23 +46,46 @@ class Plugin:
 
 
 class Registry:
-    """Commands by name and alias, with the plugins that own them."""
+    """Commands by name and alias, with the plugins that own them.
 
-    def __init__(self) -> None:
-        """Start without any command."""
-        self.plugins: list[Plugin] = []
+    A built-in plugin is imported when one of its commands is looked for, others when no built-in one has
+    the name. What concerns all commands imports all plugins.
+    """
+
+    def __init__(self, entries: Iterable[EntryPoint] = ()) -> None:
+        """Make a registry.
+
+        Args:
+            entries: Plugins to load when they are needed; of two with a command of the same name, the
+                first keeps it.
+        """
+        self._plugins: list[Plugin] = []
         self._commands: dict[str, Command] = {}
         self._owners: dict[str, Plugin] = {}
+        self._pending = {entry.name: entry for entry in entries}
+        self._order = {name: index for index, name in enumerate(self._pending)}
+        self._declared = {
+            name: entry for entry in self._pending.values() for name in _declared_names(entry)
+        }
+        self._lock = threading.RLock()
+
+    @property
+    def plugins(self) -> list[Plugin]:
+        """All plugins."""
+        self._load_all()
+        return self._plugins
 
     @property
     def commands(self) -> list[Command]:
         """All commands, by name, each once."""
+        self._load_all()
         unique = {command.name: command for command in self._commands.values()}
         return [unique[name] for name in sorted(unique)]
 
     @property
     def names(self) -> list[str]:
         """All names and aliases."""
+        self._load_all()
         return sorted(self._commands)
 
     @property
@@ -70,13 +102,13 @@ class Registry:
         """
         if self.knows(name):
             return self._commands.get(name) or self._commands[name.replace("-", "_")]
-        broken = [plugin.name for plugin in self.plugins if plugin.error]
+        broken = [plugin.name for plugin in self._plugins if plugin.error]
         hint = f"plugins not available: {', '.join(broken)} (see: plugins)" if broken else ""
-        raise unknown("command", name, self._commands, hint or "see: help")
+        raise unknown("command", name, {*self._commands, *self._declared}, hint or "see: help")
 
     def knows(self, name: str) -> bool:
         """Tell whether a command has this name or alias."""
-        return name in self._commands or name.replace("-", "_") in self._commands
+        return any(self._provide(spelling) for spelling in (name, name.replace("-", "_")))
 
     def owner(self, command: Command) -> str:
         """Return the name of the plugin that brought a command."""
@@ -97,13 +129,13 @@ class Registry:
 
     def add(self, command: Command, plugin: Plugin) -> None:
         """Register a command; a name that is in use stays with its first owner."""
-        if command.name in self._commands:
+        if self._provide_declared(command.name):
             plugin.clashes.append(self._clash(command.name, plugin))
             return
         plugin.commands.append(command)
         self._owners[command.name] = plugin
         for name in command.names:
-            if name in self._commands:
+            if self._provide_declared(name):
                 plugin.clashes.append(self._clash(name, plugin))
             else:
                 self._commands[name] = command
@@ -118,23 +150,45 @@ class Registry:
             if home == module.__name__ or home.startswith(module.__name__ + "."):
                 self.add(command, plugin)
 
-    def load(self, entry: EntryPoint) -> None:
+    def _provide(self, name: str) -> bool:
+        """Load what may have a command of this name; return whether there is one."""
+        if not self._provide_declared(name):
+            for entry in list(self._pending.values()):
+                if not entry.value.startswith(BUILT_IN):
+                    self._load(entry)
+        return name in self._commands
+
+    def _provide_declared(self, name: str) -> bool:
+        """Load the built-in plugin that declares a name, if any; return whether the name is in use."""
+        if name not in self._commands and name in self._declared:
+            self._load(self._declared[name])
+        return name in self._commands
+
+    def _load_all(self) -> None:
+        for entry in list(self._pending.values()):
+            self._load(entry)
+        self._plugins.sort(key=lambda plugin: self._order.get(plugin.name, len(self._order)))
+
+    def _load(self, entry: EntryPoint) -> None:
         """Load one plugin; if it fails it is listed with the reason, the traceback in the log."""
-        version = _version(entry.dist) if entry.dist is not None else ""
-        plugin = Plugin(entry.name, entry.value, version)
-        self.plugins.append(plugin)
-        try:
-            loaded = entry.load()
-        except (Exception, SystemExit) as error:
-            plugin.error = f"{type(error).__name__}: {error}".splitlines()[0]
-            logger.exception("plugin %s (%s) cannot be loaded", entry.name, entry.value)
-            return
-        if not isinstance(loaded, ModuleType):
-            plugin.error = f"entry point '{entry.value}' is not a module"
-            return
-        self.add_module(loaded, plugin)
-        for clash in plugin.clashes:
-            logger.warning("%s", clash)
+        with self._lock, _collection_paused():
+            if self._pending.pop(entry.name, None) is None:
+                return
+            version = _version(entry.dist) if entry.dist is not None else ""
+            plugin = Plugin(entry.name, entry.value, version)
+            self._plugins.append(plugin)
+            try:
+                loaded = entry.load()
+            except (Exception, SystemExit) as error:
+                plugin.error = f"{type(error).__name__}: {error}".splitlines()[0]
+                logger.exception("plugin %s (%s) cannot be loaded", entry.name, entry.value)
+                return
+            if not isinstance(loaded, ModuleType):
+                plugin.error = f"entry point '{entry.value}' is not a module"
+                return
+            self.add_module(loaded, plugin)
+            for clash in plugin.clashes:
+                logger.warning("%s", clash)
 
     def _clash(self, name: str, plugin: Plugin) -> str:
         first = self.owner(self._commands[name])
@@ -144,7 +198,7 @@ class Registry:
 
 
 def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
-    """Load the installed plugins.
+    """Return the installed plugins, which are loaded when they are needed.
 
     The environment variable MAPLAB_PLUGINS (names separated by commas) restricts which; the
     console's own commands are always there.
@@ -160,17 +214,34 @@ def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
         raise UserError(
             f"{PLUGINS_VARIABLE} names plugins that are not installed: {', '.join(sorted(missing))}"
         )
-    registry = Registry()
+    chosen = (e for e in installed if not names or e.name in names or e.name == ALWAYS_LOADED)
+    return Registry(chosen)
+
+
+@contextmanager
+def _collection_paused() -> Iterator[None]:
+    """Pause the collection of garbage: what plugins define stays, and it is a tenth of the start."""
     collects = gc.isenabled()
-    gc.disable()  # what plugins define stays, so that collecting it is a tenth of the start in vain
+    gc.disable()
     try:
-        for entry in installed:
-            if not names or entry.name in names or entry.name == ALWAYS_LOADED:
-                registry.load(entry)
+        yield
     finally:
         if collects:
             gc.enable()
-    return registry
+
+
+def _declared_names(entry: EntryPoint) -> list[str]:
+    """Return the names and aliases that the source of a built-in plugin declares, without importing it."""
+    spec = find_spec(entry.value) if entry.value.startswith(BUILT_IN) else None
+    if spec is None or spec.origin is None:
+        return []
+    origin = Path(spec.origin)
+    is_package = spec.submodule_search_locations is not None
+    names: list[str] = []
+    for path in sorted(origin.parent.rglob("*.py")) if is_package else [origin]:
+        for match in _DECLARATION.finditer(path.read_text()):
+            names += re.findall(r'"([^"]+)"', match[1]) if match[1] else [match[2]]
+    return names
 
 
 @functools.cache

@@ -312,7 +312,7 @@ def coloured_parts(line: str, registry: Registry) -> list[tuple[str, str]]:
             parts.append(("", line[position : word.start]))
             raw = line[word.start : word.end]
             if number == 0:
-                known = word.text in registry.names
+                known = registry.knows(word.text)
                 command = registry.find(word.text) if known else None
                 style = "command" if known or word.text in LEAVE else "unknown"
                 parts.append((style, raw))

@@ -24,7 +24,7 @@ def check_name(name: str, registry: Registry) -> None:
     """
     if not _NAME.match(name):
         raise UserError(f"'{name}' cannot be an alias: use letters, digits, - and _")
-    if name in registry.names or name in ("q", "quit", "exit"):
+    if registry.knows(name) or name in ("q", "quit", "exit"):
         raise UserError(f"'{name}' is a command; choose another name")
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import escaped
+from maplab_py.console.scripts.checking import check_commands
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.status import Status
 from maplab_py.errors import UserError
@@ -105,6 +106,8 @@ def run_batch(
 ) -> Status:
     """Run a batch file's commands for each of its folders, each time in a fresh session.
 
+    The commands for all folders are checked before the first one runs, unless `keep_going` is set.
+
     Args:
         batch: What to run.
         make_runner: Makes the runner of a fresh session.
@@ -114,13 +117,25 @@ def run_batch(
     Returns:
         The status of the first failure.
     """
+    commands = "\n".join(batch.commands)
+    texts = [commands.replace(FOLDER_TEMPLATE, escaped(folder)) for folder in batch.folders]
+    if not keep_going:
+        runner, written = make_runner(), list[Path]()
+        checked = [check_commands(text, runner.session, written) for text in texts]
+        if status := runner.report_problems(
+            [
+                f"map folder {folder}: {problem}"
+                for folder, problems in zip(batch.folders, checked, strict=True)
+                for problem in problems
+            ]
+        ):
+            return status
     first = Status.OK
     failed = 0
-    for folder in batch.folders:
+    for folder, text in zip(batch.folders, texts, strict=True):
         runner = make_runner()
         runner.terminal.note(f"map folder {folder}")
-        text = "\n".join(batch.commands).replace(FOLDER_TEMPLATE, escaped(folder))
-        status = runner.run_script(text, keep_going=keep_going)
+        status = runner.run_text(text, keep_going=keep_going)
         status = runner.finish(status, discard=discard)
         runner.session.watchers.close()
         failed += status != Status.OK

@@ -17,7 +17,7 @@ LEAVE = ("q", "quit", "exit")
 _MAX_DEPTH = 8
 
 
-def check_commands(text: str, session: Session) -> list[str]:
+def check_commands(text: str, session: Session, written: list[Path] | None = None) -> list[str]:
     """Return the errors of a text of commands, each with its place; nothing is run.
 
     Names, flags, types, values that are missing, variables, and files and folders that a command reads and
@@ -26,8 +26,9 @@ def check_commands(text: str, session: Session) -> list[str]:
     Args:
         text: The commands.
         session: Gives aliases, variables and lasting flags; it does not change.
+        written: Files that texts before it may write; those of this text are appended.
     """
-    checker = _Checker(session)
+    checker = _Checker(session, [] if written is None else written)
     checker.check(text)
     return checker.problems
 
@@ -35,13 +36,13 @@ def check_commands(text: str, session: Session) -> list[str]:
 class _Checker:
     """Follows what earlier commands of the chain would do to variables, aliases and flags."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, written: list[Path]) -> None:
         self.problems: list[str] = []
         self._registry = session.registry
         self._variables = dict(session.variables)
         self._aliases = dict(session.aliases)
         self._settings = session.settings.copy()
-        self._written: list[Path] = []
+        self._written = written
         self._runs_shell = False  # a shell command can make any file
 
     def check(self, text: str, place: str = "", depth: int = 0) -> None:

@@ -91,12 +91,14 @@ class Runner:
         A text with an error is not started, unless the commands after a failure shall run anyway.
         """
         problems = [] if keep_going else check_commands(text, self.session)
+        return self.report_problems(problems) or self.run_text(text, keep_going=keep_going)
+
+    def report_problems(self, problems: Sequence[str]) -> Status:
+        """Print the errors for which commands are not started and return the status."""
         for problem in problems:
             logger.error("not started: %s", problem)
             self.terminal.failed(problem, "", int(Status.USER_ERROR))
-        if problems:
-            return Status.USER_ERROR
-        return self.run_text(text, keep_going=keep_going)
+        return Status.USER_ERROR if problems else Status.OK
 
     def run_words(self, words: Sequence[str]) -> Status:
         """Run one command and return its status."""
@@ -141,7 +143,7 @@ class Runner:
             has_effects: The command had written files or changed the session before.
         """
         status = status_of(error)
-        known = command in self.session.registry.names
+        known = bool(command) and self.session.registry.knows(command)
         name = self.session.registry.find(command).name if known else command
         if status is Status.CANCELLED:
             remark = ", what it had done outside them remains" if has_effects else ""

@@ -274,7 +274,7 @@ class Session:
     def __getattr__(self, name: str) -> Callable[..., Report]:
         """Return a command as a function: `session.optvi(ba_num_iterations=20)`."""
         registry = self.__dict__.get("registry")
-        if registry is None or name not in registry.names:
+        if registry is None or name.startswith("_") or not registry.knows(name):
             raise AttributeError(f"a session has no attribute and no command '{name}'")
         return functools.partial(self.run, name)
 

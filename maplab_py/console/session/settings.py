@@ -76,6 +76,8 @@ class Settings:
         Raises:
             FlagError: A flag is unknown or no command with this flag takes the value.
         """
+        if not words:
+            return []
         known = self._registry.all_flags()
         dashed = [w if w.startswith("-") or "=" not in w else f"--{w}" for w in words]
         given, plain = parse_words(dashed, known, "")

@@ -176,7 +176,7 @@ def new_plugin(context: CommandContext, name: str, *, folder: Path | None = None
 
     files = plugin_files(name, version("maplab-py"))
     name = name.replace("-", "_")
-    if name in context.session.registry.names:
+    if context.session.registry.knows(name):
         raise UserError(f"new_plugin: '{name}' is already a command; give another name")
     target = folder or Path(f"maplab_{name}")
     if target.exists():

@@ -10,8 +10,10 @@ from maplab_py.plugin import CommandContext, command
 from maplab_py.viewer.options import PlaybackOptions
 
 
-def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewReport]:
+def _player(name: str, what: str, example: str = "") -> Callable[..., ViewReport]:
     """Make the command that plays the missions with one type of image resource."""
+
+    resource = name.removeprefix("visualize_")
 
     def play(
         context: CommandContext,
@@ -22,22 +24,26 @@ def _player(resource: str, what: str, example: str = "") -> Callable[..., ViewRe
         return _show(context, resource, playback, display)
 
     play.__doc__ = f"Play the missions with {what}."
-    return command(
-        f"visualize_{resource}", example=example, acts_outside=True, guards_effects=True
-    )(play)
+    return command(name, example=example, acts_outside=True, guards_effects=True)(play)
 
 
 visualize_raw_images = _player(
-    "raw_images", "their grey images as recorded", "visualize_raw_images"
+    "visualize_raw_images", "their grey images as recorded", "visualize_raw_images"
 )
-visualize_raw_color_images = _player("raw_color_images", "their colour images as recorded")
-visualize_undistorted_images = _player("undistorted_images", "their undistorted grey images")
+visualize_raw_color_images = _player(
+    "visualize_raw_color_images", "their colour images as recorded"
+)
+visualize_undistorted_images = _player(
+    "visualize_undistorted_images", "their undistorted grey images"
+)
 visualize_undistorted_color_images = _player(
-    "undistorted_color_images", "their undistorted colour images"
+    "visualize_undistorted_color_images", "their undistorted colour images"
 )
-visualize_disparity_maps = _player("disparity_maps", "their disparity maps")
-visualize_raw_depth_maps = _player("raw_depth_maps", "their depth maps as recorded")
-visualize_optimized_depth_maps = _player("optimized_depth_maps", "their optimised depth maps")
+visualize_disparity_maps = _player("visualize_disparity_maps", "their disparity maps")
+visualize_raw_depth_maps = _player("visualize_raw_depth_maps", "their depth maps as recorded")
+visualize_optimized_depth_maps = _player(
+    "visualize_optimized_depth_maps", "their optimised depth maps"
+)
 
 
 def _show(

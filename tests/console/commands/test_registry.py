@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import types
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from maplab_py.console.commands import schema
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.lines import scan, split_commands
 from maplab_py.console.commands.registry import (
+    BUILT_IN,
     ENTRY_POINT_GROUP,
     PLUGINS_VARIABLE,
     Plugin,
@@ -174,6 +175,35 @@ def test_the_installed_plugins_load() -> None:
     registry = load_registry()
     names = {plugin.name for plugin in registry.plugins if not plugin.error}
     assert {"console", "vi_map_basic", "missions"} <= names
+
+
+def test_a_command_is_found_without_importing_other_plugins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every name and alias of the built-in plugins is declared where it is found without an import."""
+    loaded: list[str] = []
+    load = EntryPoint.load
+    monkeypatch.setattr(EntryPoint, "load", lambda self: loaded.append(self.name) or load(self))
+    full = load_registry()
+    for plugin in [p for p in full.plugins if p.module.startswith(BUILT_IN)]:
+        registry = load_registry()
+        loaded.clear()
+        names = {name: command.name for command in plugin.commands for name in command.names}
+        assert {name: registry.find(name).name for name in names} == names
+        assert loaded == [plugin.name]
+
+
+def test_a_plugin_of_others_is_imported_for_a_name_that_no_built_in_one_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = entry(tmp_path, monkeypatch, "other", SOURCE.format(name="lc", alias="mine"))
+    registry = load_registry([*entry_points(group=ENTRY_POINT_GROUP), other])
+    assert registry.owner(registry.find("lc")) == "loopclosure"
+    with pytest.raises(UserError, match="did you mean lc"):
+        registry.find("lcc")
+    assert registry.problems == [
+        "command 'lc' of plugin other is taken by plugin loopclosure, which keeps it"
+    ]
 
 
 def test_schemas_can_be_made_by_two_threads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -204,6 +204,15 @@ def test_batch_stops_unless_told_to_go_on(capsys: Capture) -> None:
     assert "2 map folders, 2 failed" in err
 
 
+def test_the_commands_for_all_folders_are_checked_before_the_first_runs(capsys: Capture) -> None:
+    batch = Batch(("a", "b$none"), ("echo <CURRENT_VIMAP_FOLDER>", "echo --nothing"))
+    assert run_batch(batch, make_runner, keep_going=False, discard=False) == Status.USER_ERROR
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("line 2, column 1: echo has no flag --nothing") == 2
+    assert "map folder b$none: " in err
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -284,4 +293,4 @@ def test_folders_are_taken_literally(tmp_path: Path, name: str) -> None:
 
     batch = Batch((str(tmp_path / name),), (f"load --map_folder={FOLDER_TEMPLATE}",))
     assert run_batch(batch, make_runner, keep_going=False, discard=False) == Status.OK
-    assert [entry.folder for entry in loaded[0].session.maps] == [tmp_path / name]
+    assert [entry.folder for entry in loaded[-1].session.maps] == [tmp_path / name]
