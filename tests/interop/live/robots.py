@@ -27,9 +27,8 @@ PLAYERS = {
     "foxglove": ("foxglove", "foxglove_player.py"),
 }
 """Transport and program of each robot."""
-_MASTER = "rosmaster --core -p 11311"
+MASTER = "rosmaster --core -p 11311"
 _ENVIRONMENT = {
-    "ROS_DOMAIN_ID": "11",
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "ROS_LOCALHOST_ONLY": "1",
     "ROS_IP": "127.0.0.1",
@@ -41,7 +40,8 @@ _ENVIRONMENT = {
 class LiveRun:
     """A run of rovioli beside a robot."""
 
-    seen: dict[str, Any]  # by the last player
+    folder: Path  # of what the programs have written
+    seen: dict[str, Any]  # by the last player; empty if rovioli failed
     printed: str  # by rovioli
     status: int  # of rovioli
     processor_s: float
@@ -101,7 +101,8 @@ def run_live(
     recorded: Path,
     flags: str,
     *players: str,
-    master: str = _MASTER,
+    master: str = MASTER,
+    domain: int = 11,
     cameras: int = 2,
     longest_s: float = 240.0,
 ) -> LiveRun:
@@ -114,6 +115,7 @@ def run_live(
         flags: Of rovioli, beside its source.
         players: Options of the players that run one after the other.
         master: Shell command of the master of ROS 1.
+        domain: Of ROS 2.
         cameras: Number of cameras.
         longest_s: The programs are killed then.
     """
@@ -136,17 +138,19 @@ def run_live(
         [*runner, str(longest_s)],
         check=True,
         timeout=longest_s + 60.0,
-        env={**os.environ, **_ENVIRONMENT},
+        env={**os.environ, **_ENVIRONMENT, "ROS_DOMAIN_ID": str(domain)},
         cwd=NODES,
     )
     usage = json.loads((folder / "usage.json").read_text())
     printed = (folder / "rovioli.out").read_text()
     played = (folder / "player.out").read_text().splitlines()
-    assert "".join(played[-1:]).startswith("{"), "\n".join([*played, printed])
+    status = usage["codes"].get("rovioli", -1)
+    assert status > 0 or "".join(played[-1:]).startswith("{"), "\n".join([*played, printed])
     return LiveRun(
-        json.loads(played[-1]),
+        folder,
+        {} if status > 0 else json.loads(played[-1]),
         printed,
-        usage["codes"].get("rovioli", -1),
+        status,
         usage["processor_s"],
         [tuple(sample) for sample in usage["memory_mb"]],
     )

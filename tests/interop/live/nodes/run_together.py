@@ -29,7 +29,8 @@ def main() -> None:
                     command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
                 )
         waited = {started[name].pid: name for name in ("player", "rovioli") if name in started}
-        while waited and time.monotonic() - begin_s < longest_s:
+        # nobody plays on to a program that has failed
+        while waited and not codes.get("rovioli") and time.monotonic() - begin_s < longest_s:
             for pid, name in list(waited.items()):
                 done, status, usage = os.wait4(pid, os.WNOHANG)
                 if done:
