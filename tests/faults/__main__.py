@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import gc
 import json
 import os
 import re
@@ -40,6 +41,7 @@ class Outcome:
 def run(act: Callable[[Path], object], folder: Path, fault: Fault) -> Outcome:
     """Run an action in a forked child with one fault."""
     reading, writing = os.pipe()
+    gc.freeze()
     child = os.fork()
     if child == 0:
         os.close(reading)
@@ -93,6 +95,10 @@ class Explorer:
         self.template.mkdir()
         scenario.prepare(self.template)
         self.old = state_of(self.template, hidden=False)
+        self.restore()
+        self.scenario.save(self.folder)  # forks shall neither import nor load kernels
+        if scenario.tidy is not None:
+            scenario.tidy(self.folder)
         self.broken: list[str] = []
         self.injected = 0
 

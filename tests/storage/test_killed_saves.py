@@ -37,8 +37,8 @@ def test_a_few_kills(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [(), ("external",)])
-def test_fifty_kills_with_five_hundred_resources(tmp_path: Path, place: tuple[str, ...]) -> None:
-    found = outcomes(tmp_path, "500", "50", *place)
-    assert len(found) == 51
+def test_kills_of_saves_with_many_resources(tmp_path: Path, place: tuple[str, ...]) -> None:
+    found = outcomes(tmp_path, "300", "20", *place)
+    assert len(found) == 21
     assert set(found) == {"old", "new"}
-    assert found.count("old") > 10
+    assert found.count("old") > 4
