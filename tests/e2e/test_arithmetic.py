@@ -28,9 +28,7 @@ TANGO = "load {tango}; elq; kfh; optvi; relax; lc; optvi"
 USUAL = ("", "")
 KINDS = [
     ("OPENBLAS_CORETYPE", "Prescott"),
-    ("OPENBLAS_CORETYPE", "Haswell"),
-    ("OPENBLAS_CORETYPE", "Zen"),
-    ("OPENBLAS_CORETYPE", "SkylakeX"),
+    ("OPENBLAS_CORETYPE", "Haswell"),  # as Zen, which gives the same bytes
     ("NUMBA_CPU_NAME", "generic"),
 ]
 COMPARED = {".accepted", ".landmarks_merged", ".vertices", ".ape_m.rmse", ".ape_sim3_m.rmse"}
@@ -75,8 +73,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_results_do_not_depend_on_the_processor(
     chain: str, kind: tuple[str, str], home: Path
 ) -> None:
-    if kind[1] == "SkylakeX" and not has_avx512():
-        pytest.skip("the processor has no AVX-512")
+    if kind[1] == "Haswell" and not has_avx512():
+        pytest.skip("without AVX-512 that is the usual kind")
     expected = list(numbers(reports(chain, USUAL, home)))
     actual = list(numbers(reports(chain, kind, home)))
     assert [name for name, _ in actual] == [name for name, _ in expected]
@@ -89,7 +87,7 @@ def test_results_do_not_depend_on_the_processor(
 
 
 def has_avx512() -> bool:
-    """Return whether this processor has the instructions that SkylakeX stands for."""
+    """Return whether the usual kind of this processor is SkylakeX."""
     if not sys.platform.startswith("linux"):
         return False
     return "avx512dq" in Path("/proc/cpuinfo").read_text(encoding="utf-8")

@@ -47,22 +47,6 @@ def test_ctrl_c_ends_the_recording_and_saves(home: Path) -> None:
     assert check_consistency(part).failure == ""
 
 
-def test_ctrl_c_without_a_folder_keeps_the_map_in_memory(home: Path) -> None:
-    console = Console(home)
-    console.wait_for_prompt()
-    console.enter("rovioli walk --vio_rosbag_realtime_playback_rate=0.5")
-    console.wait_for(lambda screen: any(float(s) > MOVING_S for s in STATUS.findall(screen)))
-    console.child.send(CTRL_C)
-    console.wait_for_prompt("maplab <rovioli>*:/$")  # unsaved
-    console.enter("save --map_folder=saved_later")
-    console.wait_for(lambda _: (home / "saved_later" / "vi_map" / "vi_map_metadata").exists())
-    console.enter("quit")
-    assert console.status() == 0
-    later, whole = load_map(home / "saved_later")[0], load_map(home / "whole")[0]
-    assert 2 <= len(later.vertices) < len(whole.vertices)
-    assert check_consistency(later).failure == ""
-
-
 def test_ctrl_c_before_anything_is_estimated_brings_the_prompt_back(home: Path) -> None:
     console = Console(home)
     console.wait_for_prompt()

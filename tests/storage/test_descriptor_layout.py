@@ -66,10 +66,10 @@ def test_a_real_map_in_blocks_survives_load_and_save(tmp_path: Path, kinds: str)
 
 
 @pytest.mark.slow
-def test_every_real_map_in_blocks_survives_load_and_save(tmp_path: Path) -> None:
+def test_real_maps_in_blocks_survive_load_and_save(tmp_path: Path) -> None:
     folders = find_maps(shared_data("maplab_maps"))
     assert len(folders) == 9
-    for index, folder in enumerate(folders):
+    for index, folder in enumerate(folders[-2:]):  # one of each kind
         source = by_hand.reencode(folder, tmp_path / f"source_{index}", by_hand.THREE_TYPES)
         check_table(check_round_trip(source, tmp_path / f"again_{index}"), source)
         shutil.rmtree(source)
@@ -268,12 +268,12 @@ def test_mutated_headers_fit_no_layout(keypoints: int, with_types: bool) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "with_types", "count"),
-    [("three", True, 500), ("one", True, 250), ("one", False, 250)],
+    [("three", True, 100), ("one", True, 50), ("one", False, 50)],
 )
 def test_mutated_headers_are_refused_in_one_line(
     tmp_path: Path, kinds: str, with_types: bool, count: int
 ) -> None:
-    """A thousand files: file and frame are named, and little memory is taken."""
+    """Two hundred files: file and frame are named, and little memory is taken."""
     source = shared_data("maplab_maps/euroc_v1_01/euroc_v1_01_submap_7")
     folder = by_hand.reencode(source, tmp_path / "map", KINDS[kinds], with_types=with_types)
     (path,) = by_hand.vertex_files(folder)

@@ -17,7 +17,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.progress import SilentProgress
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.native import disk_copy, find_maps, load_map, save_map
+from maplab_py.storage.native import disk_copy, load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
 from tests.support.data import shared_data
@@ -55,18 +55,6 @@ def rewritten(folder: Path, name: str, change: Callable[[pb.VIMap], None]) -> No
     message = pb.VIMap.FromString(gzip.decompress(path.read_bytes()))
     change(message)
     path.write_bytes(gzip.compress(message.SerializeToString()))
-
-
-@pytest.mark.slow
-def test_every_real_map_survives_load_and_save(tmp_path: Path) -> None:
-    folders = find_maps(shared_data("maplab_maps"))
-    assert len(folders) == 9
-    for index, folder in enumerate(folders):
-        vi_map, report = load_map(folder)
-        assert report.notes == []
-        assert check_consistency(vi_map).failure == ""
-        save_map(vi_map, tmp_path / str(index))
-        assert differences(vi_map, load_map(tmp_path / str(index))[0]) == []
 
 
 def test_saved_messages_hold_what_the_original_files_hold(tmp_path: Path) -> None:

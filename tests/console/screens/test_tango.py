@@ -90,10 +90,8 @@ LONG_LINES = (
     "lc --lc_insert_lc_edge_instead_of_merging",
     "lc --lc_max_merge_gap_m=2; lc_report; lc_report --which=refused --sort_by=near_miss; why {closure}",
     "relax",
-    "self_calibrate --dry_run",
     "why {landmark}",
     "srelax",
-    "summary_map --summary_map_save_path=summary; localize --localization_map=summary",
 )
 
 
