@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from maplab_py.console.commands.flag_types import BOOL, FlagType, format_value
+from maplab_py.console.commands.flag_types import BOOL, FLOAT, FlagType, format_value
 from maplab_py.console.commands.maplab_flags import explanation
 from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.errors import FlagError
@@ -75,6 +75,13 @@ CONSOLE_FLAGS = {
             BOOL,
             False,
             "After a refusal with a known remedy, run the remedy and the command again (see fix)",
+        ),
+        Flag(
+            "checkpoint_seconds",
+            FLOAT,
+            30.0,
+            "Work of a script after which its unsaved maps are kept for `recover`, in case it is killed",
+            unit="s",
         ),
         Flag(
             "complete_while_typing",

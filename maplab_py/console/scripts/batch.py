@@ -135,7 +135,7 @@ def run_batch(
     for folder, text in zip(batch.folders, texts, strict=True):
         runner = make_runner()
         runner.terminal.note(f"map folder {folder}")
-        status = runner.run_text(text, keep_going=keep_going)
+        status = runner.run_checked(text, keep_going=keep_going)
         status = runner.finish(status, discard=discard)
         runner.session.watchers.close()
         failed += status != Status.OK

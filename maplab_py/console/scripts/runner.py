@@ -18,12 +18,17 @@ from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.scripts.aliases import expanded
 from maplab_py.console.scripts.checking import LEAVE, check_commands
-from maplab_py.console.scripts.rescue import rescue_unsaved
+from maplab_py.console.scripts.rescue import Rescue
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
 from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status, describe, status_of
-from maplab_py.console.terminal.foreground import interruptible, run_in_foreground, terminal_lent
+from maplab_py.console.terminal.foreground import (
+    interruptible,
+    run_in_foreground,
+    terminal_lent,
+    terminations_as_interrupts,
+)
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.report import Report
@@ -55,6 +60,7 @@ class Runner:
         self.terminal = terminal
         self.wants_exit = False
         self._alias_depth = 0
+        self._rescue: Rescue | None = None  # of a script
         terminal.mission_names = lambda: session.mission_names
 
     def run_text(self, text: str, *, keep_going: bool = False) -> Status:
@@ -76,6 +82,7 @@ class Runner:
             is_new = refusal is not None and refusal is not before
             if is_new and self.session.settings.is_on("auto_fix"):
                 status = self.run_words([FIX])
+            self._keep_copies()
             first = first or status
             failed += [command.source] if status else []
             if self.wants_exit or status == Status.CANCELLED or (status and not keep_going):
@@ -91,7 +98,29 @@ class Runner:
         A text with an error is not started, unless the commands after a failure shall run anyway.
         """
         problems = [] if keep_going else check_commands(text, self.session)
-        return self.report_problems(problems) or self.run_text(text, keep_going=keep_going)
+        return self.report_problems(problems) or self.run_checked(text, keep_going=keep_going)
+
+    def run_checked(self, text: str, *, keep_going: bool = False) -> Status:
+        """Run the commands of a script that has been checked.
+
+        A request of the system to end the process (SIGTERM, SIGHUP) cancels the command as Ctrl-C does.
+        """
+        self._rescue = Rescue(self.session)
+        try:
+            with terminations_as_interrupts():
+                return self.run_text(text, keep_going=keep_going)
+        except KeyboardInterrupt:
+            return Status.CANCELLED  # between two commands
+
+    def _keep_copies(self) -> None:
+        """Keep copies of the unsaved maps of a script where much work would be lost if it were killed."""
+        if self._rescue is None or self._alias_depth:
+            return
+        try:
+            self._rescue.update(self.session.settings.value("checkpoint_seconds"))
+        except MaplabError as error:
+            self._rescue = None
+            self.terminal.warning(f"unsaved maps are not kept while the script runs: {error}")
 
     def report_problems(self, problems: Sequence[str]) -> Status:
         """Print the errors for which commands are not started and return the status."""
@@ -118,10 +147,12 @@ class Runner:
             if not status and not job.was_told:
                 status = self.run_words(["join", str(job.number)])
         unsaved = ", ".join(entry.key for entry in self.session.maps.unsaved)
+        rescue = self._rescue or Rescue(self.session)
         if not unsaved or discard:
+            rescue.remove()
             return status
         try:
-            run = rescue_unsaved(self.session)
+            run = rescue.save()
         except Exception as error:
             logger.exception("rescue")
             self.terminal.error(f"unsaved changes are lost: {unsaved} ({describe(error)})")

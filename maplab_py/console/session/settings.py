@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flagfile import read_flagfile
@@ -58,8 +59,12 @@ class Settings:
 
     def is_on(self, name: str) -> bool:
         """Return the value of one of the console's own switches."""
+        return bool(self.value(name))
+
+    def value(self, name: str) -> Any:
+        """Return the value of one of the console's own flags."""
         flag, setting = CONSOLE_FLAGS[name], self.current().get(name)
-        return bool(flag.default if setting is None else flag.convert(setting.text))
+        return flag.default if setting is None else flag.convert(setting.text)
 
     def for_command(self, command: Command) -> dict[str, Setting]:
         """Return the settings of a command's flags."""
