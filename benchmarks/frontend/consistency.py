@@ -43,8 +43,8 @@ def run(tracks: SimulatedTracks, options: WindowOptions, seed: int) -> Consisten
     nees, errors = [], []
     for row, frame in enumerate(tracks.frames[1:], start=1):
         update = smoother.add(frame)
-        error = se3.local(update.T_M_I, tracks.T_M_I[row])
-        nees.append(_nees(error, update.covariance, update.T_M_I))
+        error = se3.local(update.state.T_M_I[0], tracks.T_M_I[row])
+        nees.append(_nees(error, update.covariance, update.state.T_M_I[0]))
         errors.append(error)
     later = slice(10, None)
     mean, error = np.mean(nees[later], axis=0), np.array(errors)

@@ -113,9 +113,9 @@ def _scale(initializer: Initializer, tracks: SimulatedTracks) -> float:
 def _errors(state: StartState, T_M_I: F64, v_M: F64) -> tuple[float, float, float, float]:
     """Return error of the tilt [deg], true speed [m/s], scale, and share of the velocity's error."""
     up = np.array([0.0, 0.0, 1.0])
-    q_I_M, q_I_M_true = so3.inverse(state.T_M_I[:4]), so3.inverse(T_M_I[:4])
+    q_I_M, q_I_M_true = so3.inverse(state.T_M_I[0, :4]), so3.inverse(T_M_I[:4])
     chord = np.linalg.norm(so3.rotate(q_I_M, up) - so3.rotate(q_I_M_true, up))
-    v, v_true = so3.rotate(q_I_M, state.v_M), so3.rotate(q_I_M_true, v_M)
+    v, v_true = so3.rotate(q_I_M, state.v_M[0]), so3.rotate(q_I_M_true, v_M)
     speed = float(np.linalg.norm(v_true))
     return (
         float(np.degrees(2.0 * np.arcsin(0.5 * chord))),

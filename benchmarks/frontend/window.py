@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.estimation.window.frame import WindowFrame, WindowUpdate
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.estimation.window.update import WindowUpdate
 from tests.estimation.window.recordings import SimulatedTracks, scenario, simulated
 
 _SIGMA = np.repeat([1e-3, 1e-3, 0.02, 1e-3, 0.02], 3)
@@ -217,7 +216,7 @@ def measure(keypoints: int, seconds: float) -> Measured:
         peer_ms=float(np.median(peer.update_ms[full])),
         ours_all_p90_ms=float(np.percentile(ours_ms[full], 90)),
         peer_p90_ms=float(np.percentile(peer.update_ms[full], 90)),
-        ours_error_m=float(np.linalg.norm(updates[-1].T_M_I[4:] - truth)),
+        ours_error_m=float(np.linalg.norm(updates[-1].state.T_M_I[0, 4:] - truth)),
         peer_error_m=float(np.linalg.norm(peer.position - truth)),
     )
 

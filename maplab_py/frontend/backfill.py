@@ -15,8 +15,8 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.frame import Motion, StartState, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.starting import Start
+from maplab_py.vimap.nav_state import NavState
 
 _LONGEST_S = 120.0
 """Frames that are older are forgotten: they would need memory without limit."""
@@ -34,7 +34,7 @@ class Backfill:
     """States of consecutive frames, from before the start to after it, in the order of time."""
 
     stamps_ns: I64  # (N,) of the images, without a delay that was estimated
-    states: BodyStates  # (N,)
+    states: NavState  # (N,)
     frames: tuple[WindowFrame, ...]  # (N,) with the samples that lead to each
 
 
@@ -117,7 +117,7 @@ class BackwardReading:
         smoother: FixedLagSmoother,
         waiting: WaitingFrames,
         state: StartState,
-        later: list[BodyStates],
+        later: list[NavState],
         *,
         is_resting: bool,
     ) -> None:
@@ -135,7 +135,7 @@ class BackwardReading:
         self._is_resting = is_resting
         self._row = len(self._frames) - 1  # of the frame that was read last
         self._origin_ns = self._frames[-1].time_ns
-        self._states = {int(of_frame.times_ns[0]): of_frame for of_frame in later}
+        self._states = {int(of_frame.time_ns[0]): of_frame for of_frame in later}
         reversed_state = dataclasses.replace(state, v_M=-state.v_M, gyro_bias=-state.gyro_bias)
         smoother.start(self._reversed(self._row), reversed_state)
 
@@ -153,29 +153,31 @@ class BackwardReading:
                 self._row = 0
                 return
             self._row -= 1
-            past = update.released
-            motion = np.concatenate([past.v_M, past.gyro_bias, past.accel_bias], axis=1)
-            self._keep(past.time_ns, past.T_M_I, motion)
+            self._keep(update.released)
 
     def result(self) -> Backfill:
         """Return the states of all frames that have been read."""
         states = self._smoother.states
-        self._keep(self._smoother.times_ns, states.T_M_I, states.motion)
+        self._keep(NavState.of_motion(self._smoother.times_ns, states.T_M_I, states.motion))
         rows = [row for row, f in enumerate(self._waiting.frames) if f.time_ns in self._states]
         frames = [self._waiting.frames[row] for row in rows]
         return Backfill(
             stamps_ns=np.array([self._waiting.stamps_ns[row] for row in rows], dtype=np.int64),
-            states=BodyStates.concatenate([self._states[frame.time_ns] for frame in frames]),
+            states=NavState.stack([self._states[frame.time_ns] for frame in frames]),
             frames=tuple(frames),
         )
 
-    def _keep(self, times_ns: I64, T_M_I: F64, motion: F64) -> None:
-        """Keep states (N, 9) of reversed time."""
-        for row, time_ns in enumerate((2 * self._origin_ns - times_ns).tolist()):
-            v_M, gyro_bias, accel_bias = motion[row].reshape(3, 3)
-            self._states[time_ns] = BodyStates.single(
-                time_ns, T_M_I[row], -v_M, -gyro_bias, accel_bias
-            )
+    def _keep(self, past: NavState) -> None:
+        """Keep states of reversed time."""
+        states = NavState(
+            2 * self._origin_ns - past.time_ns,
+            past.T_M_I,
+            -past.v_M,
+            -past.gyro_bias,
+            past.accel_bias,
+        )
+        for row, time_ns in enumerate(states.time_ns.tolist()):
+            self._states[time_ns] = states.row(row)
 
     def _reversed(self, row: int) -> WindowFrame:
         """Return a frame of reversed time, with the samples that lead to it from the one after it."""
@@ -217,7 +219,7 @@ class Backfiller:
         self.waiting, self._reading = WaitingFrames(), None
         self._scale_check_ns = None
 
-    def start(self, start: Start, newest: BodyStates, later: list[BodyStates]) -> None:
+    def start(self, start: Start, newest: NavState, later: list[NavState]) -> None:
         """Read backwards from a start, or watch its scale while that is not known.
 
         Args:
@@ -225,7 +227,7 @@ class Backfiller:
             newest: State of the newest frame.
             later: States of the frames that have come since the start, to the newest.
         """
-        newest_ns = int(newest.times_ns[0])
+        newest_ns = int(newest.time_ns[0])
         if start.scale_sigma > _TRUSTED_SCALE_SIGMA:
             self._scale_check_ns, self.trusted_ns = newest_ns, None
             return
@@ -286,11 +288,13 @@ class Backfiller:
         if not np.isfinite(sigma).all():
             return
         sigma[:3] = _POSITION_SIGMA_M
-        v_M, gyro_bias, accel_bias = states.motion[-1].reshape(3, 3)
-        state = StartState(states.T_M_I[-1], v_M, gyro_bias, accel_bias, sigma)
+        v_M, gyro_bias, accel_bias = np.split(states.motion[-1:], 3, axis=1)
+        state = StartState(
+            smoother.times_ns[-1:], states.T_M_I[-1:], v_M, gyro_bias, accel_bias, sigma
+        )
         self._read_from(state, [], is_resting=False)
 
-    def _read_from(self, state: StartState, later: list[BodyStates], *, is_resting: bool) -> None:
+    def _read_from(self, state: StartState, later: list[NavState], *, is_resting: bool) -> None:
         self._reading = BackwardReading(
             self._make_smoother(), self.waiting, state, later, is_resting=is_resting
         )

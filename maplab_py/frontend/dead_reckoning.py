@@ -14,11 +14,11 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.sensors import Imu
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.tables import LoopClosureEdges
 
@@ -43,7 +43,7 @@ class Tie:
 
     @classmethod
     def by_samples(
-        cls, imu: Imu, last: BodyStates, covariance: F64 | None, times_ns: I64, samples: F64
+        cls, imu: Imu, last: NavState, covariance: F64 | None, times_ns: I64, samples: F64
     ) -> Self:
         """Integrate the samples (S, 6) from a state to the time of the last sample.
 
@@ -61,7 +61,7 @@ class Tie:
         t = float(edge.duration_s[0])
         R_I_M = so3.to_matrix(last.T_M_I[0, :4]).T
         gravity_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
-        fallen_I = R_I_M @ (last.v_M_I[0] * t + 0.5 * gravity_M * t**2)
+        fallen_I = R_I_M @ (last.v_M[0] * t + 0.5 * gravity_M * t**2)
         T_A_B = se3.make(edge.q_A_B[0], fallen_I + edge.dp[0])
         J = np.zeros((6, 15))
         J[:3, 3:6], J[:3, 6:9] = so3.skew(fallen_I), t * R_I_M

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.odometry_options import HealthOptions
+from maplab_py.vimap.nav_state import NavState
 
 _TILT = slice(3, 5)
 _VELOCITY = slice(6, 9)
@@ -32,7 +32,7 @@ class HealthMonitor:
         """Whether tracks, and not the states before, are the reason of a divergence."""
         return self._newest_ns - self._tracked_ns > _BLIND_NS
 
-    def problem(self, state: BodyStates, covariance: F64, tracks: int) -> str:
+    def problem(self, state: NavState, covariance: F64, tracks: int) -> str:
         """Return why an estimate has diverged, empty if it has not.
 
         Args:
@@ -40,9 +40,9 @@ class HealthMonitor:
             covariance: Of it (15, 15), order [p, theta, v, b_g, b_a].
             tracks: Number of keypoints that were seen in the frame before, too.
         """
-        options, time_ns = self._options, int(state.times_ns[0])
+        options, time_ns = self._options, int(state.time_ns[0])
         self._newest_ns = time_ns
-        columns = (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias)
+        columns = (state.T_M_I, state.v_M, state.gyro_bias, state.accel_bias)
         if not all(np.isfinite(column).all() for column in columns):
             return "the estimate is not a number"
         if tracks >= options.min_tracks or self._tracked_ns < 0:
@@ -50,7 +50,7 @@ class HealthMonitor:
         blind_s = (time_ns - self._tracked_ns) * 1e-9
         if blind_s > options.max_time_without_tracks_s:
             return f"fewer than {options.min_tracks} keypoints tracked for {blind_s:.1f} s"
-        speed = float(np.linalg.norm(state.v_M_I))
+        speed = float(np.linalg.norm(state.v_M))
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         checks = (
             (speed, options.max_speed, "speed {:.1f} m/s"),

@@ -11,7 +11,6 @@ from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError
 from maplab_py.frontend.backfill import Backfill
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.dead_reckoning import Tie, tied
 from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
@@ -19,6 +18,7 @@ from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vimap.stacking import stack
 
 _EARLY = 0.95
@@ -125,7 +125,7 @@ class MapBuilder:
     def fill(self, backfill: Backfill) -> None:
         """Make vertices of the frames before the first vertex of the mission, and refine the others."""
         mission, earlier = self._missions[-1], RecordedMission()
-        first_ns = int(mission.states[0].times_ns[0]) if len(mission) else 0
+        first_ns = int(mission.states[0].time_ns[0]) if len(mission) else 0
         for row, frame in enumerate(backfill.frames):
             if frame.time_ns <= first_ns and row:
                 earlier.add_imu(frame.imu_times_ns, frame.accel_gyro)
@@ -139,7 +139,7 @@ class MapBuilder:
 
     def add_vertex(
         self,
-        state: BodyStates,
+        state: NavState,
         frames: Sequence[TrackedFrame | None],
         images: Sequence[U8 | None] = (),
         covariance: F64 | None = None,
@@ -169,7 +169,7 @@ class MapBuilder:
             for frame, image in zip(frames, images or [None] * len(frames), strict=True)
         ]
 
-    def refine(self, states: BodyStates) -> None:
+    def refine(self, states: NavState) -> None:
         """Replace the states of vertices of the present mission that have one of these times."""
         self._missions[-1].refine(states)
 

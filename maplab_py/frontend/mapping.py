@@ -182,9 +182,9 @@ class Mapping:
     def trajectory(self) -> Trajectory:
         """Return the states of all frames as they were estimated at their time, in their mission."""
         rows = np.array(self._states).reshape(-1, 16)
-        T_M_I, v_M_I, gyro_bias, accel_bias = np.split(rows, [7, 10, 13], axis=1)
+        T_M_I, v_M, gyro_bias, accel_bias = np.split(rows, [7, 10, 13], axis=1)
         times_ns = np.array(self._times_ns, dtype=np.int64)
-        return Trajectory(times_ns, T_M_I, v_M_I, gyro_bias, accel_bias, self._recording.name)
+        return Trajectory(times_ns, T_M_I, v_M, gyro_bias, accel_bias, self._recording.name)
 
     def _pushed(self, event: Event) -> list[OdometryUpdate]:
         if isinstance(event, ImuBatch):
@@ -202,7 +202,7 @@ class Mapping:
         if update.state is not None and self._keeps_states:
             self._times_ns.append(update.time_ns)
             state = update.state
-            for column in (state.T_M_I, state.v_M_I, state.gyro_bias, state.accel_bias):
+            for column in (state.T_M_I, state.v_M, state.gyro_bias, state.accel_bias):
                 self._states.extend(column[0])
         if self.localization is not None:
             self._localize(update, self.localization, progress)
@@ -282,7 +282,7 @@ class Mapping:
         sigma: F64 = np.sqrt(np.maximum(np.diagonal(update.window.covariance), 0.0))
         state = update.state
         progress.line(
-            f"{now_s:.1f} s  speed {np.linalg.norm(state.v_M_I):.2f} +- {sigma[6:9].max():.3f} m/s  "
+            f"{now_s:.1f} s  speed {np.linalg.norm(state.v_M):.2f} +- {sigma[6:9].max():.3f} m/s  "
             f"tilt +- {np.degrees(sigma[3:5].max()):.2f} deg  "
             f"gyro bias {np.linalg.norm(state.gyro_bias):.4f} rad/s  "
             f"accel bias {np.linalg.norm(state.accel_bias):.3f} m/s^2  "

@@ -17,7 +17,6 @@ from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.backfill import Backfill, Backfiller
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.gyroscope import turn
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.image_delay import DelayMonitor
@@ -26,7 +25,7 @@ from maplab_py.frontend.initialization.imu_noise import plausible_noise
 from maplab_py.frontend.initialization.initializer import Initializer
 from maplab_py.frontend.motion import MotionDetector
 from maplab_py.frontend.odometry_options import OdometryOptions
-from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate, WindowSummary
+from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
 from maplab_py.frontend.starting import MakeStarter, Start, Starter
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.protocol import (
@@ -35,6 +34,7 @@ from maplab_py.interop.recordings.protocol import (
     RecordedSensors,
     TrackedFrameSet,
 )
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vision.tracking.replay import tracked_images_of
 from maplab_py.vision.tracking.tracker import FrameTracker
 from maplab_py.vision.tracking.tracks import TrackedImages
@@ -192,13 +192,13 @@ class Odometry:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         return self._smoother.landmarks()
 
-    def window_states(self) -> BodyStates:
+    def window_states(self) -> NavState:
         """Return the present estimates of the frames in the window."""
         smoother = self._smoother
         if smoother is None:
-            return BodyStates.none()
+            return NavState.stack([])
         states = smoother.states
-        return BodyStates.of_motion(smoother.times_ns, states.T_M_I, states.motion)
+        return NavState.of_motion(smoother.times_ns, states.T_M_I, states.motion)
 
     # -- frames -----------------------------------------------------------------------------------
 
@@ -386,26 +386,22 @@ class Odometry:
         update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
         self.counts.starts += 1
         self._gyro_bias = state.gyro_bias[0]
-        self._speed_mps = float(np.linalg.norm(state.v_M_I[0]))
+        self._speed_mps = float(np.linalg.norm(state.v_M[0]))
         return dataclasses.replace(
             update, status=OdometryStatus.TRACKING, mission=self.counts.starts - 1, interval=None,
             state=state,
         )  # fmt: skip
 
-    def _started(self, start: Start) -> BodyStates:
+    def _started(self, start: Start) -> NavState:
         """Start the smoother, and add the frames that have come since; return the newest state."""
         first, state = start.frame, start.state
         smoother = self._new_smoother()
         smoother.start(first, state)
-        newest = BodyStates.single(
-            first.time_ns, state.T_M_I, state.v_M, state.gyro_bias, state.accel_bias
-        )
+        newest: NavState = state
         later = []
         for frame in start.later:
             # without biases and speed, turning and resting could not be told apart
-            newest = BodyStates.of_newest(
-                smoother.add(dataclasses.replace(frame, motion=Motion.MOVING))
-            )
+            newest = smoother.add(dataclasses.replace(frame, motion=Motion.MOVING)).state
             later.append(newest)
         self._smoother = smoother
         self._health = HealthMonitor(self.options.health)
@@ -458,9 +454,8 @@ class Odometry:
         begin = time.perf_counter()
         try:
             result = smoother.add(frame)
-            state = BodyStates.of_newest(result)
             tracked = sum(int((c.num_frames > 1).sum()) for c in update.tracked.cameras)
-            problem = self._health.problem(state, result.covariance, tracked)
+            problem = self._health.problem(result.state, result.covariance, tracked)
         except EstimationError as error:
             problem = str(error)
         update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
@@ -470,15 +465,15 @@ class Odometry:
                 update, interval=None, note=self._start_again(problem),
                 healthy_until_ns=healthy_until_ns, has_diverged=not is_blind,
             )  # fmt: skip
-        self._gyro_bias = result.gyro_bias
-        self._speed_mps = float(np.linalg.norm(result.v_M))
+        self._gyro_bias = result.state.gyro_bias[0]
+        self._speed_mps = float(np.linalg.norm(result.state.v_M))
         self._backfiller.check_scale(smoother, update.stamp_ns, frame, self._buffer.samples)
         return dataclasses.replace(
             self._advance_backfill(update),
             status=OdometryStatus.TRACKING,
-            state=state,
-            released=BodyStates.of_released(result),
-            window=WindowSummary.of(result),
+            state=result.state,
+            released=result.released,
+            window=result,
         )
 
     def _start_again(self, reason: str = "") -> str:

@@ -7,13 +7,12 @@ from enum import Enum
 
 import numpy as np
 
-from maplab_py.array_types import F64, U8
-from maplab_py.estimation.window.frame import Motion, WindowFrame
-from maplab_py.estimation.window.update import WindowUpdate
+from maplab_py.array_types import U8
+from maplab_py.estimation.window.frame import Motion, WindowFrame, WindowUpdate
 from maplab_py.frontend.backfill import Backfill
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.interop.recordings.protocol import TrackedFrameSet
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vision.tracking.tracks import TrackedImages
 
 
@@ -22,28 +21,6 @@ class OdometryStatus(Enum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class WindowSummary:
-    """State of the smoother's window."""
-
-    covariance: F64  # (15, 15) of the newest state, order [p, theta, v, b_g, b_a]
-    is_keyframe: bool
-    landmarks: int
-    observations: int
-    median_error_px: float
-
-    @classmethod
-    def of(cls, update: WindowUpdate) -> WindowSummary:
-        """Take what a user sees of an update of the window."""
-        return cls(
-            covariance=update.covariance,
-            is_keyframe=update.is_keyframe,
-            landmarks=update.num_landmarks,
-            observations=update.num_observations,
-            median_error_px=update.median_error_px,
-        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,9 +34,9 @@ class OdometryUpdate:
     motion: Motion
     interval: ImuInterval | None  # samples since the frame before; None after a start or an IMU gap
     stage_ms: dict[str, float]  # elapsed time of each stage
-    state: BodyStates | None = None  # of this frame; None while the estimator initialises
-    released: BodyStates | None = None  # final estimates of frames that have left the window
-    window: WindowSummary | None = None
+    state: NavState | None = None  # of this frame; None while the estimator initialises
+    released: NavState | None = None  # final estimates of frames that have left the window
+    window: WindowUpdate | None = None
     note: str = ""  # why the estimator waits, or why it was started again
     healthy_until_ns: int = 0  # states after this time are doubtful; 0 = none is
     has_diverged: bool = False  # the states before that time may be wrong, too

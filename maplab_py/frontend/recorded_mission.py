@@ -10,7 +10,6 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.frontend.backfill import cut_samples
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.dead_reckoning import LONGEST_S, Tie
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.sensors import Imu
@@ -18,6 +17,7 @@ from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.ids import from_hex, random_ids
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import (
     BaseFrames,
@@ -44,7 +44,7 @@ class RecordedMission:
 
     def __init__(self) -> None:
         """Start without vertices."""
-        self.states: list[BodyStates] = []
+        self.states: list[NavState] = []
         self.frames: list[tuple[Frame, ...]] = []
         self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none
         self.edges: list[tuple[I64, F64]] = []  # times and samples between vertices
@@ -59,7 +59,7 @@ class RecordedMission:
     @property
     def last_ns(self) -> int | None:
         """Time of the last vertex, None if there is none."""
-        return int(self.states[-1].times_ns[0]) if self.states else None
+        return int(self.states[-1].time_ns[0]) if self.states else None
 
     def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
         """Add samples; the first repeats the last sample that was added."""
@@ -79,9 +79,9 @@ class RecordedMission:
         """Return where the first vertex of the following mission is; None = nobody knows."""
         if not self.states or not following.states or self.is_doubtful:
             return None
-        last, first_ns = self.states[-1], int(following.states[0].times_ns[0])
+        last, first_ns = self.states[-1], int(following.states[0].time_ns[0])
         times_ns, samples = merged_samples(self._samples)
-        last_ns = int(last.times_ns[0])
+        last_ns = int(last.time_ns[0])
         if not len(times_ns) or not times_ns[0] <= last_ns < first_ns <= times_ns[-1]:
             return None
         times_ns, samples = cut_samples(times_ns, samples, last_ns, first_ns)
@@ -90,7 +90,7 @@ class RecordedMission:
 
     def add_vertex(
         self,
-        state: BodyStates,
+        state: NavState,
         frames: tuple[Frame, ...],
         image_rows: Sequence[int],
         covariance: F64 | None = None,
@@ -102,12 +102,12 @@ class RecordedMission:
         """
         if self.states:
             times_ns, accel_gyro = joined_samples(self._samples)
-            ends = (self.last_ns, int(state.times_ns[0]))
+            ends = (self.last_ns, int(state.time_ns[0]))
             if len(times_ns) < 2 or (int(times_ns[0]), int(times_ns[-1])) != ends:
                 raise ValueError(f"IMU samples do not reach from {ends[0]} to {ends[1]} ns")
             self.edges.append((times_ns, accel_gyro))
             self._samples = []
-        time_ns = int(state.times_ns[0])
+        time_ns = int(state.time_ns[0])
         self._row_of_time[time_ns] = len(self.states)
         if covariance is not None:
             self._covariances.append((time_ns, covariance))
@@ -129,12 +129,12 @@ class RecordedMission:
         self.frames = [*earlier.frames, *self.frames]
         self.image_rows = [*earlier.image_rows, *self.image_rows]
         self.edges = [*earlier.edges, edge, *self.edges]
-        times_ns = (int(state.times_ns[0]) for state in self.states)
+        times_ns = (int(state.time_ns[0]) for state in self.states)
         self._row_of_time = {time_ns: row for row, time_ns in enumerate(times_ns)}
 
     def drop_after(self, time_ns: int) -> None:
         """Remove vertices after a time; the samples that lead to them lead to the next mission."""
-        kept = sum(int(state.times_ns[0]) <= time_ns for state in self.states)
+        kept = sum(int(state.time_ns[0]) <= time_ns for state in self.states)
         for column in (self.states, self.frames, self.image_rows):
             del column[kept:]
         first = max(kept - 1, 0)
@@ -147,7 +147,7 @@ class RecordedMission:
         for column in (self.states, self.frames, self.image_rows):
             del column[:first]
         del self.edges[:first]
-        self._row_of_time = {int(s.times_ns[0]): row for row, s in enumerate(self.states)}
+        self._row_of_time = {int(s.time_ns[0]): row for row, s in enumerate(self.states)}
 
     def part(self, first: int) -> RecordedMission:
         """Return the vertices from a row on, with the samples between them."""
@@ -156,18 +156,12 @@ class RecordedMission:
         result.image_rows, result.edges = self.image_rows[first:], self.edges[first:]
         return result
 
-    def refine(self, states: BodyStates) -> None:
+    def refine(self, states: NavState) -> None:
         """Replace the states of vertices that have one of these times."""
-        for index, time_ns in enumerate(states.times_ns.tolist()):
+        for index, time_ns in enumerate(states.time_ns.tolist()):
             row = self._row_of_time.get(time_ns)
             if row is not None:
-                self.states[row] = BodyStates.single(
-                    time_ns,
-                    states.T_M_I[index],
-                    states.v_M_I[index],
-                    states.gyro_bias[index],
-                    states.accel_bias[index],
-                )
+                self.states[row] = states.row(index)
 
 
 def merged_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
@@ -194,8 +188,8 @@ def mission_map(
 
     Ids follow from the sensors and the time of the first vertex: equal input gives equal maps.
     """
-    states = BodyStates.concatenate(mission.states)
-    seed = np.random.default_rng(_id_seed(device, int(states.times_ns[0])))
+    states = NavState.stack(mission.states)
+    seed = np.random.default_rng(_id_seed(device, int(states.time_ns[0])))
     # one for each table, so that an id stays while the mission grows
     rng, edge_rng, frame_rng, vertex_rng, set_rng = seed.spawn(5)
     count = len(states)
@@ -215,10 +209,10 @@ def mission_map(
             id=random_ids(count, vertex_rng),
             mission=np.zeros(count, dtype=np.int32),
             T_M_I=states.T_M_I,
-            v_M=states.v_M_I,
+            v_M=states.v_M,
             accel_bias=states.accel_bias,
             gyro_bias=states.gyro_bias,
-            timestamp_ns=states.times_ns,
+            timestamp_ns=states.time_ns,
             nframe_id=random_ids(count, set_rng),
         ),
         frames=frames,
@@ -259,7 +253,7 @@ def _frame_table(mission: RecordedMission, rng: np.random.Generator) -> Frames:
     is_there = np.array([frame is not None for frame in frames])
     ids = random_ids(count, rng)
     ids[~is_there] = 0
-    times_ns = np.repeat([int(state.times_ns[0]) for state in mission.states], cameras)
+    times_ns = np.repeat([int(state.time_ns[0]) for state in mission.states], cameras)
     return Frames.filled(
         count,
         id=ids,

@@ -100,7 +100,7 @@ class RunStatistics:
         if update.status is OdometryStatus.INITIALISING:
             parts.append(f"not started: {update.note}" if update.note else "not started")
         elif update.window is not None:
-            parts.append(f"{update.window.landmarks} landmarks")
+            parts.append(f"{update.window.num_landmarks} landmarks")
         times = {stage.stage: stage.median_ms for stage in self.stages(_RECENT)}
         total = times.pop("all stages", 0.0)
         listed = ", ".join(f"{stage} {spent:.0f}" for stage, spent in times.items())

@@ -21,6 +21,7 @@ from maplab_py.interop.text_table import format_rows
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.output_files import write_text
 from maplab_py.vimap import VIMap, ids, ragged_rows
+from maplab_py.vimap.nav_state import NavState
 from maplab_py.vimap.tables import MissionSensor
 
 ASL_FILE, RPG_FILE = "vertex_poses_velocities_biases.csv", "stamped_traj_estimate.txt"
@@ -33,19 +34,12 @@ _ASL_HEADER = (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class VertexStates:
+class VertexStates(NavState):
     """States by mission, then time. S is the reference sensor, by default the IMU."""
 
-    times_ns: I64  # (N,)
     vertex: I64  # (N,) vertex row; the one before, for states between vertices
     T_M_S: F64  # (N, 7)
     T_G_S: F64  # (N, 7)
-    v_M: F64  # (N, 3) of the IMU
-    gyro_bias: F64  # (N, 3)
-    accel_bias: F64  # (N, 3)
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
 
 
 def vertex_states(
@@ -90,15 +84,15 @@ def poses_at(vi_map: VIMap, mission: int, times_ns: I64) -> F64:
     """
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     states = _mission_vertices(vi_map, rows)
-    stamps = states.times_ns
+    stamps = states.time_ns
     if len(stamps) < 2 or not vi_map.missions.sensor_id[mission, MissionSensor.IMU].any():
-        return interpolate_poses(stamps, states.T_M_S, times_ns)[0]
+        return interpolate_poses(stamps, states.T_M_I, times_ns)[0]
     inside = np.clip(times_ns, stamps[0], stamps[-1])
     before = np.clip(np.searchsorted(stamps, inside, side="right") - 1, 0, len(stamps) - 2)
     T_M_I = _between(states, before, inside)
     vertex = np.searchsorted(stamps, inside)
     at_vertex = stamps[vertex] == inside
-    T_M_I[at_vertex] = states.T_M_S[vertex[at_vertex]]  # to the last bit
+    T_M_I[at_vertex] = states.T_M_I[vertex[at_vertex]]  # to the last bit
     return T_M_I
 
 
@@ -113,7 +107,7 @@ def write_asl(vi_map: VIMap, states: VertexStates, path: Path, *, overwrite: boo
     mission_names = ids.to_hex_list(vi_map.missions.id)
     order = [4, 5, 6, 3, 0, 1, 2]
     columns: list[NDArray[np.float64] | I64 | list[str]] = [
-        states.times_ns,
+        states.time_ns,
         [names[row] for row in states.vertex.tolist()],
         [mission_names[row] for row in vi_map.vertices.mission[states.vertex].tolist()],
         states.T_G_S[:, order],
@@ -132,8 +126,8 @@ def write_rpg(states: VertexStates, path: Path, *, overwrite: bool = False) -> N
     Raises:
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
-    order = np.argsort(states.times_ns, kind="stable")
-    trajectory = Trajectory(states.times_ns[order], states.T_G_S[order])
+    order = np.argsort(states.time_ns, kind="stable")
+    trajectory = Trajectory(states.time_ns[order], states.T_G_S[order])
     write_tum(trajectory, path, overwrite=overwrite)
 
 
@@ -141,12 +135,13 @@ def _mission_vertices(vi_map: VIMap, rows: I64) -> VertexStates:
     table = vi_map.vertices
     return VertexStates(
         table.timestamp_ns[rows],
-        rows,
         table.T_M_I[rows],
-        vi_map.T_G_I[rows],
         table.v_M[rows],
         table.gyro_bias[rows],
         table.accel_bias[rows],
+        vertex=rows,
+        T_M_S=table.T_M_I[rows],
+        T_G_S=vi_map.T_G_I[rows],
     )
 
 
@@ -158,26 +153,28 @@ def _mission_states(vi_map: VIMap, mission: int, at_imu_times: bool) -> VertexSt
     edges = np.flatnonzero(vi_map.vertices.mission[vi_map.imu_edges.from_vertex] == mission)
     samples = ragged_rows(vi_map.sample_start, edges)
     times = distinct(vi_map.imu_samples.timestamp_ns[samples])
-    stamps = states.times_ns
+    stamps = states.time_ns
     if len(stamps) < 2:
         return states
     times = times[(times >= stamps[0]) & (times <= stamps[-1])]
     before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
-    T_M_S = _between(states, before, times)
+    T_M_I = _between(states, before, times)
     gyro_bias, accel_bias, v_M = (
         interpolate_vectors(stamps, values, times)[0]
         for values in (states.gyro_bias, states.accel_bias, states.v_M)
     )
-    T_G_S = se3.compose(vi_map.T_G_M[mission], T_M_S)
-    return VertexStates(times, rows[before], T_M_S, T_G_S, v_M, gyro_bias, accel_bias)
+    T_G_I = se3.compose(vi_map.T_G_M[mission], T_M_I)
+    return VertexStates(
+        times, T_M_I, v_M, gyro_bias, accel_bias, vertex=rows[before], T_M_S=T_M_I, T_G_S=T_G_I
+    )
 
 
 def _between(states: VertexStates, before: I64, times: I64) -> F64:
     """Return T_M_I between vertices: cubic Hermite position, rotation along the great arc."""
     after = before + 1
-    span = (states.times_ns[after] - states.times_ns[before]) * 1e-9
-    s = (times - states.times_ns[before]) * 1e-9 / span
-    A, B = states.T_M_S[before], states.T_M_S[after]
+    span = (states.time_ns[after] - states.time_ns[before]) * 1e-9
+    s = (times - states.time_ns[before]) * 1e-9 / span
+    A, B = states.T_M_I[before], states.T_M_I[after]
     h = np.stack([2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, 3 * s**2 - 2 * s**3, s**3 - s**2])
     h[1::2] *= span
     p = (

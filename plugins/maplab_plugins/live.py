@@ -150,7 +150,7 @@ class LiveRun:
             estimate = Estimate(
                 update.time_ns,
                 state.T_M_I[0],
-                state.v_M_I[0],
+                state.v_M[0],
                 w_I,
                 None if update.window is None else update.window.covariance,
                 None if pose is None else pose.T_G_M,

@@ -42,5 +42,6 @@ class KnownStart:
             assert self.truth.gyro_bias is not None
             assert self.truth.accel_bias is not None
             gyro_bias, accel_bias = self.truth.gyro_bias[row], self.truth.accel_bias[row]
-        state = StartState(T_M_I[0], self.truth.v_R[row], gyro_bias, accel_bias, SIGMA)
+        v_M, b_g, b_a = (x[None] for x in (self.truth.v_R[row], gyro_bias, accel_bias))
+        state = StartState(time_ns, T_M_I, v_M, b_g, b_a, SIGMA)
         return Start(frame, state)

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64, I64
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.dead_reckoning import Tie
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.simulation.scenario import ImuOptions
+from maplab_py.vimap.nav_state import NavState
 from tests.frontend.initialization.flights import Flight, fly, lively
 
 SIGMA = np.repeat([0.02, 0.01, 0.05, 2e-3, 0.03], 3)
 
 
-def between(first: int = 5, last: int = 65) -> tuple[Flight, BodyStates, I64, F64]:
+def between(first: int = 5, last: int = 65) -> tuple[Flight, NavState, I64, F64]:
     """Return a flight, the true state of a frame, and the samples from it to another, 3 s later."""
     perfect = ImuOptions(
         gyro_noise_density=0.0, accel_noise_density=0.0, gyro_bias_walk=0.0, accel_bias_walk=0.0
@@ -25,7 +25,7 @@ def between(first: int = 5, last: int = 65) -> tuple[Flight, BodyStates, I64, F6
     times_ns = np.concatenate([frame.imu_times_ns for frame in frames])
     times_ns, rows = np.unique(times_ns, return_index=True)
     samples = np.concatenate([frame.accel_gyro for frame in frames])[rows]
-    state = BodyStates.single(
+    state = NavState.single(
         flight.frames[first].time_ns, flight.truth.T_G_I[first], flight.truth.v_G[first],
         flight.gyro_bias[first], flight.accel_bias[first],
     )  # fmt: skip
@@ -53,8 +53,8 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     for _ in range(200):
         p, theta, v, gyro, accel = (SIGMA * rng.standard_normal(15)).reshape(5, 3)
         q = so3.multiply(state.T_M_I[0, :4], so3.exp(theta))
-        wrong = BodyStates.single(
-            int(times_ns[0]), se3.make(q, state.T_M_I[0, 4:] + p), state.v_M_I[0] + v,
+        wrong = NavState.single(
+            int(times_ns[0]), se3.make(q, state.T_M_I[0, 4:] + p), state.v_M[0] + v,
             state.gyro_bias[0] + gyro, state.accel_bias[0] + accel,
         )  # fmt: skip
         moved = Tie.by_samples(imu, wrong, None, times_ns, samples)

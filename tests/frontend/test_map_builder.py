@@ -11,7 +11,6 @@ import pytest
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import EstimationError, FlagError
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.map_builder import MapBuilder
 from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
@@ -24,6 +23,7 @@ from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.nav_state import NavState
 from tests.interop.small_map import make_map
 
 OFTEN = MapBuilderOptions(nframe_sync_max_output_frequency_hz=1000.0)
@@ -36,9 +36,9 @@ def stereo() -> VIMap:
     return simulate(dataclasses.replace(scenario, sessions=(session,))).maps[0]
 
 
-def states_of(vi_map: VIMap, vertex: int) -> BodyStates:
+def states_of(vi_map: VIMap, vertex: int) -> NavState:
     v = vi_map.vertices
-    return BodyStates.single(
+    return NavState.single(
         int(v.timestamp_ns[vertex]),
         v.T_M_I[vertex],
         v.v_M[vertex],
@@ -135,8 +135,8 @@ def test_final_estimates_replace_the_first(stereo: VIMap) -> None:
     rebuilt(stereo, builder)
     moved = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0]])
     wanted = dataclasses.replace(states_of(stereo, 2), T_M_I=moved)
-    other = dataclasses.replace(wanted, times_ns=wanted.times_ns + 1)  # no vertex has this time
-    builder.refine(BodyStates.concatenate([wanted, other]))
+    other = dataclasses.replace(wanted, time_ns=wanted.time_ns + 1)  # no vertex has this time
+    builder.refine(NavState.stack([wanted, other]))
     result = builder.make_map()
     np.testing.assert_array_equal(result.vertices.T_M_I[2], wanted.T_M_I[0])
     np.testing.assert_array_equal(result.vertices.T_M_I[3], stereo.vertices.T_M_I[3])

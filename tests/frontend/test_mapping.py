@@ -14,7 +14,6 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.finishing import finish, scale_verdict
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
@@ -28,6 +27,7 @@ from maplab_py.progress import SilentProgress
 from maplab_py.storage.native import load_map
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.nav_state import NavState
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import EditedRecording, position_errors, replayed
 from tests.support.own_process import in_own_process
@@ -269,9 +269,9 @@ def test_a_mission_after_a_wrong_state_is_not_tied() -> None:
     middle_ns = frames[len(frames) // 2].time_ns
     problem = HealthMonitor.problem
 
-    def wrong_once(self: HealthMonitor, state: BodyStates, covariance: F64, tracks: int) -> str:
+    def wrong_once(self: HealthMonitor, state: NavState, covariance: F64, tracks: int) -> str:
         text = problem(self, state, covariance, tracks)
-        return "speed 30.0 m/s" if state.times_ns[0] == middle_ns else text
+        return "speed 30.0 m/s" if state.time_ns[0] == middle_ns else text
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HealthMonitor, "problem", wrong_once)

@@ -10,7 +10,6 @@ import pytest
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_options import HealthOptions, OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
@@ -25,6 +24,7 @@ from maplab_py.interop.recordings.protocol import (
 )
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MotionOptions
+from maplab_py.vimap.nav_state import NavState
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import REST_FIRST, position_errors, replayed
 
@@ -47,8 +47,8 @@ def pushed(odometry: Odometry, events: list[Event]) -> list[OdometryUpdate]:
     return updates
 
 
-def states_of(updates: list[OdometryUpdate]) -> BodyStates:
-    return BodyStates.concatenate([u.state for u in updates if u.state is not None])
+def states_of(updates: list[OdometryUpdate]) -> NavState:
+    return NavState.stack([u.state for u in updates if u.state is not None])
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -58,7 +58,7 @@ def test_perfect_measurements_are_reproduced(cameras: int) -> None:
     assert [update.status for update in updates] == [OdometryStatus.TRACKING] * len(updates)
     states = states_of(updates)
     assert len(states) == sum(isinstance(event, TrackedFrameSet) for event in events)
-    assert position_errors(start.truth, states.times_ns, states.T_M_I).max() < 2e-3
+    assert position_errors(start.truth, states.time_ns, states.T_M_I).max() < 2e-3
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -67,11 +67,11 @@ def test_noisy_measurements(cameras: int) -> None:
     odometry = Odometry(device, make_starter=start)
     updates = pushed(odometry, events)
     states = states_of(updates)
-    assert position_errors(start.truth, states.times_ns, states.T_M_I).max() < 0.1
-    released = BodyStates.concatenate([u.released for u in updates if u.released is not None])
-    final = BodyStates.concatenate([released, odometry.window_states()])
-    assert len(np.unique(final.times_ns)) == len(final) == len(states)
-    assert position_errors(start.truth, final.times_ns, final.T_M_I).max() < 0.1
+    assert position_errors(start.truth, states.time_ns, states.T_M_I).max() < 0.1
+    released = NavState.stack([u.released for u in updates if u.released is not None])
+    final = NavState.stack([released, odometry.window_states()])
+    assert len(np.unique(final.time_ns)) == len(final) == len(states)
+    assert position_errors(start.truth, final.time_ns, final.T_M_I).max() < 0.1
     track_id, p_M = odometry.landmarks()
     assert len(track_id) == len(p_M) > 20
     assert {u.mission for u in updates} == {0}
@@ -119,9 +119,9 @@ def test_frames_that_came_during_a_start_are_used() -> None:
     for frame in later:
         expected = smoother.add(dataclasses.replace(frame, motion=Motion.MOVING))
     states = states_of(updates)
-    np.testing.assert_array_equal(states.T_M_I[0], expected.T_M_I)
-    np.testing.assert_array_equal(states.v_M_I[0], expected.v_M)
-    assert position_errors(known.truth, states.times_ns, states.T_M_I).max() < 0.1
+    np.testing.assert_array_equal(states.T_M_I[:1], expected.state.T_M_I)
+    np.testing.assert_array_equal(states.v_M[:1], expected.state.v_M)
+    assert position_errors(known.truth, states.time_ns, states.T_M_I).max() < 0.1
 
 
 def test_batches_of_samples_do_not_change_results() -> None:
@@ -151,7 +151,7 @@ def test_it_starts_by_itself_at_rest() -> None:
     assert first.motion is Motion.RESTING
     states = states_of(updates)
     # the start defines position and yaw: compare distances from the first position
-    true = start.truth.T_R_B[np.searchsorted(start.truth.times_ns, states.times_ns), 4:]
+    true = start.truth.T_R_B[np.searchsorted(start.truth.times_ns, states.time_ns), 4:]
     distance = np.linalg.norm(states.T_M_I[:, 4:] - states.T_M_I[0, 4:], axis=1)
     assert np.abs(distance - np.linalg.norm(true - true[0], axis=1)).max() < 0.1
     gravity_error = np.degrees(np.arccos(np.clip(cosine_of_tilts(states, start), -1, 1)))
@@ -159,9 +159,9 @@ def test_it_starts_by_itself_at_rest() -> None:
     assert gravity_error[-1] < 0.3
 
 
-def cosine_of_tilts(states: BodyStates, start: KnownStart) -> np.ndarray:
+def cosine_of_tilts(states: NavState, start: KnownStart) -> np.ndarray:
     """Return the cosines of the angles between estimated and true gravity in the body."""
-    rows = np.searchsorted(start.truth.times_ns, states.times_ns)
+    rows = np.searchsorted(start.truth.times_ns, states.time_ns)
     up = np.array([0.0, 0.0, 1.0])
     estimated = so3.rotate(so3.inverse(states.T_M_I[:, :4]), up)
     expected = so3.rotate(so3.inverse(start.truth.T_R_B[rows, :4]), up)
@@ -199,7 +199,7 @@ def test_turning_on_the_spot_is_not_rest(cameras: int) -> None:
     turning = [u for u in updates if 1.8 <= (u.time_ns - begin_ns) * 1e-9 <= 5.2]
     assert len(turning) > 30
     assert not any(u.motion is Motion.RESTING for u in turning)
-    rows = np.searchsorted(start.truth.times_ns, states_of(updates).times_ns)
+    rows = np.searchsorted(start.truth.times_ns, states_of(updates).time_ns)
     turn = so3.multiply(so3.inverse(start.truth.T_R_B[rows, :4]), states_of(updates).T_M_I[:, :4])
     assert np.degrees(np.linalg.norm(so3.log(turn), axis=1)).max() < 1.0
 
@@ -218,12 +218,12 @@ def test_turning_on_the_spot_shows_no_translation(cameras: int) -> None:
     times_s = np.array([u.time_ns - updates[0].time_ns for u in updates]) * 1e-9
     turning = [u for u, t in zip(updates, times_s, strict=True) if 6.0 <= t <= 13.0]
     assert sum(u.motion is Motion.TURNING for u in turning) > 0.9 * len(turning)
-    assert min(u.window.landmarks for u in turning if u.window is not None) > 20
-    released = BodyStates.concatenate([u.released for u in updates if u.released is not None])
-    states = BodyStates.concatenate([released, odometry.window_states()])
-    later = states.times_ns >= turning[0].time_ns
+    assert min(u.window.num_landmarks for u in turning if u.window is not None) > 20
+    released = NavState.stack([u.released for u in updates if u.released is not None])
+    states = NavState.stack([released, odometry.window_states()])
+    later = states.time_ns >= turning[0].time_ns
     p_M = states.T_M_I[later, 4:]
-    true = start.truth.T_R_B[np.searchsorted(start.truth.times_ns, states.times_ns[later]), 4:]
+    true = start.truth.T_R_B[np.searchsorted(start.truth.times_ns, states.time_ns[later]), 4:]
     moved = (p_M - p_M[0]) - (true - true[0])
     distance = np.linalg.norm(moved, axis=1)
     assert np.median(distance[-15:]) < 0.01  # the drift; single images are farther off
@@ -261,7 +261,7 @@ def test_a_long_gap_of_the_imu_starts_a_new_mission() -> None:
     assert not others
     assert next(u for u in updates if u.mission == 1).interval is None
     assert odometry.counts.imu_gaps == 1
-    errors = position_errors(start.truth, states_of(updates).times_ns, states_of(updates).T_M_I)
+    errors = position_errors(start.truth, states_of(updates).time_ns, states_of(updates).T_M_I)
     assert errors.max() < 0.1
 
 
@@ -375,7 +375,7 @@ def test_a_wrong_mounting_is_estimated_and_given_to_the_sensors() -> None:
     mended = wrong.with_cameras(*estimate.cameras())
     off = np.abs(se3.local(device.T_I_C, mended.T_I_C))
     assert np.degrees(off[:, 3:].max()) < 0.5
-    assert position_errors(start.truth, states.times_ns, states.T_M_I)[-1] < 0.1
+    assert position_errors(start.truth, states.time_ns, states.T_M_I)[-1] < 0.1
     assert mended.cameras[0].image_delay_s == 0.0
 
 

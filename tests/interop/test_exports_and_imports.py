@@ -55,12 +55,12 @@ def as_rpg(vi_map: VIMap, folder: Path) -> Path:
 
 
 def as_tum(vi_map: VIMap, folder: Path) -> Path:
-    write_tum(Trajectory(states(vi_map).times_ns, states(vi_map).T_G_S), folder / "tum.txt")
+    write_tum(Trajectory(states(vi_map).time_ns, states(vi_map).T_G_S), folder / "tum.txt")
     return folder / "tum.txt"
 
 
 def as_euroc(vi_map: VIMap, folder: Path) -> Path:
-    write_euroc(Trajectory(states(vi_map).times_ns, states(vi_map).T_G_S), folder / "euroc.csv")
+    write_euroc(Trajectory(states(vi_map).time_ns, states(vi_map).T_G_S), folder / "euroc.csv")
     return folder / "euroc.csv"
 
 
@@ -68,7 +68,7 @@ def as_localized(vi_map: VIMap, folder: Path) -> Path:
     """rovioli's poses in a map; the second frame was not localised."""
     of = states(vi_map)
     lines = [LOCALIZED_HEADER]
-    for row, time_ns in enumerate(of.times_ns.tolist()):
+    for row, time_ns in enumerate(of.time_ns.tolist()):
         T_G_I = se3.identity() if row == 1 else of.T_G_S[row]
         poses = [T[[4, 5, 6, 3, 0, 1, 2]] for T in (T_G_I, of.T_M_S[row], vi_map.T_G_M[0])]
         values = np.concatenate([*poses, of.v_M[row], np.zeros(6), [0.1, row != 1, 0]])
@@ -98,9 +98,9 @@ SECONDS = ("TUM", "export_trajectory_to_csv --csv_export_format=rpg")
 def test_trajectories_are_read_with_their_values(name: str, tmp_path: Path) -> None:
     vi_map = flat_map()
     read = read_trajectory(EXPORTS[name](vi_map, tmp_path))
-    rows = np.searchsorted(states(vi_map).times_ns, read.times_ns)
+    rows = np.searchsorted(states(vi_map).time_ns, read.times_ns)
     assert len(read) == VERTICES - (name.startswith("rovioli"))
-    np.testing.assert_array_equal(read.times_ns, states(vi_map).times_ns[rows])
+    np.testing.assert_array_equal(read.times_ns, states(vi_map).time_ns[rows])
     np.testing.assert_allclose(read.T_R_B, states(vi_map).T_G_S[rows], atol=1e-14)
     if read.v_R is not None and name != "csv_export":
         q_G_M = vi_map.T_G_M[0, :4]

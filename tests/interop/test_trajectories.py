@@ -249,7 +249,7 @@ def test_real_imu_recording() -> None:
 def test_states_of_all_vertices() -> None:
     vi_map = make_map()
     states = vertex_states(vi_map)
-    assert np.array_equal(states.times_ns, vi_map.vertices.timestamp_ns)
+    assert np.array_equal(states.time_ns, vi_map.vertices.timestamp_ns)
     assert np.array_equal(states.T_G_S, vi_map.T_G_I)
     one = vertex_states(vi_map, missions=np.array([1]))
     assert one.vertex.tolist() == list(range(VERTICES, 2 * VERTICES))
@@ -305,10 +305,10 @@ def test_states_at_imu_times_follow_the_motion() -> None:
     vi_map = make_map()
     states = vertex_states(vi_map, at_imu_times=True)
     assert len(states) == 2 * ((VERTICES - 1) * 50 + 1)
-    at_vertex = np.isin(states.times_ns, vi_map.vertices.timestamp_ns)
+    at_vertex = np.isin(states.time_ns, vi_map.vertices.timestamp_ns)
     assert np.max(np.abs(se3.local(states.T_G_S[at_vertex], vi_map.T_G_I))) < 1e-12
     half = len(states) // 2
-    t = (states.times_ns[:half] - states.times_ns[0]) * 1e-9
+    t = (states.time_ns[:half] - states.time_ns[0]) * 1e-9
     assert np.max(np.abs(states.T_M_S[:half, 4:] - position(t))) < 2e-4
     q = so3.exp(np.stack([0 * t, 0.3 * t, 0 * t], axis=1))
     error = so3.log(so3.multiply(so3.inverse(q), states.T_M_S[:half, :4]))

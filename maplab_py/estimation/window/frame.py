@@ -1,4 +1,4 @@
-"""Input of the smoother for a frame, and the state it starts from."""
+"""Input and result of the smoother for a frame, and the state it starts from."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import UserError
+from maplab_py.vimap.nav_state import NavState
 
 
 class Motion(Enum):
@@ -75,11 +76,25 @@ class FrameRows:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class StartState:
-    """State of the first frame. M has gravity along -z."""
+class StartState(NavState):
+    """State of the first frame (N = 1). M has gravity along -z."""
 
-    T_M_I: F64  # (7,)
-    v_M: F64  # (3,) [m/s]
-    gyro_bias: F64  # (3,) [rad/s]
-    accel_bias: F64  # (3,) [m/s^2]
     sigma: F64  # (15,) standard deviations [p, theta, v, b_g, b_a]; infinite = unknown
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowUpdate:
+    """Result of an update of the smoother."""
+
+    state: NavState  # newest frame
+    covariance: F64  # (15, 15) order [p, theta, v, b_g, b_a]; infinite where nothing is known
+    is_keyframe: bool
+    num_frames: int
+    num_landmarks: int  # that were estimated
+    num_observations: int  # of them
+    median_error_px: float  # of all observations of landmarks; nan without any
+    costs: dict[str, float]
+    iterations: int
+    termination: str
+    released: NavState  # final estimates of frames that have left the window, in the order of time
+    stage_ms: dict[str, float]  # processor time of this thread

@@ -19,13 +19,19 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
 from maplab_py.estimation.kernels.window_arguments import WindowPoint
 from maplab_py.estimation.linear.threads import single_thread
-from maplab_py.estimation.problem.solver import SolverOptions, SolverSummary, optimize_states
+from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.camera_poses import CameraPoses
 from maplab_py.estimation.window.cameras import BackProjection
 from maplab_py.estimation.window.factors import FrameFactors
-from maplab_py.estimation.window.frame import FrameRows, Motion, StartState, WindowFrame
+from maplab_py.estimation.window.frame import (
+    FrameRows,
+    Motion,
+    StartState,
+    WindowFrame,
+    WindowUpdate,
+)
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.keyframes import needs_keyframe
 from maplab_py.estimation.window.map_terms import MapTerms
@@ -38,9 +44,9 @@ from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator
 from maplab_py.estimation.window.turning import is_on_the_spot, shows_parallax
-from maplab_py.estimation.window.update import ReleasedStates, WindowUpdate
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Camera, Imu
+from maplab_py.vimap.nav_state import NavState
 
 _MIN_KNOWN_DEPTHS = 10
 """Landmarks of which the median depth is taken."""
@@ -90,7 +96,7 @@ class FixedLagSmoother:
         self._frames = FrameRows()
         self._states = WindowStates(np.zeros((0, 7)), np.zeros((0, 9)), np.zeros((0, 3)))
         self._stage_ms: dict[str, float] = {}
-        self._released: list[tuple[int, F64, F64]] = []
+        self._released: list[NavState] = []
 
     def start(self, frame: WindowFrame, state: StartState) -> None:
         """Begin with a first frame, whose IMU samples are not read, at a state.
@@ -100,13 +106,12 @@ class FixedLagSmoother:
         """
         if len(self._states):
             raise EstimationError("the smoother has been started already: make a new one")
-        motion = np.concatenate([state.v_M, state.gyro_bias, state.accel_bias])
-        T_M_I = np.array(state.T_M_I, dtype=np.float64)
+        motion, T_M_I = state.motion, np.array(state.T_M_I, dtype=np.float64)
         mean = self.calibration.mean
         self._prior = WindowPrior.of_state(
-            T_M_I, motion, np.asarray(state.sigma), (mean, self.calibration.sigma)
+            T_M_I[0], motion[0], np.asarray(state.sigma), (mean, self.calibration.sigma)
         )
-        self._states = WindowStates(T_M_I[None], motion[None], np.zeros((0, 3)), calibration=mean)
+        self._states = WindowStates(T_M_I, motion, np.zeros((0, 3)), calibration=mean)
         self._take_calibration()
         self._append_frame(frame, is_keyframe=True)
         self._see(frame)
@@ -140,11 +145,23 @@ class FixedLagSmoother:
             with self._stage("outliers"):
                 error_px = self._remove_outliers(problem, order)
             with self._stage("slide"):
-                newest = self._states.T_M_I[-1], self._states.motion[-1]
+                newest = self._nav_state(len(self._states) - 1)
                 self._frames.is_keyframe[-1] = is_keyframe = self._decide(frame.motion)
                 self._slide()
-        used = len(rows), len(order)
-        return self._update(frame, newest, error_px, summary, used, is_keyframe=is_keyframe)
+        return WindowUpdate(
+            state=newest,
+            covariance=self.newest_covariance,
+            is_keyframe=is_keyframe,
+            num_frames=len(self._states),
+            num_landmarks=len(rows),
+            num_observations=len(order),
+            median_error_px=error_px,
+            costs=summary.final_costs,
+            iterations=summary.iterations,
+            termination=summary.termination,
+            released=NavState.stack(self._released),
+            stage_ms=self._stage_ms,
+        )
 
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places p_M (L, 3) of the landmarks in the window that are not too far."""
@@ -449,9 +466,13 @@ class FixedLagSmoother:
         )
 
     def _release(self, frame: int) -> None:
-        states = self._states
-        time_ns = int(self._frames.time_ns[frame])
-        self._released.append((time_ns, states.T_M_I[frame], states.motion[frame]))
+        self._released.append(self._nav_state(frame))
+
+    def _nav_state(self, frame: int) -> NavState:
+        rows, states = slice(frame, frame + 1), self._states
+        return NavState.of_motion(
+            self._frames.time_ns[rows], states.T_M_I[rows], states.motion[rows]
+        )
 
     def _forget_frame(self, frame: int) -> None:
         self._states = self._states.without_frame(frame)
@@ -467,33 +488,3 @@ class FixedLagSmoother:
         began = time.thread_time()
         yield
         self._stage_ms[name] = 1e3 * (time.thread_time() - began)
-
-    def _update(
-        self,
-        frame: WindowFrame,
-        newest: tuple[F64, F64],
-        error_px: float,
-        summary: SolverSummary,
-        used: tuple[int, int],
-        *,
-        is_keyframe: bool,
-    ) -> WindowUpdate:
-        T_M_I, motion = newest
-        return WindowUpdate(
-            time_ns=frame.time_ns,
-            T_M_I=T_M_I,
-            v_M=motion[:3],
-            gyro_bias=motion[3:6],
-            accel_bias=motion[6:],
-            covariance=self.newest_covariance,
-            is_keyframe=is_keyframe,
-            num_frames=len(self._states),
-            num_landmarks=used[0],
-            num_observations=used[1],
-            median_error_px=error_px,
-            costs=summary.final_costs,
-            iterations=summary.iterations,
-            termination=summary.termination,
-            released=ReleasedStates.of_frames(self._released),
-            stage_ms=self._stage_ms,
-        )

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.states import WindowStates
@@ -124,10 +124,12 @@ class MotionStart:
         refined = yield from self._refinement.refine(segment, states, wanted_scale_sigma=wanted)
         reason = self._objection(refined, rays, limits)
         if refined is not None and not reason:
-            return Attempt(_start_state(refined), "", refined)
+            return Attempt(_start_state(segment.time_ns[-1:], refined), "", refined)
         if refined is None or not self._is_plausible(refined):
             return Attempt(None, reason, refined)
-        return Attempt(None, reason, refined, _start_state(refined), refined.scale_sigma)
+        return Attempt(
+            None, reason, refined, _start_state(segment.time_ns[-1:], refined), refined.scale_sigma
+        )
 
     def _is_plausible(self, refined: Refined) -> bool:
         """Tell whether the estimator may go on from a state, however uncertain its scale."""
@@ -213,11 +215,12 @@ def _states(turns: Turns, gyro_bias: F64, motion: LinearMotion) -> WindowStates:
     return WindowStates(T_M_I, np.concatenate([velocity, biases], axis=1), np.zeros((0, 3)))
 
 
-def _start_state(refined: Refined) -> StartState:
+def _start_state(time_ns: I64, refined: Refined) -> StartState:
     """Return the state of the last frame, in a mission frame that begins there."""
-    T_M_I, motion = refined.states.T_M_I[-1].copy(), refined.states.motion[-1]
-    T_M_I[4:] = 0.0
+    T_M_I, motion = refined.states.T_M_I[-1:].copy(), refined.states.motion[-1:]
+    T_M_I[:, 4:] = 0.0
     sigma = np.sqrt(np.maximum(np.diagonal(refined.covariance), 0.0))
     # heading is free to choose: what is known of it is what is known of the tilt
     sigma[:3], sigma[3:6] = _POSITION_SIGMA_M, refined.tilt_sigma_rad
-    return StartState(T_M_I, motion[:3], motion[3:6], motion[6:], sigma)
+    v_M, gyro_bias, accel_bias = np.split(motion, 3, axis=1)
+    return StartState(time_ns, T_M_I, v_M, gyro_bias, accel_bias, sigma)

@@ -117,7 +117,9 @@ def start_at_rest(
         3,
     )
     T_M_I = se3.make(mission_frame(-up_I), np.zeros(3))
-    return StartState(T_M_I, np.zeros(3), gyro_bias, accel_bias, sigma)
+    return StartState(
+        times_ns[-1:], T_M_I[None], np.zeros((1, 3)), gyro_bias[None], accel_bias[None], sigma
+    )
 
 
 def _spaced(frames: list[WindowFrame]) -> list[Keypoints]:

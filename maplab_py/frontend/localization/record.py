@@ -46,7 +46,7 @@ class LocalizationRecord:
             sigma_m = float(np.sqrt(variance)) if np.isfinite(variance) else 0.0
         for T in (T_G_I, state.T_M_I[0], T_G_M):
             self._rows.extend(T[[4, 5, 6, 3, 0, 1, 2]])
-        for column in (state.v_M_I, state.gyro_bias, state.accel_bias):
+        for column in (state.v_M, state.gyro_bias, state.accel_bias):
             self._rows.extend(column[0])
         self._rows.extend((sigma_m, float(pose is not None), float(update.mission)))
 

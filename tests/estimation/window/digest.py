@@ -21,7 +21,7 @@ def digest_of_run() -> str:
     digest = hashlib.sha256()
     for frame in tracks.frames[1:]:
         update = smoother.add(frame)
-        digest.update(update.T_M_I.tobytes() + update.covariance.tobytes())
+        digest.update(update.state.T_M_I.tobytes() + update.covariance.tobytes())
     digest.update(smoother.prior.root.tobytes() + smoother.landmarks()[1].tobytes())
     return digest.hexdigest()
 

@@ -50,10 +50,11 @@ class SimulatedTracks:
 
         error = np.zeros(15) if rng is None else sigma * rng.standard_normal(15)
         return StartState(
-            se3.retract(self.T_M_I[0], error[:6]),
-            self.v_M[0] + error[6:9],
-            self.gyro_bias[0] + error[9:12],
-            self.accel_bias[0] + error[12:],
+            np.array([self.frames[0].time_ns]),
+            se3.retract(self.T_M_I[:1], error[None, :6]),
+            self.v_M[:1] + error[6:9],
+            self.gyro_bias[:1] + error[9:12],
+            self.accel_bias[:1] + error[12:],
             sigma,
         )
 

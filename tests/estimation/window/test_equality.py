@@ -98,8 +98,8 @@ def general_problem(
     terms = [
         InertialTerm(motion, imu, a, a + 1, g_M),
         BiasWalkTerm(a, a + 1, walk[:, 0], walk[:, 1]),
-        PosePrior(first, start.T_M_I[None], np.diag(1.0 / SIGMA[:6])),
-        *(VertexVectorPrior(kind, first, x[None], s) for kind, x, s in vectors),
+        PosePrior(first, start.T_M_I, np.diag(1.0 / SIGMA[:6])),
+        *(VertexVectorPrior(kind, first, x, s) for kind, x, s in vectors),
     ]
     visual = VisualTerms(visual_kernels(), observations, cameras, len(window), loss=Loss.HUBER)
     return Problem(states, visual, terms), states
@@ -117,8 +117,7 @@ def window_problem(
     still = residual_kernel("relative_pose", sources.relative_pose)
     never = np.zeros(len(window), dtype=np.bool_)
     factors = FrameFactors(chain, Standstill(still, smoother.options.standstill), never, never)
-    motion = np.concatenate([start.v_M, start.gyro_bias, start.accel_bias])
-    prior = WindowPrior.of_state(start.T_M_I, motion, SIGMA)
+    prior = WindowPrior.of_state(start.T_M_I[0], start.motion[0], SIGMA)
     for T_M_I, motion in zip(window.T_M_I[1:], window.motion[1:], strict=True):
         prior = prior.with_frame(T_M_I, motion)
     return WindowProblem(window_kernels(), data, cameras, factors, prior)

@@ -78,7 +78,7 @@ def test_without_matches_it_is_the_odometry_bit_by_bit(noisy: SimulatedTracks) -
         smoother.start(noisy.frames[0], noisy.start_state(SIGMA))
     for frame in noisy.frames[1:]:
         expected, update = plain.add(frame), localized.add(frame)
-        assert update.T_M_I.tobytes() == expected.T_M_I.tobytes()
+        assert update.state.T_M_I.tobytes() == expected.state.T_M_I.tobytes()
         assert update.covariance.tobytes() == expected.covariance.tobytes()
     assert localized.prior.root.tobytes() == plain.prior.root.tobytes()
     assert localized.map_estimate is None

@@ -11,10 +11,9 @@ import pytest
 
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, MapError, UserError
-from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.window.frame import Motion, WindowFrame, WindowUpdate
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.estimation.window.update import WindowUpdate
 from maplab_py.geometry import se3
 from tests.estimation.window.digest import digest_of_run
 from tests.estimation.window.recordings import SimulatedTracks, scenario, simulated
@@ -46,7 +45,7 @@ def test_replay_without_noise_is_exact(stereo: bool) -> None:
         scenario(duration_s=6.0, stereo=stereo, noise=False, keypoints=80, imu_rate_hz=800.0)
     )
     _, updates = run(tracks, sigma=PERFECT)
-    estimates = np.array([update.T_M_I for update in updates])
+    estimates = np.array([update.state.T_M_I[0] for update in updates])
     error = se3.local(estimates, tracks.T_M_I[1:])
     assert np.linalg.norm(error[:, :3], axis=1).max() < 1e-4
     assert np.linalg.norm(error[:, 3:], axis=1).max() < 1e-4
@@ -65,7 +64,7 @@ def test_errors_agree_with_covariances(noisy: SimulatedTracks) -> None:
     _, updates = run(noisy)
     nees = []
     for update, truth in zip(updates[10:], noisy.T_M_I[11:], strict=True):
-        error, covariance = se3.local(update.T_M_I, truth), update.covariance[:6, :6]
+        error, covariance = se3.local(update.state.T_M_I[0], truth), update.covariance[:6, :6]
         assert np.all(np.linalg.eigvalsh(update.covariance) > 0.0)
         nees.append(error @ np.linalg.solve(covariance, error))
     assert 1.0 < np.mean(nees) < 12.0  # 6 degrees of freedom, a single session
@@ -126,8 +125,8 @@ def test_outliers_do_not_matter(noisy: SimulatedTracks) -> None:
         frames.append(dataclasses.replace(frame, uv_px=uv))
     _, clean = run(noisy)
     _, updates = run(dataclasses.replace(noisy, frames=frames))
-    error = se3.local(updates[-1].T_M_I, noisy.T_M_I[-1])
-    clean_error = se3.local(clean[-1].T_M_I, noisy.T_M_I[-1])
+    error = se3.local(updates[-1].state.T_M_I[0], noisy.T_M_I[-1])
+    clean_error = se3.local(clean[-1].state.T_M_I[0], noisy.T_M_I[-1])
     assert np.linalg.norm(error[:3]) < 0.03
     assert np.linalg.norm(error[:3] - clean_error[:3]) < 0.02
 
@@ -170,9 +169,9 @@ def test_standing_still_neither_drifts_nor_adds_keyframes(noisy: SimulatedTracks
     start = smoother.states.T_M_I[0].copy()
     updates = [smoother.add(frame) for frame in tracks.frames[1:]]
     assert not any(update.is_keyframe for update in updates)
-    assert np.linalg.norm(updates[-1].T_M_I[4:] - start[4:]) < 0.02
-    assert np.linalg.norm(updates[-1].v_M) < 0.01
-    assert np.linalg.norm(updates[-1].gyro_bias - tracks.gyro_bias[0]) < 2e-4
+    assert np.linalg.norm(updates[-1].state.T_M_I[0, 4:] - start[4:]) < 0.02
+    assert np.linalg.norm(updates[-1].state.v_M) < 0.01
+    assert np.linalg.norm(updates[-1].state.gyro_bias - tracks.gyro_bias[0]) < 2e-4
     assert len(smoother.times_ns) <= 3
     assert max(len(update.released) for update in updates) <= 2
 
@@ -224,7 +223,7 @@ def test_goes_on_without_keypoints_and_recovers(noisy: SimulatedTracks) -> None:
     _, updates = run(dataclasses.replace(noisy, frames=frames))
     uncertain = [np.sqrt(np.trace(update.covariance[:3, :3])) for update in updates]
     assert uncertain[20] > 2.0 * uncertain[10]
-    error = se3.local(updates[-1].T_M_I, noisy.T_M_I[-1])
+    error = se3.local(updates[-1].state.T_M_I[0], noisy.T_M_I[-1])
     assert np.linalg.norm(error[:3]) < 4.0 * uncertain[-1]
 
 
@@ -254,7 +253,7 @@ def test_no_landmarks_from_motion_while_turning_without_parallax(noisy: Simulate
     mono = dataclasses.replace(noisy, frames=left, cameras=noisy.cameras[:1], T_I_C=noisy.T_I_C[:1])
     assert run(mono)[1][-1].num_landmarks > 10
     updates = run(turning(mono))[1]
-    since_ns = [update.time_ns - mono.frames[0].time_ns for update in updates]
+    since_ns = [update.state.time_ns[0] - mono.frames[0].time_ns for update in updates]
     early = [u.num_landmarks for u, ns in zip(updates, since_ns, strict=True) if ns < 350_000_000]
     assert len(early) >= 2
     assert not any(early)
@@ -267,9 +266,9 @@ def test_turning_has_no_velocity_unless_the_estimate_contradicts(noisy: Simulate
     tight = WindowOptions(turning_max_mps=100.0, turning_sigma_mps=1e-4)
     assert np.linalg.norm(noisy.v_M[1]) > 0.2
     _, updates = run(turning(first), tight)
-    assert np.linalg.norm(updates[0].v_M) < 0.05
+    assert np.linalg.norm(updates[0].state.v_M) < 0.05
     _, updates = run(turning(first), dataclasses.replace(tight, turning_max_mps=0.1))
-    assert np.linalg.norm(updates[0].v_M - noisy.v_M[1]) < 0.05
+    assert np.linalg.norm(updates[0].state.v_M - noisy.v_M[1]) < 0.05
 
 
 def test_thesis_policy_keeps_few_landmarks(noisy: SimulatedTracks) -> None:
@@ -278,5 +277,5 @@ def test_thesis_policy_keeps_few_landmarks(noisy: SimulatedTracks) -> None:
     assert smoother.tracks.is_landmark.sum() <= 5
     assert max(update.num_landmarks for update in updates) <= 5 + 50
     assert max(update.num_frames for update in updates) <= 5 + 3
-    error = se3.local(updates[-1].T_M_I, noisy.T_M_I[-1])
+    error = se3.local(updates[-1].state.T_M_I[0], noisy.T_M_I[-1])
     assert np.linalg.norm(error[:3]) < 0.03

@@ -102,10 +102,10 @@ def test_euroc(cameras: str, most_s: float, begin_s: float) -> None:
     truth = read_trajectory(shared_data(FOLDER) / "mav0/state_groundtruth_estimate0/data.csv")
     row = int(np.argmin(np.abs(truth.times_ns - time_ns)))
     assert seconds <= most_s
-    assert tilt_error_deg(state.T_M_I, truth.T_R_B[row]) < 1.0
+    assert tilt_error_deg(state.T_M_I[0], truth.T_R_B[row]) < 1.0
     assert truth.v_R is not None
     assert truth.gyro_bias is not None
-    velocity = body_velocity(state.T_M_I, state.v_M)
+    velocity = body_velocity(state.T_M_I[0], state.v_M[0])
     expected = body_velocity(truth.T_R_B[row], truth.v_R[row])
     assert np.linalg.norm(velocity - expected) < 0.01 + 0.03 * np.linalg.norm(expected)
     assert np.linalg.norm(truth.gyro_bias[row]) > 0.07
@@ -126,7 +126,7 @@ def test_tango() -> None:
         previous, row = images, row + 1
     assert start is not None
     state, row = start.state, row - 1 - len(start.later)
-    assert tilt_error_deg(state.T_M_I, vi_map.vertices.T_M_I[row]) < 1.5
+    assert tilt_error_deg(state.T_M_I[0], vi_map.vertices.T_M_I[row]) < 1.5
     bias = vi_map.vertices.accel_bias[row]
     assert np.linalg.norm(bias) > 0.7
     assert np.linalg.norm(state.accel_bias - bias) < 0.25

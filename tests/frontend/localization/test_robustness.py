@@ -164,7 +164,7 @@ def test_a_slow_constant_velocity_is_not_taken_for_rest() -> None:
     for update in (u for u, is_straight in zip(updates, straight, strict=True) if is_straight):
         assert update.motion is Motion.MOVING
         assert update.state is not None
-        v_M.append(update.state.v_M_I[0])
+        v_M.append(update.state.v_M[0])
     expected = truth.v_R[np.searchsorted(truth.times_ns, [f.time_ns for f in frames])][straight]
     np.testing.assert_allclose(np.linalg.norm(expected, axis=1), SLOW_MPS, atol=0.03)
     np.testing.assert_allclose(np.array(v_M), expected, atol=0.03)
