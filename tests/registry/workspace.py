@@ -58,6 +58,7 @@ PREPARED = {
     "cancel": "",
     "load": "",
     "recover": "",
+    "check": "!echo map_stats > nightly.maplab",
     "load_all": "",
     "load_merge_all_maps": "",
     "load_merge_all_submaps": "",

@@ -28,9 +28,16 @@ def check_commands(text: str, session: Session, written: list[Path] | None = Non
         session: Gives aliases, variables and lasting flags; it does not change.
         written: Files that texts before it may write; those of this text are appended.
     """
+    return check_script(text, session, written)[0]
+
+
+def check_script(
+    text: str, session: Session, written: list[Path] | None = None
+) -> tuple[list[str], list[tuple[str, Call | None]]]:
+    """Return the errors as `check_commands`, and the commands with their calls; None for a help page."""
     checker = _Checker(session, [] if written is None else written)
     checker.check(text)
-    return checker.problems
+    return checker.problems, checker.steps
 
 
 class _Checker:
@@ -38,6 +45,7 @@ class _Checker:
 
     def __init__(self, session: Session, written: list[Path]) -> None:
         self.problems: list[str] = []
+        self.steps: list[tuple[str, Call | None]] = []
         self._registry = session.registry
         self._variables = dict(session.variables)
         self._aliases = dict(session.aliases)
@@ -81,6 +89,7 @@ class _Checker:
             self.check(alias, place, depth + 1)
             return False
         call = call_from_words(command.words, self._registry, self._settings)
+        self.steps.append((typed.source, None if call.wants_help else call))
         if not call.wants_help:
             call.arguments()
             self._check_files(call)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import shutil
 import time
@@ -65,7 +66,8 @@ class Rescue:
         for key in self._copies.keys() - unsaved.keys():
             del self._copies[key]
             shutil.rmtree(self._folder / key, ignore_errors=True)
-        draft = self._session.with_maps(MapManager(self._session.maps.state), SilentTerminal())
+        draft = copy.copy(self._session)
+        draft.maps, draft.terminal = MapManager(draft.maps.state), SilentTerminal()
         for key, entry in unsaved.items():
             if key in self._copies and self._copies[key]() is entry.vi_map:
                 continue

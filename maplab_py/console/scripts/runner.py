@@ -17,7 +17,8 @@ from maplab_py.cancellation import CancelToken
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.scripts.aliases import expanded
-from maplab_py.console.scripts.checking import LEAVE, check_commands
+from maplab_py.console.scripts.checking import LEAVE, check_script
+from maplab_py.console.scripts.costs import Plan, measuring, predict
 from maplab_py.console.scripts.rescue import Rescue
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
@@ -61,6 +62,7 @@ class Runner:
         self.wants_exit = False
         self._alias_depth = 0
         self._rescue: Rescue | None = None  # of a script
+        self._plan: Plan | None = None
         terminal.mission_names = lambda: session.mission_names
 
     def run_text(self, text: str, *, keep_going: bool = False) -> Status:
@@ -75,7 +77,9 @@ class Runner:
             return self.report_error("", error)
         failed: list[str] = []
         first = Status.OK
-        for command in commands:
+        for number, command in enumerate(commands, start=1):
+            if not self._alias_depth:
+                self.terminal.position = self._position(number, len(commands))
             before = self.session.refusal
             status = self._run_typed(command, keep_going=keep_going)
             refusal = self.session.refusal
@@ -97,7 +101,9 @@ class Runner:
 
         A text with an error is not started, unless the commands after a failure shall run anyway.
         """
-        problems = [] if keep_going else check_commands(text, self.session)
+        problems, steps = ([], []) if keep_going else check_script(text, self.session)
+        if not problems and self.terminal.shows_progress:
+            self._plan = predict(steps, self.session.maps)
         return self.report_problems(problems) or self.run_checked(text, keep_going=keep_going)
 
     def run_checked(self, text: str, *, keep_going: bool = False) -> Status:
@@ -111,6 +117,14 @@ class Runner:
                 return self.run_text(text, keep_going=keep_going)
         except KeyboardInterrupt:
             return Status.CANCELLED  # between two commands
+
+    def _position(self, number: int, count: int) -> str:
+        """Return the place of a command in its script, and the time that those after it take."""
+        if self._plan is None or count == 1:
+            return ""
+        has_all = len(self._plan.steps) == count  # no alias, assignment or shell command
+        after_s = self._plan.left_after(number) if has_all else 0.0
+        return f"{number}/{count}{f', then {after_s:.0f} s' if after_s >= 1.0 else ''}: "
 
     def _keep_copies(self) -> None:
         """Keep copies of the unsaved maps of a script where much work would be lost if it were killed."""
@@ -235,7 +249,12 @@ class Runner:
                 call = self.session.parse(["help", call.command.name])
             if command.in_background:
                 return self._start_job(call, command)
-            with self._pipe(command.shell), self._write(command), self.session.lock:
+            with (
+                self._pipe(command.shell),
+                self._write(command),
+                self.session.lock,
+                measuring(call, self.session),
+            ):
                 report = run_in_foreground(
                     call.command.name,
                     lambda: self.session.execute(call),

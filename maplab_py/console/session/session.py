@@ -227,7 +227,7 @@ class Session:
             MaplabError: The command failed.
         """
         command, arguments = call.command, call.arguments()
-        draft = self.with_maps(MapManager(base), terminal)
+        draft = self._with_maps(MapManager(base), terminal)
         if command.needs_map:
             _ = draft.maps.selected
         start = time.perf_counter()
@@ -281,7 +281,7 @@ class Session:
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *(n for n in self.registry.names if n.isidentifier())})
 
-    def with_maps(self, maps: MapManager, terminal: Terminal) -> Session:
+    def _with_maps(self, maps: MapManager, terminal: Terminal) -> Session:
         """Return the session that a running command works on: a copy with a draft of the maps."""
         inside = copy.copy(self)
         inside._is_draft = True

@@ -46,14 +46,18 @@ class TerminalProgress:
     A verbosity above zero prints the lines of intermediate results everywhere.
     """
 
-    def __init__(self, stream: TextIO, verbosity: int = 0, what: str = "") -> None:
+    def __init__(
+        self, stream: TextIO, verbosity: int = 0, what: str = "", position: str = ""
+    ) -> None:
         """Start the clock of one command.
 
         Args:
             stream: Where the bar goes.
             verbosity: Above zero: print lines of intermediate results everywhere.
             what: Shown until the command names its current step.
+            position: Shown before it and all steps.
         """
+        self._position = position
         self._stream = stream
         self._token = current_token()
         self._what = what
@@ -126,7 +130,7 @@ class TerminalProgress:
                 self._bar = _make_bar(self._stream)
                 self._bar.start()
                 self._task = self._bar.add_task(self._cut(self._bar, what), total=total)
-            text = self._cut(self._bar, what)
+            text = self._cut(self._bar, self._position + what)
             self._bar.update(self._task, completed=done, total=total, description=text)
 
     @staticmethod
@@ -185,10 +189,16 @@ class ConsoleTerminal:
         """Make the terminal of this process."""
         self.as_json = as_json
         self.is_prompt = False  # a user reads the output directly
+        self.position = ""  # of the running command in its script, before its name in the bar
         self.mission_names: Callable[[], Mapping[str, str]] = dict  # by id
         self._transcript: TextIO | None = None
         self._out: IO[str] | None = None  # instead of standard output
         self._progresses: list[TerminalProgress] = []  # of the running command and inner ones
+
+    @property
+    def shows_progress(self) -> bool:
+        """Tell whether bars are drawn."""
+        return wants_colour(sys.stderr)
 
     @property
     def is_interactive(self) -> bool:
@@ -312,7 +322,7 @@ class ConsoleTerminal:
     def progress(self, command: str, verbosity: int = 0) -> Iterator[Progress]:
         """Show progress on standard error."""
         self._hide_progress()
-        progress = TerminalProgress(sys.stderr, verbosity, command)
+        progress = TerminalProgress(sys.stderr, verbosity, command, self.position)
         self._progresses.append(progress)
         try:
             yield progress

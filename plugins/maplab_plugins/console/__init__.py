@@ -4,6 +4,7 @@ from maplab_plugins.console.aliases import alias, list_flags, set_flags, unalias
 from maplab_plugins.console.help import list_plugins, show_help, show_schema
 from maplab_plugins.console.jobs import cancel, join, list_jobs
 from maplab_plugins.console.session import (
+    check,
     clear_screen,
     enable_sheep,
     fix,
@@ -16,6 +17,7 @@ from maplab_plugins.console.session import (
 __all__ = [
     "alias",
     "cancel",
+    "check",
     "clear_screen",
     "enable_sheep",
     "fix",

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from maplab_py.cancellation import current_token
+from maplab_py.console.scripts.costs import Plan
 from maplab_py.plugin import (
     Cancelled,
     CommandContext,
@@ -91,6 +92,26 @@ def watch(
         current_token().cancelled = False  # it is how this command is meant to end
         return Message(f"stopped after {counted(runs, 'run')}")
     return Message(counted(runs, "run"))
+
+
+@command("check", example="check nightly.maplab", needs_map=False, reads=("script",))
+def check(context: CommandContext, script: Path) -> Plan:
+    """Check a script without running it, and predict time, memory and disk of each step.
+
+    The predictions rest on former runs of the same commands on this machine, scaled to the maps and
+    recordings at hand. A command that was not run yet has none.
+
+    Args:
+        script: File of commands.
+    """
+    from maplab_py.console.scripts.batch import read_script
+    from maplab_py.console.scripts.checking import check_script
+    from maplab_py.console.scripts.costs import predict
+
+    problems, steps = check_script(read_script(script), context.session)
+    if problems:
+        raise UserError("; ".join(f"{script}: {problem}" for problem in problems))
+    return predict(steps, context.maps)
 
 
 @command("fix", see_also=("undo",), needs_map=False, acts_outside=True)

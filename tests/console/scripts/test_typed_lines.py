@@ -20,8 +20,9 @@ from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal import output
 from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.errors import FlagError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.report import Message
+from maplab_py.storage.native import save_map
 from tests.console.sample_plugin import make_registry, make_session, map_of
 
 Capture = pytest.CaptureFixture[str]
@@ -416,3 +417,32 @@ def test_what_a_failed_script_made_is_recovered(
     for _ in range(7):
         assert runner.finish(discard=False) in (Status.OK, Status.USER_ERROR)
     assert len(list((tmp_path / "maplab" / "rescued").iterdir())) <= 5
+
+
+def test_a_script_is_predicted_from_former_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, session: Session
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    for name, count in (("small", 1), ("large", 3)):
+        save_map(map_of(count), tmp_path / name)
+    text = "load small; map_stats; save copies"
+    Path("s.maplab").write_text(text)
+    plan = session.check("s.maplab")
+    assert [step.runs for step in plan.steps] == [0, 0, 0]
+    assert (plan.total_s, plan.not_predicted) == (0.0, 3)
+    assert Runner(Session(REGISTRY), ConsoleTerminal()).run_script(text) == Status.OK
+    plan = session.check("s.maplab")
+    assert [(step.step, step.command, step.runs) for step in plan.steps] == [
+        (1, "load small", 1), (2, "map_stats", 1), (3, "save copies", 1)
+    ]  # fmt: skip
+    assert plan.total_s > 0.0
+    assert plan.steps[2].disk_mb > 0.0
+    Path("s.maplab").write_text(text.replace("small", "large"))
+    larger = session.check("s.maplab")
+    assert larger.total_s > plan.total_s
+    (tmp_path / "maplab" / "costs.json").write_text("[1")
+    assert session.check("s.maplab").not_predicted == 3
+    Path("s.maplab").write_text("lod x; map_stats --y")
+    with pytest.raises(UserError, match=r"column 1: unknown command.*column 8: map_stats has no"):
+        session.check("s.maplab")
