@@ -115,6 +115,20 @@ def _recording(folder: Path) -> None:
             _take(page, "viewer_pick.png")
 
 
+def _history(folder: Path) -> None:
+    """Show a recorded walk as it was before its loop was closed, with the errors of all states."""
+    with Session() as session:
+        session.set_flags(["--viewer_port=0"])
+        session.run("load", map_folder=folder)
+        for command in ("relax", "lc", "optvi", "visualize"):
+            session.run(command)
+        viewer = _viewer(session)
+        with _page(viewer) as page:
+            viewer.set_state(0)
+            viewer.wait()
+            _take(page, "viewer_history.png")
+
+
 def _pick(viewer: Viewer, session: Session) -> None:
     """Pick a good landmark that a long piece of the walk has seen, and look at it from near."""
     vi_map = session.vi_map
@@ -142,6 +156,7 @@ def main() -> None:
     """Take all pictures."""
     TARGET.mkdir(exist_ok=True)
     _recording(Path(sys.argv[1]))
+    _history(Path(sys.argv[1]))
     if len(sys.argv) > 2:
         _demo(Path(sys.argv[2]))
         return

@@ -12,6 +12,7 @@ from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_drawing, spread_rows
 from maplab_py.viewer.extension import plugin_layers
+from maplab_py.viewer.history import State
 from maplab_py.viewer.layers import (
     cameras,
     closures,
@@ -52,6 +53,19 @@ class Subject:
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
     only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
     note: str = ""  # a line above the layers
+    history: tuple[State, ...] = ()  # of the map, which is one of them
+    state: int = -1  # place in the history of what is shown; -1 = the map
+
+    @property
+    def shown(self) -> VIMap:
+        """State of the map that is drawn."""
+        return self.vi_map if self.state < 0 else self.history[self.state].vi_map
+
+    @property
+    def place(self) -> int:
+        """Place in the history of what is drawn, -1 = it has none."""
+        shown = self.shown
+        return next((i for i, state in enumerate(self.history) if state.vi_map is shown), -1)
 
     def replace(self, **changes: object) -> Subject:
         """Return the subject with some of it exchanged."""
@@ -75,9 +89,9 @@ def make_checked_drawing(subject: Subject) -> Drawing:
     """
     if subject.shows_sensors:
         return _sensor_drawing(subject)
-    if not len(subject.vi_map.vertices):
+    if not len(subject.shown.vertices):
         raise UserError(f"map '{subject.title}' has no vertices: there is nothing to show")
-    return make_drawing(subject.vi_map, subject.options)
+    return make_drawing(subject.shown, subject.options)
 
 
 def scene_of(drawing: Drawing, subject: Subject) -> Scene:

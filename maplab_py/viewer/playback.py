@@ -12,7 +12,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer.drawing import PATH_ENDS, Drawing, first_observer, spread_rows
-from maplab_py.viewer.layers.references import errors_against
+from maplab_py.viewer.layers.references import position_errors
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.scene import Layer, Part, Points, Scene, Segments
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -174,7 +174,7 @@ def vertex_signals(drawing: Drawing, truth: Trajectory | None = None) -> tuple[S
         Signal("landmarks", "", landmarks[:, None], 0),
     ]
     if truth is not None:
-        error_m = errors_against(drawing, truth)
+        error_m = position_errors(drawing.vi_map.vertices.timestamp_ns, drawing.p_vertices, truth)
         signals.append(Signal("position error", "m", error_m[:, None], 3))
     return tuple(signal for signal in signals if _is_known(signal.values))
 

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions, LoopClosureOptions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
-from maplab_py.plugin import CommandContext, Message, Report, command
+from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 from maplab_py.report import counted
+from maplab_py.vimap import to_hex_list
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.loop_closure.reports import (
         ClosureRemovalReport,
         ClosureReport,
+        ClosureVerdictReport,
         LoopClosureReport,
         TrainingReport,
     )
@@ -288,6 +290,53 @@ def remove_loopclosure(
 
     ids = find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
     return context.apply(remove_closures, ids)
+
+
+@command(
+    "judge_closures",
+    example="judge_closures --refuse=59f0a1b2",
+    see_also=("why", "lc_report", "relax", "visualize"),
+    completes={"accept": closure_values, "refuse": closure_values},
+)
+def judge_closures(
+    context: CommandContext,
+    *,
+    accept: str = "",
+    refuse: str = "",
+    options: LoopClosureOptions = _LOOPS,
+) -> ClosureVerdictReport:
+    """Accept or refuse recorded closures by hand; without ids as in the viewer's closure court.
+
+    An accepted closure becomes an edge with the pose that was found, for relax. A refused one is
+    removed as by remove_loopclosure; later searches refuse it, too.
+
+    Args:
+        accept: Beginnings of ids as lc_report shows them, separated by commas.
+        refuse: The same.
+    """
+    from maplab_plugins.visualization.following import verdicts_of_page
+    from maplab_py.algorithms.loop_closure.listing import find_closures
+    from maplab_py.algorithms.loop_closure.record_updates import accept_closures, remove_closures
+    from maplab_py.algorithms.loop_closure.reports import ClosureVerdictReport
+
+    lists = [[name for name in text.split(",") if name.strip()] for text in (accept, refuse)]
+    if not any(lists):
+        lists = verdicts_of_page(context)
+    accepted, refused = (find_closures(context.vi_map, names) for names in lists)
+    if set(map(bytes, accepted)) & set(map(bytes, refused)):
+        raise UserError("judge_closures: a closure is both accepted and refused")
+    without, removal = remove_closures(context.vi_map, refused)
+    result = accept_closures(without, accepted, options)
+    context.commit(result)
+    return ClosureVerdictReport(
+        accepted=tuple(name[:8] for name in to_hex_list(accepted)),
+        refused=removal.closures,
+        edges_added=len(result.loop_closure_edges) - len(without.loop_closure_edges),
+        edges_removed=removal.edges_removed,
+        landmarks_restored=removal.landmarks_restored,
+        observations_moved=removal.observations_moved,
+        notes=removal.notes,
+    )
 
 
 @command("delete_loopclosure_record")

@@ -6,10 +6,12 @@ import io
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from maplab_plugins.visualization.following import Following
 
 from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
@@ -23,6 +25,7 @@ from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
 from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.viewer.scene import Entity
 from maplab_py.vimap.ids import to_hex
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
@@ -107,6 +110,57 @@ def test_closures_are_listed_removed_and_forgotten(tmp_path: Path) -> None:
     assert len(session.vi_map.landmarks) == before
     session.run("delete_loopclosure_record")
     assert session.run("lc_report").recorded == 0
+
+
+def test_a_person_accepts_and_refuses_closures() -> None:
+    session = session_of(TWICE)
+    strict = {"lc_min_inlier_count": 1000}  # refuses all of them
+    session.run("lc", **strict)
+    before = session.vi_map
+    ids = [line.id for line in session.run("lc_report", which="refused").closures]
+    report = session.run("judge_closures", accept=ids[0], refuse=f"{ids[1]}, {ids[2]}")
+    assert (report.accepted, report.refused, report.edges_added) == ((ids[0],), (ids[1], ids[2]), 1)
+    (edge,) = session.vi_map.loop_closure_edges.T_A_B
+    closures = read_record(session.vi_map).closures
+    assert np.array_equal(edge, closures.T_A_B[[to_hex(i)[:8] for i in closures.id].index(ids[0])])
+    verdicts = {line.id: line.verdict for line in session.run("lc_report", which="all").closures}
+    assert [verdicts[i] for i in ids[:3]] == ["accepted", "removed by hand", "removed by hand"]
+    relaxed = session.run("relax", **strict)
+    assert relaxed.relaxation.num_loop_closures == 1
+    session.run("undo")
+    session.run("undo")
+    assert session.vi_map is before
+    session.run("judge_closures", accept=ids[1])
+    with pytest.raises(UserError, match="no closure begins with 'ffff'"):
+        session.run("judge_closures", accept="ffff")
+    with pytest.raises(UserError, match="both accepted and refused"):
+        session.run("judge_closures", accept=ids[0], refuse=ids[0])
+    with pytest.raises(UserError, match="give --accept or --refuse"):
+        session.run("judge_closures")
+
+
+def test_verdicts_of_the_page_are_applied() -> None:
+    session = session_of(TWICE)
+    session.run("lc", lc_min_inlier_count=1000)
+    session.run("visualize", viewer_port=0)
+    following = session.watchers.find("viewer", Following)
+    assert following is not None
+    viewer = following.viewer
+    with pytest.raises(UserError, match="no verdict was given in the page"):
+        session.run("judge_closures")
+    page = SimpleNamespace(client=None)
+    viewer.court.judge(None, page)
+    first = viewer.selection.picked
+    assert first is not None
+    assert first.entity is Entity.CLOSURE
+    viewer.court.judge(True, page)
+    assert viewer.selection.picked.row != first.row
+    viewer.court.judge(False, page)
+    report = session.run("judge_closures")
+    assert (len(report.accepted), len(report.refused)) == (1, 1)
+    name = to_hex(read_record(session.vi_map).closures.id[first.row])[:8]
+    assert report.accepted == (name,)
+    session.run("viewer_stop")
 
 
 def test_a_projection_is_trained_and_used(tmp_path: Path) -> None:

@@ -121,7 +121,10 @@ def prepare(runner: Runner, name: str, capsys: Capture) -> str:
         capsys.readouterr()
     if name == "fix":  # what a refusal has left
         runner.session.refusal = Refusal("map_stats", "elq")
-    if name == "remove_loopclosure":  # whose argument is an id that nobody knows beforehand
+    if name in (
+        "remove_loopclosure",
+        "judge_closures",
+    ):  # whose argument is an id that nobody knows beforehand
         closures = runner.session.run("lc_report").as_dict()["closures"]
         example = example.replace("59f0a1b2", closures[0]["id"])
     if name == "import_point_clouds":  # likewise

@@ -94,7 +94,7 @@ for _name in ("segment_database_stats", "prune_segments", "export_segments"):
     PREPARED[_name] = f"{MERGED}; collect_segments --database=device.segments"
 # two short walks show no accelerometer scale, and are refused if that is asked of them
 PREPARED["self_calibrate"] = f"{MERGED}; set --sc_states=intrinsics,extrinsics_rotation"
-PREPARED["remove_loopclosure"] = f"{MERGED}; lc"
+PREPARED["remove_loopclosure"] = PREPARED["judge_closures"] = f"{MERGED}; lc"
 PREPARED["simulate"] = f"{MERGED}; !rm -r simulated"
 PREPARED["tour"] = "!mkdir -p maplab_tour/sessions && touch maplab_tour/sessions/truth.npz"
 PREPARED["relax_external"] = f"{MERGED}; sbk --map_mission=59f0; sbk --map_mission=a1"

@@ -100,18 +100,43 @@ def closure_edges(closures: Closures, options: LoopClosureOptions) -> LoopClosur
     rows = np.flatnonzero(closures.accepted & enough)
     _, first = np.unique(closures.id[rows], axis=0, return_index=True)
     rows = rows[np.sort(first)]  # two places may have the same best vertex
-    T_M_A = closures.T_M_I[rows]
-    T_A_B = closures.T_A_B[rows]
-    covariance = _of_relative_pose(closures.covariance[rows], T_M_A, T_A_B)
-    covariance += np.diag(_FLOOR_STD**2)
+    return make_edges(
+        closures.id[rows],
+        (closures.query_vertex[rows], closures.place_vertex[rows]),
+        closures.T_M_I[rows],
+        closures.T_A_B[rows],
+        closures.covariance[rows],
+        options,
+    )
+
+
+def make_edges(
+    ids: IdArray,
+    ends: tuple[I64, I64],
+    T_M_A: F64,
+    T_A_B: F64,
+    covariance: F64,
+    options: LoopClosureOptions,
+) -> LoopClosureEdges:
+    """Return the edges (N) of closures.
+
+    Args:
+        ids: Ids (N, 2).
+        ends: Query (A) and place (B) vertices (N,).
+        T_M_A: Poses (N, 7) of the queries in the missions of the places.
+        T_A_B: Poses (N, 7) of the places' vertices in the queries.
+        covariance: Covariances (N, 6, 6) of T_M_A, [dp, dtheta].
+        options: Scale of the covariance, and variance of the switches.
+    """
+    relative = _of_relative_pose(covariance, T_M_A, T_A_B) + np.diag(_FLOOR_STD**2)
     return LoopClosureEdges.filled(
-        len(rows),
-        id=closures.id[rows],
-        from_vertex=closures.query_vertex[rows],
-        to_vertex=closures.place_vertex[rows],
+        len(ids),
+        id=ids,
+        from_vertex=ends[0],
+        to_vertex=ends[1],
         T_A_B=T_A_B,
-        covariance=options.edge_covariance_scaler * covariance,
-        switch_variable_variance=np.full(len(rows), options.switch_variable_variance),
+        covariance=options.edge_covariance_scaler * relative,
+        switch_variable_variance=np.full(len(ids), options.switch_variable_variance),
     )
 
 

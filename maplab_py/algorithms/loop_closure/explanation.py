@@ -278,7 +278,8 @@ def _summary_of_closure(
         return f"{text} No flag accepts it."
     flags = " ".join(acceptance.flags)
     if acceptance.verdict is Verdict.ACCEPTED:
-        return f"{text} {flags} would accept it."
+        others = f" and {counted(acceptance.others, 'other')}" if acceptance.others else ""
+        return f"{text} {flags} would accept it{others}."
     return (
         f"{text} {flags} would not suffice: it would then be refused ({acceptance.verdict.value}), "
         "and no flag moves that."
@@ -291,6 +292,7 @@ class Acceptance:
 
     flags: tuple[str, ...]  # --NAME=VALUE
     verdict: Verdict
+    others: int  # refused closures that the flags accept as well
 
 
 def acceptance(
@@ -317,7 +319,8 @@ def acceptance(
     failed = [gate for gate in closure_gates(closures, options) if gate.failed[row]]
     changes: dict[str, Any] = {}
     moved = options
-    decided = Verdict.ACCEPTED
+    decided, others = Verdict.ACCEPTED, 0
+    before = judge(vi_map, query, place, T_M_I, measured, options)[0].accepted
     while failed:
         values = {gate.flag: gate.passing_value(row) for gate in failed}
         wanted = {name.removeprefix("--lc_"): value for name, value in values.items()}
@@ -332,9 +335,10 @@ def acceptance(
         moved = dataclasses.replace(options, **{n: kinds[n](v) for n, v in changes.items()})
         judged, _ = judge(vi_map, query, place, T_M_I, measured, moved)
         decided = VERDICTS[judged.verdict[row]]
+        others = int(np.count_nonzero(judged.accepted & ~before)) - int(judged.accepted[row])
         failed = [gate for gate in closure_gates(judged, moved) if gate.failed[row]]
     flags = tuple(f"--lc_{name}={getattr(moved, name):g}" for name in changes)
-    return Acceptance(flags, decided) if flags else None
+    return Acceptance(flags, decided, others) if flags else None
 
 
 def _near_misses(closures: ClosureRecord, gates: list[Gate]) -> tuple[NearMiss, ...]:

@@ -16,14 +16,21 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     read_record,
     write_record,
 )
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, Closures, GateValues
+from maplab_py.algorithms.loop_closure.closure_table import (
+    VERDICTS,
+    Closures,
+    GateValues,
+    make_edges,
+)
 from maplab_py.algorithms.loop_closure.consensus import path_lengths
 from maplab_py.algorithms.loop_closure.merging import MergeResult
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verdict
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import IdArray, IdIndex, VIMap, to_hex_list
+from maplab_py.vimap import IdArray, IdIndex, LoopClosureEdges, VIMap, to_hex_list
 from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges, with_p_G
 
 REMOVED = VERDICTS.index(Verdict.REMOVED)
@@ -177,6 +184,40 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
         observations_moved=moved,
         notes=tuple(notes),
     )
+
+
+def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) -> VIMap:
+    """Accept refused closures by hand: each becomes an edge with its recorded pose and uncertainty.
+
+    Args:
+        vi_map: A map with a record.
+        ids: Ids (N, 2) of closures in the record; those that are accepted already stay as they are.
+        options: Scale of the edges' covariance.
+
+    Raises:
+        UserError: The pose of a closure was not determined.
+    """
+    record = read_record(vi_map)
+    c = record.closures
+    chosen = (IdIndex(ids).rows(c.id) >= 0) & (c.verdict != VERDICTS.index(Verdict.ACCEPTED))
+    new = c.take(chosen)
+    unknown = ~np.isfinite(new.sigma).all(axis=1)
+    if unknown.any():
+        name = to_hex_list(new.id[unknown])[0][:8]
+        raise UserError(f"closure {name} has no uncertainty: its pose is not determined, refuse it")
+    query, place = (vi_map.vertex_index.rows(v).astype(np.int64) for v in (new.query, new.place))
+    T_M_A = se3.compose(vi_map.vertices.T_M_I[place], se3.inverse(new.T_A_B))
+    covariance = new.sigma.astype(np.float64)[:, :, None] ** 2 * np.eye(6)
+    edges = make_edges(new.id, (query, place), T_M_A, new.T_A_B, covariance, options)
+    old = vi_map.loop_closure_edges
+    kept = old.take(IdIndex(new.id).rows(old.id) < 0)
+    closures = c.replace(
+        verdict=np.where(chosen, VERDICTS.index(Verdict.ACCEPTED), c.verdict),
+        use=np.where(chosen, USES.index("edge"), c.use),
+        weight=np.where(chosen, 1.0, c.weight),
+    )
+    result = vi_map.replace(loop_closure_edges=LoopClosureEdges.concatenate([kept, edges]))
+    return write_record(result, dataclasses.replace(record, closures=closures))
 
 
 def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:

@@ -185,6 +185,24 @@ class ClosureRemovalReport(Report):
 
 
 @dataclasses.dataclass(frozen=True)
+class ClosureVerdictReport(Report):
+    """Verdicts that a person has given."""
+
+    accepted: tuple[str, ...]  # prefixes of ids
+    refused: tuple[str, ...]
+    edges_added: int
+    edges_removed: int
+    landmarks_restored: int
+    observations_moved: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def advice(self) -> str:
+        """Name the command that moves the trajectory."""
+        return "relax moves the trajectory by these closures" if self.edges_added else ""
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainingReport(Report):
     """Training data of a projection and its separation of landmarks."""
 

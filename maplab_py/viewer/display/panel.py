@@ -393,6 +393,11 @@ def fact_table(facts: Facts) -> str:
     return f"<div style='{_SMALL}{_PADDED}'><table style='border:0;width:100%'>{rows}</table></div>"
 
 
+def small(html: str) -> str:
+    """Return HTML in the panel's small type."""
+    return f"<div style='{_SMALL}{_PADDED}'>{html}</div>"
+
+
 def hint(text: str) -> str:
     """Return a quiet line."""
     return f"<div style='{_SMALL}{_PADDED}opacity:0.6'>{escape(text)}</div>"

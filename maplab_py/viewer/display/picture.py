@@ -20,10 +20,13 @@ from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.child_processes import kill, start
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes, write_text
+from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.camera import aim, aim_initially, view_of
-from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND
+from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND, add_part
 from maplab_py.viewer.display.server import page_script
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.history import MAX_STATES, error_curves, history_chart, state_layers
 from maplab_py.viewer.scene import Extent, Scene
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -157,25 +160,78 @@ _OVERLAY = """
 <div style="position:fixed;left:14px;bottom:14px;max-width:19em;padding:4px 2px;border-radius:8px;
 font-family:system-ui,sans-serif;font-size:15px;z-index:10;pointer-events:none;
 background:{ground};color:{ink};max-height:calc(100vh - 40px);overflow:auto">{header}{missions}
-{switches}{legend}</div>
+{switches}{legend}{chooser}</div>
 """
 
 _SCRIPT = """
 <script>
-document.querySelectorAll("input[data-layer]").forEach(box => box.addEventListener("change", () => {
-  const nodes = window.__viserSceneTree.getState();
-  const paths = ["/map/" + box.dataset.layer + "/", "/labels/map/" + box.dataset.layer + "/"];
-  for (const name in nodes)
-    if (nodes[name] && paths.some(path => name.startsWith(path)))
-      nodes[name].overrideVisibility = nodes[name].effectiveVisibility = box.checked;
-  window.dispatchEvent(new Event("resize"));
-}));
+(() => {
+  const boxes = [...document.querySelectorAll("input[data-layer]")];
+  const slider = document.querySelector("input[data-states]");
+  const layerOf = (name) => (name.match(/^(?:\\/labels)?\\/map\\/([^/]+)\\//) || [])[1];
+  const show = () => {
+    const nodes = window.__viserSceneTree.getState();
+    const isPresent = !slider || slider.value === slider.dataset.states;
+    for (const name in nodes) {
+      const box = boxes.find((box) => box.dataset.layer === layerOf(name));
+      const isOfState = /^\\/history\\/\\d+\\//.test(name);
+      if (!nodes[name] || !(box || isOfState)) continue;
+      const isVisible = isOfState
+        ? !isPresent && name.startsWith("/history/" + slider.value + "/")
+        : isPresent && box.checked;
+      nodes[name].overrideVisibility = nodes[name].effectiveVisibility = isVisible;
+    }
+    boxes.forEach((box) => (box.disabled = !isPresent));
+    document.querySelectorAll("[data-chart]").forEach((chart) => {
+      chart.hidden = chart.dataset.chart !== slider.value;
+    });
+    window.dispatchEvent(new Event("resize"));
+  };
+  [...boxes, slider].forEach((input) => input && input.addEventListener("input", show));
+})();
 </script>
 """
-"""Switches layers by the scene tree that viser's page offers to its tests."""
+"""Switches layers and states by the scene tree that viser's page offers to its tests."""
 
 
-def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_dark: bool) -> int:
+@contextmanager
+def states_to_choose(server: Any, drawing: Drawing, subject: Subject | None) -> Iterator[str]:
+    """Send nodes of all states of the map for as long as this lasts, and give the slider that chooses one."""
+    states = () if subject is None else subject.history[-MAX_STATES:]
+    if subject is None or len(states) < 2:
+        yield ""
+        return
+    curves = error_curves(states, subject.truth)
+    place = next((i for i, state in enumerate(states) if state.vi_map is drawing.vi_map), 0)
+    handles = []
+    for number, state in enumerate(states):
+        layers = () if number == place else state_layers(drawing, state, len(states))
+        for layer in layers:
+            for mission, part in layer.parts.items():
+                handles += add_part(server, f"/history/{number}/{layer.name}/{mission}", part)
+    for handle in handles:
+        handle.visible = False
+    charts = "".join(
+        f"<div data-chart='{number}'{'' if number == place else ' hidden'}>"
+        f"{history_chart(states, curves, number)}</div>"
+        for number in range(len(states))
+    )
+    left_out = len(subject.history) - len(states)
+    note = panel.hint(f"{left_out} earlier states are not in this page") if left_out else ""
+    try:
+        yield (
+            f"<div style='pointer-events:auto'><input type='range' data-states='{place}' min='0' "
+            f"max='{len(states) - 1}' value='{place}' aria-label='state' "
+            f"style='width:calc(100% - 1.4em);margin:0.4em 0.7em'>{charts}{note}</div>"
+        )
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def export_html(
+    server: Any, scene: Scene, layers: set[str], path: Path, chooser: str, *, is_dark: bool
+) -> int:
     """Write what the server shows to a file, with a switch per layer; return its size in bytes.
 
     Args:
@@ -183,6 +239,7 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
         scene: What it shows.
         layers: Names of the layers that are visible at first; the others have nodes that are hidden.
         path: The file.
+        chooser: HTML of the slider of states, empty = none.
         is_dark: Theme.
 
     Raises:
@@ -198,6 +255,7 @@ def export_html(server: Any, scene: Scene, layers: set[str], path: Path, *, is_d
         missions=panel.mission_legend(scene.missions),
         switches=panel.layer_switches(scene.layers, layers),
         legend=panel.legend(dict.fromkeys(entries)),
+        chooser=chooser,
     )
     end = page.rindex("</body>")
     page = f"{page[:end]}{overlay}{_SCRIPT}{page_script()}{page[end:]}"

@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
+from maplab_py.errors import UserError
 from maplab_py.viewer import colours
+from maplab_py.viewer.display.camera import approach
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import add_part
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.facts import facts
 from maplab_py.viewer.layers import cameras
 from maplab_py.viewer.layers.closures import closure_ends
-from maplab_py.viewer.picking import Pick
+from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id
 from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, ragged_rows
@@ -70,6 +72,20 @@ class Selection:
             pair = closure_picture(drawing.vi_map, image_of, *self._ends)
             image, note = pair or (None, note)
         self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
+
+    def jump(self, drawing: Drawing, text: str, image_of: ImageOf, client: Any) -> None:
+        """Pick what an id means, and move the camera of one page there."""
+        if len(text.strip()) < MIN_DIGITS:
+            return  # the page sends every key
+        try:
+            picked = find_by_id(drawing, text)
+        except UserError as error:
+            self._panel.show_hint(str(error))
+            return
+        self.pick(drawing, picked, image_of)
+        if client is not None:
+            with client.atomic():
+                approach(client.camera, picked.p, 0.25 * drawing.extent.radius_m)
 
     def clear(self) -> None:
         """Clear the pick."""

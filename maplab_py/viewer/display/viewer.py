@@ -18,19 +18,26 @@ from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
-from maplab_py.viewer.display.camera import Cameras, aim, approach
+from maplab_py.viewer.display.camera import Cameras, aim
+from maplab_py.viewer.display.court import Court
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes, by_user
-from maplab_py.viewer.display.picture import export_html, save_picture, take_picture
+from maplab_py.viewer.display.picture import (
+    export_html,
+    save_picture,
+    states_to_choose,
+    take_picture,
+)
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
 from maplab_py.viewer.display.server import LOOPBACK, start_server
+from maplab_py.viewer.display.time_machine import TimeMachine
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, pick
+from maplab_py.viewer.picking import Pick, pick
 from maplab_py.viewer.playback import moved_scene, without_played
 from maplab_py.viewer.scene import Scene
 from maplab_py.vimap import VIMap
@@ -48,6 +55,7 @@ class Viewer:
         scene: What is shown.
         subject: What it was made of.
         show_image: Shows an image (H, W, 3) in the panel, or none.
+        court: Where closures are judged.
     """
 
     def __init__(self, port: int = 8080, *, is_dark: bool = False) -> None:
@@ -70,6 +78,8 @@ class Viewer:
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
         self._playback = Playback(self._server, self, self._lock, self._panel.say)
+        self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
+        self.court = Court(self._server, self, self._lock, self._panel.say)
         self._image_of: ImageOf = no_image
         self._is_dark = is_dark
         self._drawing: Drawing | None = None
@@ -145,6 +155,7 @@ class Viewer:
             self._image_of = image_of
             self._choices = {}
             self._show(subject, drawing, scene)
+        self._wake.set()  # measures the history
         return scene
 
     def follow(self, subject: Subject) -> None:
@@ -219,7 +230,10 @@ class Viewer:
         layers = self.visible_layers
         with self._lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
             try:
-                return export_html(self._server, scene, layers, path, is_dark=self._is_dark)
+                with states_to_choose(self._server, self.drawing, self.subject) as chooser:
+                    return export_html(
+                        self._server, scene, layers, path, chooser, is_dark=self._is_dark
+                    )
             finally:
                 self._cameras.aim_new_pages(scene.extent)
 
@@ -309,6 +323,13 @@ class Viewer:
             self._choices[REFUSED] = True
             self.follow(self.subject.replace(options=options))
 
+    def set_state(self, place: int) -> None:
+        """Show a state of the map by its place in the undo history; the map stays as it is."""
+        with self._lock:
+            subject = self.wanted
+            if subject is not None and 0 <= place < len(subject.history):
+                self.follow(subject.replace(state=place))
+
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
         with self._lock:
@@ -392,18 +413,8 @@ class Viewer:
 
     def jump_to_id(self, client: Any, text: str) -> None:
         """Select what an id means, and move the camera of one page there."""
-        if len(text.strip()) < MIN_DIGITS:
-            return  # the page sends every key
         with self._lock:
-            try:
-                picked = find_by_id(self.drawing, text)
-            except UserError as error:
-                self._panel.show_hint(str(error))
-                return
-            self.select(picked)
-            if client is not None:
-                with client.atomic():
-                    approach(client.camera, picked.p, 0.25 * self.drawing.extent.radius_m)
+            self._selection.jump(self.drawing, text, self._image_of, client)
 
     def _click(self, event: Any) -> None:
         if self.scene is None:
@@ -427,6 +438,8 @@ class Viewer:
                 self._building = subject
             if subject is not None and not self._is_stopped:
                 self._show_safely(subject)
+            if not self._is_stopped:
+                self._time_machine.measure()
             with self._lock:
                 self._building = None
                 if self._pending is None:
@@ -450,7 +463,7 @@ class Viewer:
                 )
 
     def _show(self, subject: Subject, drawing: Drawing, scene: Scene) -> None:
-        is_new_map = self.subject is None or self.subject.vi_map is not subject.vi_map
+        is_new_map = self.subject is None or self.subject.shown is not subject.shown
         is_new_place = self.scene is None or self.scene.extent.radius_m != scene.extent.radius_m
         is_other_map = self.scene is None or self.scene.title != scene.title
         self.subject, self.scene, self._drawing = subject, scene, drawing
@@ -464,6 +477,8 @@ class Viewer:
         else:
             self._cameras.keep_in_view(scene.extent)
         self._panel.show_colouring(subject.options, scene.missions)
+        self._time_machine.show(subject)
+        self.court.show(subject.shown)
         self._panel.show_reasons(scene, subject.options.refused_closures_reason)
         self.redraw()
 

@@ -75,14 +75,13 @@ def _displacements(drawing: Drawing, other: VIMap) -> Layer:
     return Layer("displacements", "Displacement", parts, len(here), legend=(legend,))
 
 
-def _aligned_truth(drawing: Drawing, truth: Trajectory) -> tuple[I64, F64, F64]:
+def _aligned_truth(stamps_ns: I64, p: F64, truth: Trajectory) -> tuple[I64, F64, F64]:
     """Return the vertices (N,) with ground truth, where they are in truth (N, 3), and T_scene_R.
 
     Raises:
         UserError: Too few vertices have ground truth to lay it on the map.
     """
-    stamps = drawing.vi_map.vertices.timestamp_ns
-    T_R_B, has_truth = match(truth, stamps, TrajectoryEvaluationOptions())
+    T_R_B, has_truth = match(truth, stamps_ns, TrajectoryEvaluationOptions())
     rows = np.flatnonzero(has_truth)
     if len(rows) < 3:
         raise UserError(
@@ -90,21 +89,26 @@ def _aligned_truth(drawing: Drawing, truth: Trajectory) -> tuple[I64, F64, F64]:
             "(do the clocks agree?)"
         )
     try:
-        T_scene_R = align_yaw_position(drawing.p_vertices[rows], T_R_B[rows, 4:])
+        T_scene_R = align_yaw_position(p[rows], T_R_B[rows, 4:])
     except EstimationError as error:
         raise UserError(f"{truth.source}: {error}") from None
     return rows, se3.transform(T_scene_R, T_R_B[rows, 4:]), T_scene_R
 
 
-def errors_against(drawing: Drawing, truth: Trajectory) -> F64:
+def position_errors(stamps_ns: I64, p: F64, truth: Trajectory) -> F64:
     """Return how far each vertex (V,) is from the true path laid on the map [m]; NaN without truth.
+
+    Args:
+        stamps_ns: Times (V,) of the vertices.
+        p: Their positions (V, 3).
+        truth: The true path.
 
     Raises:
         UserError: Too few vertices have ground truth to lay it on the map.
     """
-    rows, p_true, _ = _aligned_truth(drawing, truth)
-    error_m = np.full(len(drawing.p_vertices), np.nan)
-    error_m[rows] = np.linalg.norm(drawing.p_vertices[rows] - p_true, axis=1)
+    rows, p_true, _ = _aligned_truth(stamps_ns, p, truth)
+    error_m = np.full(len(p), np.nan)
+    error_m[rows] = np.linalg.norm(p[rows] - p_true, axis=1)
     return error_m
 
 
@@ -115,7 +119,8 @@ def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
         UserError: Too few vertices have ground truth to lay it on the map.
     """
     vi_map = drawing.vi_map
-    rows, p_true, T_scene_R = _aligned_truth(drawing, truth)
+    stamps_ns = vi_map.vertices.timestamp_ns
+    rows, p_true, T_scene_R = _aligned_truth(stamps_ns, drawing.p_vertices, truth)
     p_vertex = drawing.p_vertices[rows]
     span = vi_map.vertices.timestamp_ns[rows]
     inside = (truth.times_ns >= span.min()) & (truth.times_ns <= span.max())

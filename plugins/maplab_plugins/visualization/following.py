@@ -16,10 +16,11 @@ from maplab_py.options import Options, option
 from maplab_py.plugin import Cancelled, CommandContext, Report, UserError
 
 if TYPE_CHECKING:
-    from maplab_py.console.session.maps import MapManager
+    from maplab_py.console.session.maps import MapEntry, MapManager
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.display.selection import ImageOf
     from maplab_py.viewer.display.viewer import Viewer
+    from maplab_py.viewer.history import State
     from maplab_py.viewer.options import PlaybackOptions
     from maplab_py.vimap import VIMap
 
@@ -79,10 +80,10 @@ class Following:
         if entry.vi_map is subject.vi_map or not len(entry.vi_map.vertices):
             return
         if entry.key == subject.title:
-            following = subject.replace(vi_map=entry.vi_map, note="")
+            following = subject.replace(vi_map=entry.vi_map, note="", state=-1)
         else:
             following = Subject(entry.vi_map, entry.key, subject.options)
-        self.viewer.follow(following)
+        self.viewer.follow(following.replace(history=states_of(entry)))
 
     def during_command(self, make_map: Callable[[], VIMap]) -> None:
         """Show where a running command has got to."""
@@ -91,6 +92,45 @@ class Following:
     def close(self) -> None:
         """Stop the server."""
         self.viewer.stop()
+
+
+def states_of(entry: MapEntry) -> tuple[State, ...]:
+    """Return the values of a map that undo and redo lead to and its present one, the oldest first."""
+    from maplab_py.viewer.history import State
+
+    commands = ("", *(step.command for step in entry.past))
+    values = (*(step.vi_map for step in entry.past), entry.vi_map)
+    states = [State(command, value) for command, value in zip(commands, values, strict=True)]
+    states += [State(step.command, step.vi_map) for step in entry.future]
+    return tuple(state for state in states if len(state.vi_map.vertices))
+
+
+def _with_history(context: CommandContext, subject: Subject) -> Subject:
+    """Return the subject with the history of its map, if that is the selected one."""
+    entry = context.maps.selected if context.maps.selected_key else None
+    if entry is None or entry.vi_map is not subject.vi_map:
+        return subject
+    return subject.replace(history=states_of(entry))
+
+
+def verdicts_of_page(context: CommandContext) -> list[list[str]]:
+    """Return the ids of closures that were accepted, and of those refused, in the page; forget them there.
+
+    Raises:
+        UserError: None were.
+    """
+    following = context.session.watchers.find(NAME, Following)
+    if following is None or following.viewer.is_stopped:
+        raise UserError(
+            "judge_closures: give --accept or --refuse, or judge in the page: visualize",
+            remedy="visualize",
+        )
+    verdicts = following.viewer.court.take_verdicts()
+    if not verdicts:
+        raise UserError(
+            "judge_closures: no verdict was given in the page (Closure court); give --accept or --refuse"
+        )
+    return [[key for key, verdict in verdicts.items() if verdict is kind] for kind in (True, False)]
 
 
 def running_viewer(context: CommandContext) -> Viewer:
@@ -121,7 +161,7 @@ def viewer_for_output(context: CommandContext) -> Iterator[Viewer]:
 
     viewer = Viewer(0)
     try:
-        viewer.show(Subject(context.vi_map, context.map_key))
+        viewer.show(_with_history(context, Subject(context.vi_map, context.map_key)))
         yield viewer
     finally:
         viewer.stop()
@@ -178,6 +218,7 @@ def show(
         )
     viewer = ensure_viewer(context, viewer_options)
     check_cancelled()
+    subject = _with_history(context, subject)
     viewer.show(subject, playback=playback, image_of=images)
     if plays:
         viewer.open_time_line()

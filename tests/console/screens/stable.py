@@ -35,6 +35,7 @@ ESTIMATES = {
     "demo",
     "evaluate_segment_information",
     "extract_features",
+    "judge_closures",
     "landmark_sparsify",
     "localize",
     "lc_report_accepted",

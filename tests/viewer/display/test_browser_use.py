@@ -28,6 +28,7 @@ from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display import picture
 from maplab_py.viewer.display.picture import find_browser
 from maplab_py.viewer.display.viewer import Viewer
+from maplab_py.viewer.history import State
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.picking import Pick
@@ -90,6 +91,40 @@ def test_a_view_opens_from_a_file(browser: Any, tmp_path: Path) -> None:
     assert page.wait_until(lambda: _width_px(page, turned=True) < 0.6 * whole, 60.0)
     page.page.mouse.up()
     assert page.wait_until(lambda: _width_px(page) == whole, 60.0)
+    assert page.errors == []
+    page.page.close()
+
+
+def test_the_history_is_a_slider_in_the_page_and_in_a_file(browser: Any, tmp_path: Path) -> None:
+    T = np.array(MAP.vertices.T_M_I)
+    T[:, 6] += np.linspace(0.0, 4.0, len(T))
+    bent = MAP.replace(vertices=MAP.vertices.replace(T_M_I=T))
+    viewer = Viewer(0)
+    viewer.show(SUBJECT.replace(history=(State("", bent), State("relax", MAP))))
+    page = Page(browser, viewer.url)
+    assert page.wait_until(lambda: page.page.get_by_text("2 of 2: relax").count() == 1)
+    viewer.set_state(0)
+    assert page.wait_until(lambda: page.page.get_by_text("1 of 2: before").count() == 1)
+    assert page.wait_until(lambda: page.page.get_by_text("reprojection, median").count() == 1)
+    assert viewer.wait()
+    assert viewer.drawing.vi_map is bent
+    page.page.close()
+
+    viewer.set_state(1)
+    assert viewer.wait()
+    target = tmp_path / "view.html"
+    viewer.export(target)
+    viewer.stop()
+    page = Page(browser, target.as_uri())
+    assert page.wait_until(lambda: colour_count(page.picture(), colours.MISSIONS[0]) > 100)
+    now = page.still_picture()
+    page.page.locator("input[data-states]").fill("0")
+    assert page.wait_until(lambda: not np.array_equal(page.picture(), now), 60.0)
+    past = page.still_picture()
+    assert colour_count(past, colours.MISSIONS[0]) > 50
+    page.page.locator("input[data-states]").fill("1")
+    beside = np.s_[:, 320:]  # the slider has the focus now
+    assert page.wait_until(lambda: np.array_equal(page.picture()[beside], now[beside]), 60.0)
     assert page.errors == []
     page.page.close()
 

@@ -1,0 +1,72 @@
+"""The undo history of the map as a slider in the panel, with the errors of its states."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from maplab_py.viewer.building import Subject
+from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.history import Curve, error_curves, history_chart
+
+
+class TimeMachine:
+    """The widgets; they are there when the map has more than one state."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        show_state: Callable[[int], None],
+        lock: threading.RLock,
+        say: Callable[[str], None],
+    ) -> None:
+        """Make the widgets.
+
+        Args:
+            server: Where.
+            show_state: Shows another state of the map (its place in the history).
+            lock: Held while a page is served.
+            say: Shows a message.
+        """
+        self._lock = lock
+        self._folder = server.gui.add_folder("History", order=1.5, visible=False)
+        with self._folder:
+            self.slider: Any = server.gui.add_slider(
+                "state", 0, 1, 1, 1, hint="the map before and after each command"
+            )
+            self.chart = server.gui.add_html("")
+        self.slider.on_update(by_user(lock, lambda event: show_state(int(event.target.value)), say))
+        self._subject: Subject | None = None
+        self._curves: tuple[Curve, ...] = ()
+        self._measured: Subject | None = None  # that the curves belong to
+
+    def show(self, subject: Subject) -> None:
+        """Show the history of a subject, with the curves that are known of it."""
+        self._subject = subject
+        states = subject.history
+        if self._folder.visible != (len(states) > 1):
+            self._folder.visible = len(states) > 1
+        if len(states) < 2:
+            return
+        if int(self.slider.max) != len(states) - 1:
+            self.slider.max = len(states) - 1
+        if int(self.slider.value) != subject.place:
+            self.slider.value = subject.place
+        is_known = self._measured is not None and self._measured.history is states
+        self.chart.content = history_chart(states, self._curves if is_known else (), subject.place)
+
+    def measure(self) -> None:
+        """Compute the curves of what is shown, unless they are known: this takes a moment in large maps."""
+        subject = self._subject
+        if subject is None or len(subject.history) < 2:
+            return
+        if self._measured is not None and self._measured.history is subject.history:
+            return
+        curves = error_curves(subject.history, subject.truth)
+        with self._lock:
+            self._curves, self._measured = curves, subject
+            if self._subject is not None:
+                self.show(self._subject)

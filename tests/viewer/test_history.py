@@ -1,0 +1,62 @@
+"""The states of a map's history: their errors, and what is drawn of each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from maplab_plugins.visualization.following import states_of
+
+from maplab_py.console.session.maps import MapEntry
+from maplab_py.interop.trajectories import Trajectory
+from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.drawing import make_drawing
+from maplab_py.viewer.history import State, error_curves, history_chart, state_layers
+from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.vimap import VIMap
+from tests.vimap.builders import walk_map
+
+MAP = walk_map(vertices=14, landmarks=300, seed=3)
+
+
+def _bent(vi_map: VIMap, metres: float) -> VIMap:
+    T = np.array(vi_map.vertices.T_M_I)
+    T[:, 6] += metres * np.linspace(0.0, 1.0, len(T)) ** 2
+    return vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T))
+
+
+def test_errors_fall_with_the_distance_from_the_truth() -> None:
+    states = [State("", _bent(MAP, 1.0)), State("relax", _bent(MAP, 0.2)), State("optvi", MAP)]
+    truth = Trajectory(MAP.vertices.timestamp_ns, MAP.T_G_I, source="truth")
+    curves = {curve.title: curve.values for curve in error_curves(states, truth)}
+    assert set(curves) == {"reprojection, median", "error to the truth, RMSE"}
+    for values in curves.values():
+        assert values[0] > 2.0 * values[1] > 4.0 * values[2] >= 0.0
+    assert curves["error to the truth, RMSE"][2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_chart_names_the_command_and_its_errors() -> None:
+    states = [State("", _bent(MAP, 1.0)), State("relax --a=<b>", MAP)]
+    curves = error_curves(states)
+    text = history_chart(states, curves, 1)
+    assert "2 of 2: relax --a=&lt;b&gt;" in text
+    assert f"{curves[0].values[1]:.3f} px" in text
+    assert "before the first command" in history_chart(states, (), 0)
+
+
+def test_a_state_is_drawn_where_the_map_has_its_origin() -> None:
+    drawing = make_drawing(MAP, VisualizationOptions(max_points=100))
+    paths, points = state_layers(drawing, State("", _bent(MAP, 5.0)), states=4)
+    assert paths.drawn == len(MAP.vertices) - 1
+    assert 0 < points.drawn <= 100
+    subject = Subject(MAP, history=(State("", _bent(MAP, 5.0)), State("relax", MAP)))
+    assert (subject.place, subject.replace(state=0).place) == (1, 0)
+    past, now = (build_scene(subject.replace(state=place)) for place in (0, -1))
+    assert past.extent.radius_m > now.extent.radius_m
+
+
+def test_the_history_is_what_undo_and_redo_lead_to() -> None:
+    entry = MapEntry("map", VIMap()).with_value(_bent(MAP, 1.0), "load").with_value(MAP, "relax")
+    assert [state.command for state in states_of(entry)] == ["load", "relax"]
+    undone = entry.undone()
+    assert [state.command for state in states_of(undone)] == ["load", "relax"]
+    assert Subject(undone.vi_map, history=states_of(undone)).place == 0
