@@ -157,8 +157,8 @@ def test_clouds_of_a_room_are_registered() -> None:
 
 
 @pytest.mark.slow
-def test_two_hundred_pairs_of_clouds() -> None:
-    assert _share_registered(200, 20) >= 0.98
+def test_many_pairs_of_clouds() -> None:
+    assert _share_registered(60, 6) >= 0.98
 
 
 def test_a_true_pose_fits_and_others_do_not() -> None:
@@ -312,25 +312,22 @@ def test_maps_without_clouds_or_pairs() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("world", "motion"), [(TWO_ROOMS, TOUR), (CORRIDOR, WALK)])
-def test_no_wrong_edges_over_twenty_seeds(world: WorldOptions, motion: SessionOptions) -> None:
+def test_no_wrong_edges_over_seeds(world: WorldOptions, motion: SessionOptions) -> None:
     edges = 0
-    for seed in range(20):
+    for seed in range(6):
         data = simulate(session(world, motion, rate_hz=0.35, seed=seed))
         vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
         off_m, off_deg = edge_errors(vi_map, data.truth)
         assert off_m.max(initial=0.0) < 0.1
         assert off_deg.max(initial=0.0) < 1.0
         edges += report.edges_added
-    assert edges > 100
+    assert edges > 30
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(("world", "motion"), [(TWO_ROOMS, TOUR), (CORRIDOR, WALK)])
-def test_a_drifting_minute_is_straightened(
-    world: WorldOptions, motion: SessionOptions, seed: int
-) -> None:
-    data = simulate(session(world, motion, rate_hz=1.0, seed=seed))
+def test_a_drifting_minute_is_straightened(world: WorldOptions, motion: SessionOptions) -> None:
+    data = simulate(session(world, motion, rate_hz=1.0))
     vi_map, _ = close_cloud_loops(data.maps[0], Path(), OPTIONS)
     relaxed, _ = relax(vi_map, RelaxationOptions())
     before = evaluate_map(data.maps[0], data.truth).ate_m
