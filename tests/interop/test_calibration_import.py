@@ -18,7 +18,6 @@ from maplab_py.sensors import Distortion, Projection, SensorSet
 from maplab_py.sensors.camera import CAMERA_MODELS, Camera
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from tests.algorithms.self_calibration.scenes import INTRINSICS, scene_map
-from tests.support.data import shared_data
 from tests.support.scene import Scene
 
 CAMCHAIN = """cam0:
@@ -381,13 +380,3 @@ def test_an_imu_whose_frame_turns_needs_its_cameras(tmp_path: Path) -> None:
         import_calibration(written(tmp_path, "imu.yaml", files["imu.yaml"]))
     with pytest.raises(UserError, match="belongs to a camera chain"):
         import_calibration(basalt(tmp_path), tmp_path / "imu.yaml")
-
-
-def test_results_of_kalibr_for_tum_vi() -> None:
-    folder = shared_data("tumvi_imu/kalibr_result_512")
-    result = import_calibration(
-        folder / "camchain-imucam-imucalib.yaml", folder / "imu-imucalib.yaml"
-    )
-    assert [camera.distortion for camera in cameras(result)] == [Distortion.EQUIDISTANT] * 2
-    alone = import_calibration(folder / "imu-imucalib.yaml")
-    assert (alone.imu_id, alone.rig_id) == (result.imu_id, "")

@@ -16,6 +16,7 @@ from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.summary import summarise
 from maplab_py.sensors import Distortion, Projection
 from tests.interop.recordings.written import make_content, write_bag, write_folder
+from tests.interop.test_calibration_import import IMU
 
 IDENTITY = "[[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]"
 CAMERA = f"""cam0:
@@ -29,13 +30,6 @@ CAMERA = f"""cam0:
   rostopic: /cam0/image_raw
 """
 SECOND = CAMERA.replace("cam0", "cam1")
-IMU = """accelerometer_noise_density: 0.01
-accelerometer_random_walk: 0.0002
-gyroscope_noise_density: 0.001
-gyroscope_random_walk: 0.00003
-rostopic: /imu0
-update_rate: 200.0
-"""
 EUROC = """%YAML:1.0
 sensor_type: camera
 comment: left
