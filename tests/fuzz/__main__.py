@@ -1,13 +1,14 @@
-"""Fuzz one reader with atheris: python -m tests.fuzz READER [--seconds=20] [--corpus=FOLDER].
+"""Fuzz readers with atheris: python -m tests.fuzz READER... [--seconds=20] [--corpus=FOLDER].
 
-The corpus grows in its folder; an input that fails is written beside it as `crash-...`, and belongs into
-tests/fuzz/findings/READER once it is mended.
+The corpus of each reader grows in its folder; an input that fails is written beside it as `crash-...`, and
+belongs into tests/fuzz/findings/READER once it is mended.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
+import os
 import random
 import sys
 import tempfile
@@ -48,25 +49,40 @@ def instrument_rest(module: ModuleType) -> None:
 
 
 def main() -> None:
-    """Run libFuzzer on a reader; the process ends with its status."""
+    """Run libFuzzer on one reader after the other, until one fails."""
     import atheris
 
     compiled = _compiled_modules()
     with atheris.instrument_imports(include=["maplab_py"], exclude=compiled):
-        from tests.fuzz.readers import READERS, check
+        from tests.fuzz.readers import READERS
     for name in compiled:
         if name in sys.modules and name.startswith(_READING):
             instrument_rest(sys.modules[name])
 
     parser = argparse.ArgumentParser()
-    parser.add_argument("reader", choices=sorted(READERS))
-    parser.add_argument("--seconds", type=int, default=20)
+    parser.add_argument("readers", nargs="+", choices=sorted(READERS))
+    parser.add_argument("--seconds", type=int, default=20, help="each")
     parser.add_argument("--runs", type=int, default=-1, help="at most, from a fixed seed")
     parser.add_argument("--corpus", type=Path)
     options = parser.parse_args()
-    reader = READERS[options.reader]
-    home = Path(tempfile.mkdtemp(prefix=f"fuzz_{options.reader}_"))
-    corpus = options.corpus or home / "corpus"
+    for name in options.readers:
+        # libFuzzer ends its process; what is imported is instrumented once
+        child = os.fork()
+        if not child:
+            _fuzz(name, options)
+        if status := os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]):
+            sys.exit(f"{name}: status {status}")
+
+
+def _fuzz(name: str, options: argparse.Namespace) -> None:
+    """Run libFuzzer on a reader; the process ends with its status."""
+    import atheris
+
+    from tests.fuzz.readers import READERS, check
+
+    reader = READERS[name]
+    home = Path(tempfile.mkdtemp(prefix=f"fuzz_{name}_"))
+    corpus = (options.corpus or home) / name
     for folder in (corpus, home / "seeds", home / "work"):
         folder.mkdir(parents=True, exist_ok=True)
     seeds = reader.seeds(home / "seeds")

@@ -39,23 +39,20 @@ def test_findings_stay_mended(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", READERS)
-def test_nothing_is_found_in_20_s(name: str, tmp_path: Path) -> None:
+def test_nothing_is_found_in_5_s(tmp_path: Path) -> None:
     pytest.importorskip("atheris")
-    command = [
-        sys.executable,
-        "-m",
-        "tests.fuzz",
-        name,
-        "--seconds=20",
-        "--runs=400",
-        f"--corpus={tmp_path / 'c'}",
-    ]
+    command = [sys.executable, "-m", "tests.fuzz", *READERS, "--seconds=5", "--runs=400"]
     root = Path(__file__).parents[2]
     # the harnesses are modules of the checkout, which tests/conftest.py takes off the path
     environment = {key: text for key, text in os.environ.items() if key != "PYTHONSAFEPATH"}
     done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, cwd=root, timeout=300, check=False
+        [*command, f"--corpus={tmp_path}"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        cwd=root,
+        timeout=900,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert len(list((tmp_path / "c").iterdir())) > 1
+    assert min(len(list((tmp_path / name).iterdir())) for name in READERS) > 1
