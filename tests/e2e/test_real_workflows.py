@@ -82,9 +82,9 @@ def test_euroc_submaps_as_one_mission(euroc: dict[str, VIMap]) -> None:
     assert abs(corrected.scale - 1.0) <= 0.02
 
 
-def scrambled(before: VIMap, seed: int) -> VIMap:
+def scrambled(before: VIMap) -> VIMap:
     """Turn each base frame but the first by any heading and shift it by up to 10 m."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     frames = before.baseframes
     count = len(frames)
     yaw = np.zeros((count, 3))
@@ -98,11 +98,10 @@ def scrambled(before: VIMap, seed: int) -> VIMap:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_euroc_submaps_as_eight_scrambled_missions(session: Session, seed: int) -> None:
+def test_euroc_submaps_as_eight_scrambled_missions(session: Session) -> None:
     session.run("load_merge_all_maps", maps_folder=shared_data(SUBMAPS), assign_new_ids=True)
     entry = session.maps.selected
-    session.maps.update(entry.with_value(scrambled(entry.vi_map, seed), "scramble"))
+    session.maps.update(entry.with_value(scrambled(entry.vi_map), "scramble"))
     for command in ("elq", "optvi", "set_mission_baseframe_to_known", "anchor_all_missions"):
         session.run(command)
     assert session.vi_map.baseframes.is_known.all()
@@ -131,46 +130,23 @@ def saved_bytes(session: Session, folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((folder / "vi_map").iterdir())}
 
 
-def test_same_input_same_bytes(tmp_path: Path) -> None:
-    saved = []
-    for name in ("a", "b"):
-        session = Session()
-        session.run("load_merge_all_submaps", maps_folder=shared_data(SUBMAPS))
-        session.run("optvi", ba_num_iterations=5)
-        session.run("lc")
-        saved.append(saved_bytes(session, tmp_path / name))
-    assert saved[0] == saved[1]
-
-
 @pytest.fixture
 def threads() -> Iterator[tuple[int, int]]:
     yield 1, min(2, numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
 
-def test_threads_do_not_change_the_result(
-    euroc: dict[str, VIMap], threads: tuple[int, int]
-) -> None:
-    results = []
-    for count in threads:
-        numba.set_num_threads(count)
-        session = session_with(euroc["loaded"])
-        session.run("optvi", ba_num_iterations=4)
-        results.append(session.vi_map.vertices)
-    for name in ("T_M_I", "v_M", "gyro_bias", "accel_bias"):
-        one, two = (getattr(vertices, name) for vertices in results)
-        np.testing.assert_allclose(one, two, atol=1e-9)
-
-
-def test_threads_do_not_change_loop_closures(
-    euroc: dict[str, VIMap], threads: tuple[int, int], tmp_path: Path
+def test_same_input_same_bytes_for_any_number_of_threads(
+    threads: tuple[int, int], tmp_path: Path
 ) -> None:
     saved = []
     for count in threads:
         numba.set_num_threads(count)
-        session = session_with(euroc["loaded"])
+        session = Session()
+        session.run("load_merge_all_submaps", maps_folder=shared_data(SUBMAPS))
         report: Any = session.run("lc")
         assert report.landmarks_merged > 100
+        session.run("optvi", ba_num_iterations=4)
         saved.append(saved_bytes(session, tmp_path / str(count)))
     assert saved[0] == saved[1]
 
@@ -266,11 +242,8 @@ def test_freeing_the_mounting_does_not_spoil_a_good_map(euroc: dict[str, VIMap])
     assert after.ape_m.rmse <= before.ape_m.rmse
 
 
-@pytest.mark.parametrize("left_out", [(3, 6), (2, 5)])
-def test_pieces_of_the_flight_are_localised_in_the_others(
-    tmp_path: Path, left_out: tuple[int, int]
-) -> None:
-    session = Session()
+def test_pieces_of_the_flight_are_localised_in_the_others(tmp_path: Path) -> None:
+    session, left_out = Session(), (3, 6)
     folders = [shared_data(f"{SUBMAPS}/euroc_v1_01_submap_{i}") for i in range(8)]
     for number, folder in enumerate(folders):
         if number not in left_out:
