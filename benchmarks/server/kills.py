@@ -31,7 +31,7 @@ from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap.excerpts import cut_by_time
 
-ROBOTS, SUBMAPS_EACH, SUBMAP_S = 4, 10, 4.0
+ROBOTS, SUBMAP_S = 4, 4.0
 _LONGEST_S = 3600.0
 _LONGEST_DELAY_S = 15.0
 """The server is killed up to so long after a random number of submaps was merged."""
@@ -54,12 +54,12 @@ class KillFigures:
     seconds: float
 
 
-def scenario() -> Scenario:
+def scenario(submaps_each: int) -> Scenario:
     """Return four robots in one room."""
     sessions = tuple(
         SessionOptions(
             kind="loop",
-            duration_s=SUBMAPS_EACH * SUBMAP_S,
+            duration_s=submaps_each * SUBMAP_S,
             turns=1.3,
             start_turn=0.2 * robot,
             reverse=robot == 3,
@@ -74,9 +74,9 @@ def scenario() -> Scenario:
     )
 
 
-def measure_kills(kills: int = 20, *, seed: int = 1) -> KillFigures:
+def measure_kills(kills: int = 20, *, submaps_each: int = 10, seed: int = 1) -> KillFigures:
     """Push the submaps, kill the server so many times, and look at the map."""
-    data, rng = simulate(scenario()), random.Random(seed)
+    data, rng = simulate(scenario(submaps_each)), random.Random(seed)
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         run = _Run(Path(folder), data, rng)
