@@ -64,11 +64,17 @@ if not (os.environ.get("MAPLAB_NATIVE") == "1" or os.environ.get("NUMBA_CPU_NAME
     os.environ["NUMBA_CPU_FEATURES"] = ""
     # Intel's vector functions, which some distributions install, give other bits than libm
     os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
+# numba colours the messages of all attempts at typing that fail, though nobody sees them
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import numba  # noqa: E402 - it reads the environment when it is imported
 import numba.extending  # noqa: E402 - for the modules that get numba from here
 from numba.core.caching import FunctionCache  # noqa: E402
 from numba.core.dispatcher import Dispatcher  # noqa: E402
+from numba.core.extending import _Intrinsic  # noqa: E402
+from numba.core.registry import CPUDispatcher  # noqa: E402
+from numba.core.sigutils import normalize_signature  # noqa: E402
+from numba.core.targetconfig import ConfigStack, TargetConfig  # noqa: E402
 
 __all__ = ["TARGET", "compiled", "numba", "prange", "target_processor"]
 
@@ -94,12 +100,85 @@ def compiled(**settings: Any) -> Callable[[Callable[..., Any]], Callable[..., An
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        kernel = numba.njit(**{"error_model": "numpy", "nogil": True, **settings})(function)
-        if isinstance(kernel, Dispatcher):  # it is not where compilation is switched off
-            kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
-        return kernel  # type: ignore[no-any-return]
+        return function if numba.config.DISABLE_JIT else _Kernel(function, {}, options)
 
+    options = {"nopython": True, "error_model": "numpy", "nogil": True, **settings}
     return decorate
+
+
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A function that gets the wrapper for calls from Python only if there are such calls.
+
+    Those that only other kernels call would need a fifth more time to compile with one.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._compiler._customize_flags = _leave_out_wrappers
+        self._cache = _KernelCache(self)
+        self._with_wrapper: set[Any] = set()
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for the types of arguments, again if only kernels could call the function."""
+        types = tuple(normalize_signature(sig)[0])
+        if not _is_inside() and types not in self._with_wrapper:
+            self.overloads.pop(types, None)
+        return super().compile(sig)
+
+    def add_overload(self, cres: Any) -> None:
+        """Let Python find what has a wrapper."""
+        types = tuple(cres.signature.args)
+        if _is_inside():
+            self.overloads[types] = cres
+        else:
+            self._with_wrapper.add(types)
+            super().add_overload(cres)
+
+
+def _is_inside() -> bool:
+    """Tell whether a kernel that calls the one at hand is being compiled."""
+    return ConfigStack.top_or_none() is not None
+
+
+def _leave_out_wrappers(flags: Any) -> Any:
+    flags.no_cfunc_wrapper = True
+    flags.no_cpython_wrapper = _is_inside()
+    return flags
+
+
+def _remember_types() -> None:
+    """Let numba resolve the type of `a + b` or `a[i]` once for each set of types, not at each place.
+
+    It is a third of the time that numba needs for a function. Flags are a part of what is remembered, since
+    functions of numba itself are compiled with those of their caller; numba compares flags slowly.
+    """
+    function = numba.types.Function
+    resolve = function.get_call_type
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        known = self.__dict__.setdefault("_known_calls", {})
+        flags = ConfigStack.top_or_none()
+        key = (context, tuple(args), flags and flags.copy())
+        if kws or key not in known:
+            signature = resolve(self, context, args, kws)
+            if kws or signature is None or not all(each.is_precise() for each in args):
+                return signature
+            known[key] = signature, self._impl_keys[signature.args]
+        signature, implementation = known[key]
+        self._impl_keys[signature.args] = implementation
+        return signature
+
+    def equal(self: Any, other: Any) -> Any:
+        if not isinstance(other, TargetConfig):
+            return NotImplemented
+        return self._values == other._values or self.values() == other.values()
+
+    function.get_call_type = get_call_type
+    TargetConfig.__eq__ = equal
+    TargetConfig.__hash__ = lambda _: hash(TargetConfig)
+
+
+_remember_types()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -135,7 +214,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 
     def _file_name(self, sig: Any, codegen: Any) -> str:
         function = self._kernel.py_func
-        content = [repr(sig), _fields(sig), repr(codegen.magic_tuple()), *_content(self._kernel)]
+        content = [f"inside: {_is_inside()}", repr(sig), _fields(sig), repr(codegen.magic_tuple())]
+        content += _content(self._kernel)
         digest = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}"
         return f"{name.replace('<', '').replace('>', '')}-{digest}.nbc"
@@ -178,6 +258,8 @@ def _content_of_function(kernel: Any, kernels: list[Any]) -> Iterator[str]:
         modules = [each for each in values if isinstance(each, ModuleType)]
         for value in (*values, *(x for each in modules for x in _named(code.co_names, vars(each)))):
             yield _describe(value)
+            if isinstance(value, _Intrinsic) and hasattr(value, "straight_line"):
+                codes.append(value.straight_line.__code__)
             if isinstance(value, Dispatcher) and value not in kernels:
                 kernels.append(value)
 

@@ -98,6 +98,13 @@ def test_only_content_decides_whether_a_kernel_is_compiled_again(tmp_path: Path)
     assert run(folder.rename(tmp_path / "elsewhere")) == ["49.0", "1"]
 
 
+def test_functions_of_kernels_can_be_called_from_python_too(tmp_path: Path) -> None:
+    write(tmp_path)
+    program = "import inner; print(inner.scaled(1.5))"
+    assert run(tmp_path, f"{PROGRAM}{program}; {program}") == ["49.0", "0", "3.0", "3.0"]
+    assert run(tmp_path, f"{program}{PROGRAM}") == ["3.0", "49.0", "1"]
+
+
 def test_a_closure_is_never_kept(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(
         "from maplab_py.compilation import compiled\n"

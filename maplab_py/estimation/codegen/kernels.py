@@ -14,6 +14,7 @@ from maplab_py.sensors.camera import DISTORTION_SIZE, MIRROR_NAMES, Distortion, 
 _HEADER = (
     '"""Generated; do not edit."""\n\n'
     "import math\n\nimport numpy as np\nfrom maplab_py.compilation import compiled, prange\n\n"
+    "from maplab_py.estimation.codegen.straight_line import straight_line\n"
     "from maplab_py.estimation.kernels.loss import rho_and_weight\n\n"
 )
 _FAST = '@compiled(fastmath={"contract", "nsz"}, forceinline=True)\n'
@@ -163,7 +164,8 @@ def _batch_source(function: Any) -> str:
     lines = function_body(function, inputs, [entries("r"), entries("J")])
     rows = function.numel_out(0)
     sizes = f"INPUTS, ROWS, COLUMNS = {total}, {rows}, {function.numel_out(1) // rows}\n\n\n"
-    return _HEADER + sizes + _function("residual", "x, r, J", lines) + template_source("batch")
+    residual = _function("residual", "x, r, J", lines, "@straight_line\n")
+    return _HEADER + sizes + residual + template_source("batch")
 
 
 def _pose_graph_source(kind: PoseError) -> str:
@@ -181,14 +183,14 @@ def _pose_graph_source(kind: PoseError) -> str:
         ("tilt", pose_graph.tilt(), "T, measured", ["e", "J"]),
         ("retraction", pose_graph.retraction(), "T, x", ["moved"]),
     ]
-    parts = [_HEADER, "from maplab_py.estimation.kernels.loss import rho_and_weight\n\n\n"]
+    parts = [_HEADER]
     for name, function, inputs, outputs in functions:
         places = [None if output is None else entries(output) for output in outputs]
         lines = function_body(function, [entries(x) for x in inputs.split(", ")], places)
         arguments = ", ".join([inputs, *(output for output in outputs if output is not None)])
-        parts.append(_function(name, arguments, lines))
+        parts.append(_function(name, arguments, lines, "@straight_line\n"))
     return "".join([*parts, template_source("pose_graph")])
 
 
-def _function(name: str, arguments: str, lines: list[str]) -> str:
-    return _FAST + f"def {name}({arguments}):\n    " + "\n    ".join(lines) + "\n\n\n"
+def _function(name: str, arguments: str, lines: list[str], decorator: str = _FAST) -> str:
+    return decorator + f"def {name}({arguments}):\n    " + "\n    ".join(lines) + "\n\n\n"
