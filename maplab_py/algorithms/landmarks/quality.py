@@ -235,6 +235,12 @@ def mostly_bad(bad: int, landmarks: int, reasons: dict[str, int]) -> str:
     return f"{bad} of {landmarks} landmarks are bad" + (f": {listed}" if listed else "")
 
 
+def causes_in_words(report: LandmarkQualityReport) -> list[str]:
+    """Return the criteria that bad landmarks fail, with their numbers, the most frequent first."""
+    counts = sorted(((getattr(report, name), name) for name in _REASONS), reverse=True)
+    return [f"{count} {_REASONS[name]}" for count, name in counts if count]
+
+
 def evaluate_unknown_quality(
     vi_map: VIMap, progress: Progress = SILENT
 ) -> tuple[VIMap, tuple[str, ...]]:

@@ -149,6 +149,13 @@ def check_map(vi_map: VIMap) -> tuple[Finding, ...]:
 
     The first seconds of a recording may not show it, and a map bends by it.
     """
+    return tuple(f for f in map_findings(vi_map) if f.verdict in (Verdict.WRONG, Verdict.NOTE))
+
+
+def map_findings(vi_map: VIMap) -> tuple[Finding, ...]:
+    """Return all findings on the calibration of the longest mission; none if it shows nothing."""
+    if not len(vi_map.vertices):
+        return ()
     counts = np.bincount(vi_map.vertices.mission, minlength=len(vi_map.missions))
     try:
         recording = MapRecording(vi_map, int(np.argmax(counts)))
@@ -158,8 +165,7 @@ def check_map(vi_map: VIMap) -> tuple[Finding, ...]:
     if cannot_work(signals, is_whole=True):
         return ()
     cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
-    findings = _check_motion(signals, cameras)
-    return tuple(f for f in findings if f.verdict in (Verdict.WRONG, Verdict.NOTE))
+    return tuple(_check_motion(signals, cameras))
 
 
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from maplab_plugins.vi_map_basic.cells import join_submaps, split_map
 from maplab_plugins.vi_map_basic.information import (
     check_map_consistency,
+    doctor,
     map_stats,
     memory,
     mission_coobservability_stats,
@@ -54,6 +55,7 @@ __all__ = [
     "copy_map",
     "create_new_map",
     "delete_map",
+    "doctor",
     "get_map_folder",
     "history",
     "join_all_maps",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         MissionExplanation,
         PairExplanation,
     )
+    from maplab_py.algorithms.map_health import MapHealth
     from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
     from maplab_py.vimap.consistency import ConsistencyReport
@@ -165,6 +167,38 @@ def check_map_consistency(context: CommandContext) -> ConsistencyReport:
         doubts = tuple(Violation(doubt, 1, ()) for doubt in scale_doubts(context.vi_map))
         report = dataclasses.replace(report, warnings=(*report.warnings, *doubts))
     return with_file_checks(report, context.vi_map, context.map_folder)
+
+
+@command(
+    "doctor",
+    example="doctor --file=health.html",
+    see_also=("check_recording", "check_map_consistency", "why"),
+    writes_files=True,
+)
+def doctor(
+    context: CommandContext, *, file: Path | None = None, overwrite: bool = False
+) -> MapHealth:
+    """Judge the health of the map on one page: lights with figures, and the command that mends each.
+
+    Consistency, the calibration against tracks and samples, scale, biases, landmarks, coverage, drift before
+    loop closures, ambiguous places, base frames and disk. Causes come before effects: mend the first.
+
+    Args:
+        file: Write the page here, as HTML or JSON by its ending.
+        overwrite: Replace the file if it exists.
+    """
+    from maplab_py.algorithms.map_health import map_health
+    from maplab_py.output_files import check_writable, write_text
+
+    if file is not None:
+        if file.suffix not in (".html", ".json"):
+            raise UserError(f"--file={file}: give a name that ends in .html or .json")
+        check_writable(file, overwrite=overwrite)
+    health = map_health(context.vi_map, context.map_key, context.map_folder, context.progress)
+    if file is not None:
+        text = health.as_html() if file.suffix == ".html" else health.as_json(indent=2)
+        write_text(file, [text], overwrite=overwrite)
+    return health
 
 
 _GB = 1e-9
