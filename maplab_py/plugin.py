@@ -15,10 +15,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from maplab_py.console.commands.command import command
-from maplab_py.console.session.context import CommandContext
+from maplab_py.console.session.context import ALL_MISSIONS, CommandContext, MissionChoice
 from maplab_py.console.session.importing import importer
 from maplab_py.console.session.maps import key_of_folder
-from maplab_py.console.session.missions import ALL_MISSIONS, MissionChoice
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, MaplabError, UserError
 from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_bytes, write_text

@@ -50,7 +50,7 @@ from maplab_py.vision import (
     rays_and_points,
     track_union,
 )
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.tracking import tracker
 
 

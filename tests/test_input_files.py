@@ -18,7 +18,7 @@ import pytest
 
 from maplab_py.algorithms.loop_closure.closure_record import FIELD_NUMBER, read_record
 from maplab_py.algorithms.self_calibration.segments.database import load_database
-from maplab_py.console.commands.flagfile import read_flagfile
+from maplab_py.console.commands.flags import read_flagfile
 from maplab_py.console.scripts.aliases import read_aliases
 from maplab_py.console.scripts.batch import read_batch, read_script
 from maplab_py.errors import MapError, UserError
@@ -29,7 +29,7 @@ from maplab_py.output_files import check_writable, planning, staging, write_byte
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.storage.extension_fields import PACKED, with_extension
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vision.projection_file import load_projection
+from maplab_py.vision.projection import load_projection
 from tests.storage.damaging import alias_bomb
 from tests.vimap.builders import walk_map
 

@@ -21,9 +21,9 @@ from maplab_py.algorithms.recording_check.doctor import diagnose, first_cause
 from maplab_py.frontend.data_source import open_source
 from maplab_py.frontend.run_options import DataSourceOptions
 from maplab_py.interop.device import RecordedSensors
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario import CameraOptions, MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario

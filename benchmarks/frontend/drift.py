@@ -19,8 +19,8 @@ from maplab_py.algorithms.landmarks.keypoint_rays import bearings
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SessionSimulator

@@ -22,8 +22,8 @@ from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from tests.support.data import shared_data_folder
 
 NEVER = InitializationOptions(max_scale_sigma=1e-9, max_tilt_sigma_deg=1e-9)

@@ -25,7 +25,6 @@ from benchmarks.frontend.sequences import TRUTH
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
@@ -34,6 +33,7 @@ from maplab_py.interop.recordings.protocol import (
     RecordedSensors,
     Recording,
 )
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import read_trajectory
 from tests.support.data import shared_data_folder
 

@@ -22,8 +22,8 @@ import numpy as np
 from benchmarks.frontend.sequences import TRUTH, position_errors
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario_file import load_scenario

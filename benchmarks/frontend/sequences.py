@@ -17,8 +17,8 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.storage.native import is_map_folder, load_map
 

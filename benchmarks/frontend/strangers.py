@@ -28,9 +28,9 @@ from maplab_py.frontend.finishing import finish
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.interop.images import Pixels
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import CameraImage, Recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario import CameraOptions, MotionOptions, Scenario, SessionOptions

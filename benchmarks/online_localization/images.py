@@ -31,9 +31,9 @@ from maplab_py.frontend.run_options import OutputOptions, RunOptions
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import Recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.storage.summary_map import write_summary_map
 from tests.support.data import shared_data_folder

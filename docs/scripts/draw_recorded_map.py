@@ -17,7 +17,7 @@ from maplab_py.frontend.mapping import Mapping
 from maplab_py.geometry import se3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.vimap import LandmarkQuality, VIMap
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from maplab_py.algorithms.recording_check.doctor import diagnose
 from maplab_py.algorithms.recording_check.rates import CameraTurns
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 
 IMAGE = Path(__file__).resolve().parents[1] / "images" / "recording_check.svg"
 SECONDS = 10.0

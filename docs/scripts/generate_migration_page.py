@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from maplab_py.console.commands.flags import COMMON_FLAGS
-from maplab_py.console.commands.maplab_flags import TABLE, Fate, former_flags
+from maplab_py.console.commands.flags import COMMON_FLAGS, TABLE, Fate, former_flags
 from maplab_py.console.commands.registry import Registry, load_registry
 
 DOCS = Path(__file__).resolve().parents[1]

@@ -7,9 +7,9 @@ from pathlib import Path
 from maplab_py.errors import UserError
 from maplab_py.frontend.run_options import DataSourceOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.storage.native import is_map_folder, load_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import find_mission

@@ -14,7 +14,7 @@ from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.calibration import CalibrationEstimate, WindowCalibration
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
-from maplab_py.estimation.window.map_rule import MapRule
+from maplab_py.estimation.window.options import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.backfill import Backfill, Backfiller
 from maplab_py.frontend.gyroscope import turn

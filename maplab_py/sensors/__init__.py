@@ -1,8 +1,7 @@
 """Sensor models: cameras, rigs, IMU, and the set of sensors of a map."""
 
-from maplab_py.sensors.camera import Camera, Distortion, Projection
+from maplab_py.sensors.camera import Camera, CameraRig, Distortion, Projection
 from maplab_py.sensors.imu import Imu, ImuIntrinsics
-from maplab_py.sensors.rig import CameraRig
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor, SensorSet
 
 __all__ = [

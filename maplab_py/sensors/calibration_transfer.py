@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.sensors.camera import Camera, Distortion, Projection
+from maplab_py.sensors.camera import Camera, CameraRig, Distortion, Projection
 from maplab_py.sensors.imu import Imu
-from maplab_py.sensors.rig import CameraRig
 from maplab_py.sensors.sensor_set import Sensor, SensorSet
 
 

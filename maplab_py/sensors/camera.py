@@ -134,3 +134,16 @@ class Camera:
                 f"camera {self.id}: {self.projection.value} needs 0 <= alpha <= 1 and "
                 f"beta > 0, not {mirror[0]:g} and {mirror[1]:g}"
             )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraRig:
+    """Cameras with their poses on the rig's body frame B."""
+
+    id: str
+    cameras: tuple[Camera, ...]
+    T_B_C: NDArray[np.float64]  # (number of cameras, 7)
+    topic: str = ""
+    description: str = ""
+    extra: dict[str, Any] = dataclasses.field(default_factory=dict)
+    camera_extra: tuple[dict[str, Any], ...] = ()  # per camera: other keys beside T_B_C, or empty

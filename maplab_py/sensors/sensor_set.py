@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
+from maplab_py.sensors.camera import CameraRig
 from maplab_py.sensors.imu import Imu
-from maplab_py.sensors.rig import CameraRig
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,11 +21,11 @@ from maplab_py.sensors.camera import (
     DISTORTION_SIZE,
     INTRINSICS_SIZE,
     Camera,
+    CameraRig,
     Distortion,
     Projection,
 )
 from maplab_py.sensors.imu import Imu, ImuIntrinsics
-from maplab_py.sensors.rig import CameraRig
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor, Sensor, SensorSet
 from maplab_py.sensors.yaml_entry import Entry, similar_key
 from maplab_py.sensors.yaml_text import dump_yaml, parse_yaml

@@ -16,7 +16,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.server.options import PublishingOptions
 from maplab_py.storage.native import is_map_folder, save_map
 from maplab_py.storage.resources.store import copied_to_external, existing_files, in_map_folder
-from maplab_py.storage.written_files import WrittenFiles
+from maplab_py.storage.unchanged_files import WrittenFiles
 from maplab_py.vimap import VIMap
 
 _BACKUPS = 5

@@ -24,8 +24,7 @@ from maplab_py.server.options import DeletedMissions, LookupReport
 from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import find_mission, mission_sensor_id
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap.queries import find_mission, mission_sensor_id, resources_of
 
 if TYPE_CHECKING:
     from maplab_py.server.server import MapServer

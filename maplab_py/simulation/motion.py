@@ -13,9 +13,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.simulation.detection import is_hidden
 from maplab_py.simulation.scenario import PATH_KINDS, MotionOptions, SessionOptions, WorldOptions
 from maplab_py.simulation.spline import PoseSpline
-from maplab_py.simulation.streets import street_route
 from maplab_py.simulation.trajectory_motion import trajectory_spline
-from maplab_py.simulation.world import World, stair_half_length
+from maplab_py.simulation.world import World, stair_half_length, street_route
 
 CONTROL_SPACING_S = 0.1
 

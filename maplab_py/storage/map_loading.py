@@ -23,7 +23,7 @@ from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.storage import load_checks
 from maplab_py.storage.cache.map_cache import CachedMap
 from maplab_py.storage.checksums import verify
-from maplab_py.storage.file_parts import FileParts
+from maplab_py.storage.file_assembly import FileParts
 from maplab_py.storage.mission_names import with_names
 from maplab_py.storage.protobuf import (
     frames_from_messages,

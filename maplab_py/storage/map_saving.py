@@ -28,7 +28,7 @@ from maplab_py.storage.protobuf import map_files, tables_to_messages
 from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice, with_layout
 from maplab_py.storage.protobuf.tables_to_messages import Partition
 from maplab_py.storage.resources.new import copied_files, with_staged_in_place
-from maplab_py.storage.written_files import TakenOver, WrittenFiles
+from maplab_py.storage.unchanged_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.number_repair import without_bad_numbers
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from maplab_py.child_processes import Service, ServiceEnded, processors, serve
 from maplab_py.errors import MapError
-from maplab_py.storage.file_parts import FileParts
+from maplab_py.storage.file_assembly import FileParts
 from maplab_py.storage.protobuf.map_files import FileKind, read_unpacked
 from maplab_py.storage.protobuf.scan import MemoryBudget
 

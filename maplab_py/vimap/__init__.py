@@ -25,8 +25,9 @@ from maplab_py.vimap.queries import (
     mission_time_spans_ns,
     observation_counts,
     observer_counts,
+    resources_of,
+    without_resources,
 )
-from maplab_py.vimap.resource_queries import resources_of, without_resources
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import (
     NO_ROW,

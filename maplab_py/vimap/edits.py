@@ -7,10 +7,11 @@ import hashlib
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import IdArray, is_valid, random_ids
 from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
+from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import NO_ROW, LandmarkQuality, Landmarks
 from maplab_py.vimap.vertex_removal import move_landmarks, remove_vertices, stores_for
 from maplab_py.vimap.vi_map import VIMap
@@ -227,3 +228,35 @@ def content_rng(vi_map: VIMap, purpose: str, *others: VIMap) -> np.random.Genera
             digest.update(np.ascontiguousarray(table.id, dtype="<u8").tobytes())
             digest.update(b"/")
     return np.random.default_rng(int.from_bytes(digest.digest(), "little"))
+
+
+def remove_keypoints(vi_map: VIMap, removed: Mask) -> VIMap:
+    """Return the map without some keypoints (K,) and their descriptors.
+
+    Landmarks that lose their last observation are removed. Blocks that lose all keypoints are, too.
+    """
+    if not removed.any():
+        return vi_map
+    frames, keypoints = vi_map.frames, vi_map.keypoints
+    before = np.concatenate([[0], np.cumsum(removed)])  # removed ones before each keypoint
+    blocks = list(frames.descriptor_blocks)
+    lost = np.diff(before[vi_map.keypoint_start])
+    for row in np.flatnonzero(lost).tolist():
+        end, kept = int(vi_map.keypoint_start[row]), []
+        for block in blocks[row] or ():
+            begin, end = end, end + block.keypoints
+            count = block.keypoints - int(before[end] - before[begin])
+            if count:
+                kept.append(block._replace(keypoints=count))
+        blocks[row] = tuple(kept) if blocks[row] is not None else None
+    size = len(vi_map.landmarks)
+    left = keypoints.landmark[~removed]
+    observed = np.bincount(keypoints.landmark[keypoints.landmark >= 0], minlength=size)
+    still = np.bincount(left[left >= 0], minlength=size)
+    reduced = vi_map.replace(
+        frames=frames.replace(
+            keypoint_count=frames.keypoint_count - lost, descriptor_blocks=object_column(blocks)
+        ),
+        keypoints=keypoints.take(np.flatnonzero(~removed)),
+    )
+    return remove_landmarks(reduced, (observed > 0) & (still == 0))

@@ -10,8 +10,12 @@ from maplab_py.array_types import Mask
 from maplab_py.geometry import se3
 from maplab_py.report import counted
 from maplab_py.vimap.consistency import LOADED_UNIT_TOLERANCE
-from maplab_py.vimap.edits import remove_landmarks, remove_missions, remove_vertices
-from maplab_py.vimap.keypoint_removal import remove_keypoints
+from maplab_py.vimap.edits import (
+    remove_keypoints,
+    remove_landmarks,
+    remove_missions,
+    remove_vertices,
+)
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.vi_map import VIMap
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
+from maplab_py.sensors.sensor_set import OtherSensor
 from maplab_py.vimap.ids import SHORT_ID_DIGITS, distinct_prefixes, to_hex_list
-from maplab_py.vimap.tables import MissionSensor
+from maplab_py.vimap.tables import MissionSensor, ResourceOwner
 from maplab_py.vimap.vi_map import VIMap
 
 
@@ -161,3 +162,46 @@ def mission_sensor_id(vi_map: VIMap, mission: int, kind: MissionSensor) -> str:
     """Return the id (32 hexadecimal digits) of a mission's sensor, empty when it has none."""
     words = vi_map.missions.sensor_id[mission, kind]
     return to_hex_list(words)[0] if words.any() else ""
+
+
+def resource_missions(vi_map: VIMap) -> I64:
+    """Return the mission (row) of every resource (R,), -1 where it belongs to none."""
+    table = vi_map.resources
+    missions = np.where(table.owner_kind == ResourceOwner.NONE, -1, table.owner).astype(np.int64)
+    of_frames = np.flatnonzero(table.owner_kind == ResourceOwner.FRAME)
+    vertices = vi_map.frames.vertex[table.owner[of_frames]]
+    missions[of_frames] = vi_map.vertices.mission[vertices]
+    return missions
+
+
+def resources_of(
+    vi_map: VIMap, kinds: tuple[int, ...] | None = None, missions: NDArray[np.int64] | None = None
+) -> Mask:
+    """Return which resources (R,) are of some types and missions (rows); None = all."""
+    table = vi_map.resources
+    chosen = np.ones(len(table), dtype=np.bool_)
+    if kinds is not None:
+        chosen &= np.isin(table.type, kinds)
+    if missions is not None:
+        chosen &= np.isin(resource_missions(vi_map), missions)
+    return chosen
+
+
+def without_resources(vi_map: VIMap, removed: Mask) -> VIMap:
+    """Return the map without some resources (R,); their files stay where they are."""
+    return vi_map.replace(resources=vi_map.resources.take(~removed))
+
+
+# Marks of missions whose scale and direction of gravity are arbitrary, as those of COLMAP models are.
+#
+# The mark is a key of the mission's odometry sensor, which stands for the model. It is saved in
+# sensors.yaml; C++ maplab ignores it.
+
+ARBITRARY_SCALE = "is_scale_and_gravity_arbitrary"
+
+
+def is_metric(vi_map: VIMap, mission: int) -> bool:
+    """Return whether scale and direction of gravity of a mission (row) are known."""
+    sensor_id = mission_sensor_id(vi_map, mission, MissionSensor.ODOMETRY_6DOF)
+    sensor = vi_map.sensors.sensors.get(sensor_id)
+    return not (isinstance(sensor, OtherSensor) and sensor.keys.get(ARBITRARY_SCALE) is True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import I8, I64, U8, U64
+from maplab_py.array_types import F64, I8, I64, U8, U64, Mask
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, type_name
 
 
 def pack_words(descriptors: U8) -> U64:
@@ -51,3 +52,84 @@ def compile_kernels(kind: type[np.uint64 | np.int8] = np.uint64) -> None:
     words: Any = np.zeros((1, 1), dtype=kind)
     rows = np.zeros(1, dtype=np.int64)
     differences(words, rows, words, rows)
+
+
+# Kinds of descriptors: which can be compared with each other, and how.
+#
+# Binary descriptors are compared by the number of different bits. All others are vectors of numbers,
+# scaled to unit length, so that Euclidean distance and cosine order them alike; they are compared as
+# signed bytes, whose rounding moves a vector of 256 numbers by 0.018, far less than descriptors vary.
+
+_ROWS_AT_ONCE = 16_384
+STEPS_PER_UNIT = 254
+"""Steps of a signed byte per unit of length: single numbers up to half the length are kept."""
+
+
+class DescriptorKind(NamedTuple):
+    """Feature type, size and depth of descriptors; only equal kinds match each other."""
+
+    size: int  # bytes of a descriptor
+    feature_type: int = FeatureType.BINARY
+    depth: int = DescriptorDepth.UINT8
+
+    @property
+    def is_binary(self) -> bool:
+        """Return whether descriptors are bit strings."""
+        return self.feature_type == FeatureType.BINARY
+
+    @property
+    def dimensions(self) -> int:
+        """Return the number of bits of a binary descriptor, of numbers of another one."""
+        if self.is_binary:
+            return 8 * self.size
+        return self.size // 4 if self.depth == DescriptorDepth.FLOAT32 else self.size
+
+    @property
+    def words(self) -> str:
+        """Return the kind in words, as in "SIFT of 128 bytes"."""
+        return f"{type_name(self.feature_type)} of {self.size} bytes"
+
+    def steps(self, raw: U8) -> I8:
+        """Return descriptors (N, size) that are not binary as vectors of signed bytes (N, dimensions).
+
+        They have unit length, that is `STEPS_PER_UNIT`. Vectors without a length, or with a number
+        that is not finite, become zero; see `has_content`.
+        """
+        steps = np.empty((len(raw), self.dimensions), dtype=np.int8)
+        for begin in range(0, len(raw), _ROWS_AT_ONCE):
+            rows = slice(begin, begin + _ROWS_AT_ONCE)
+            values = np.ascontiguousarray(raw[rows])
+            if self.depth == DescriptorDepth.FLOAT32:
+                values = values.view("<f4")
+            steps[rows] = self._round(values.astype(np.float64))
+        return steps
+
+    def _round(self, vectors: F64) -> I8:
+        """Return vectors (N, dimensions) of any length as signed bytes of unit length."""
+        largest = np.abs(vectors).max(axis=1, initial=0.0, keepdims=True)
+        usable = np.isfinite(largest) & (largest > 0.0)  # a NaN makes the largest one NaN
+        vectors = np.where(usable, vectors, 0.0) / np.where(usable, largest, 1.0)
+        length = np.sqrt(np.einsum("nd,nd->n", vectors, vectors))[:, None]
+        vectors *= STEPS_PER_UNIT / np.where(length > 0.0, length, 1.0)
+        return np.clip(np.rint(vectors), -127, 127).astype(np.int8)
+
+    def has_content(self, raw: U8) -> Mask:
+        """Return which descriptors (N, size) can be compared: binary ones, and vectors with a length."""
+        if self.is_binary:
+            return np.ones(len(raw), dtype=np.bool_)
+        return np.asarray(self.steps(raw).any(axis=1))
+
+    def comparable(self, raw: U8) -> U64 | I8:
+        """Return descriptors (N, size) as indices compare them: packed bits, or signed bytes."""
+        return pack_words(raw) if self.is_binary else self.steps(raw)
+
+    def largest(self, bit_fraction: float, distance: float) -> float:
+        """Return the largest difference of a match in the unit that `differences` counts in.
+
+        Args:
+            bit_fraction: Largest share of different bits of binary descriptors.
+            distance: Largest Euclidean distance of others, scaled to unit length.
+        """
+        if self.is_binary:
+            return bit_fraction * 8 * self.size
+        return (distance * STEPS_PER_UNIT) ** 2

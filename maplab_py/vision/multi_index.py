@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.index import DescriptorSet, MatchRule, Neighbours
 from maplab_py.vision.kmeans import kmeans, nearest_centre
 from maplab_py.vision.projection import learn_projection

@@ -74,7 +74,7 @@ def csv_export(
 def _projection(context: CommandContext, map_mission: str, file: str) -> DescriptorProjection:
     """Return the projection of descriptors that loop closure among the chosen missions uses."""
     from maplab_py.algorithms.loop_closure.features import map_features
-    from maplab_py.vision.projection_file import load_projection
+    from maplab_py.vision.projection import load_projection
 
     rows = context.mission_rows(map_mission)
     missions = np.arange(len(context.vi_map.missions)) if rows is None else rows
@@ -259,7 +259,7 @@ def recording_info(
         recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
         check_images: Check size and completeness of all images, and list those whose files are missing.
     """
-    from maplab_py.interop.recordings.opening import open_recording
+    from maplab_py.interop.recordings.reader_choice import open_recording
     from maplab_py.interop.recordings.summary import summarise
 
     if check_images:  # which lists all images that are missing
@@ -303,7 +303,7 @@ def check_recording(
     """
     from maplab_py.algorithms.recording_check.correction import correct
     from maplab_py.algorithms.recording_check.doctor import diagnose, report
-    from maplab_py.interop.recordings.opening import open_recording
+    from maplab_py.interop.recordings.reader_choice import open_recording
     from maplab_py.output_files import check_writable, write_text
     from maplab_py.sensors.sensors_yaml import write_sensors
 

@@ -343,7 +343,7 @@ def import_gps(
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
     from maplab_py.algorithms.external_poses.options import GpsImport, LeftOutFixes
-    from maplab_py.interop.gps_bags import read_fixes
+    from maplab_py.interop.gps import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
     mission = context.mission_row(map_mission)

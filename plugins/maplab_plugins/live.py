@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from maplab_py.frontend.mapping import Mapping
     from maplab_py.frontend.odometry_update import OdometryUpdate
     from maplab_py.interop.live.bag_recording import RecordedBag
-    from maplab_py.interop.live.listing import LiveTopics
+    from maplab_py.interop.live.connection import LiveTopics
     from maplab_py.interop.live.playing import PlayedRecording
     from maplab_py.interop.live.publishing import PosePublisher
     from maplab_py.interop.live.source import LiveRecording
@@ -46,7 +46,7 @@ def live_topics(
         transport: ros2, ros1 or foxglove.
         listen_s: Count messages for so long [s].
     """
-    from maplab_py.interop.live.listing import list_topics
+    from maplab_py.interop.live.connection import list_topics
 
     return list_topics(transport, network, listen_s, progress=context.progress)
 
@@ -77,7 +77,7 @@ def play_recording(
         transport: ros2, ros1 or foxglove (then this command is the server, at --foxglove_url).
     """
     from maplab_py.interop.live.playing import play_recording as play
-    from maplab_py.interop.recordings.opening import open_recording
+    from maplab_py.interop.recordings.reader_choice import open_recording
 
     opened = open_recording(recording, source)
     with ending_early() as is_to_end:
@@ -174,10 +174,10 @@ def live_run(
     Raises:
         UserError: There is no calibration, or a topic is missing or of another type.
     """
-    from maplab_py.interop.live.opening import open_transport
+    from maplab_py.interop.live.connection import open_transport
     from maplab_py.interop.live.publishing import PosePublisher
     from maplab_py.interop.live.source import LiveRecording
-    from maplab_py.interop.recordings.opening import given_device
+    from maplab_py.interop.recordings.reader_choice import given_device
 
     device = given_device(source, f"--datasource_type={kind}: a live source")
     with open_transport(kind, network) as transport:

@@ -195,7 +195,7 @@ def train_projection_matrix(
         overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.loop_closure.features import train_projection
-    from maplab_py.vision.projection_file import save_projection
+    from maplab_py.vision.projection import save_projection
 
     missions = context.mission_rows("", map_mission_list)
     projection, report = train_projection(

@@ -10,7 +10,7 @@ from maplab_py.interop.resources.images import ImageImportOptions
 from maplab_py.plugin import CommandContext, command
 
 if TYPE_CHECKING:
-    from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
+    from maplab_py.interop.resources.matching import ExportedImages, ImportedResources
 
 
 @command(

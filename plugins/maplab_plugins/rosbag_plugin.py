@@ -10,7 +10,7 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserEr
 
 if TYPE_CHECKING:
     from maplab_py.interop.bags.listing import BagInfo
-    from maplab_py.interop.bags.reports import BagImport, BagReport
+    from maplab_py.interop.bags.options import BagImport, BagReport
 
 _POSES, _EXPORT, _IMPORT = PoseToBagOptions(), BagExportOptions(), BagImportOptions()
 

@@ -8,8 +8,8 @@ from numpy.testing import assert_array_equal
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
-from maplab_py.estimation.kernels.connected_parts import connected_parts
 from maplab_py.estimation.linear import supernodal, supernodal_solver
+from maplab_py.estimation.problem.gauge import connected_parts
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3

@@ -9,7 +9,7 @@ from benchmarks.city.joint import merges_of_strangers, stage_of
 from benchmarks.city.sessions import city_scenario, read_truth, sizes, write_sessions
 from maplab_py.simulation.scenario import SessionOptions
 from maplab_py.simulation.scenario_file import check_scenario
-from maplab_py.simulation.streets import pitch_m
+from maplab_py.simulation.world import pitch_m
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import merge_landmarks

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from maplab_py.console.commands.flags import COMMON_FLAGS
-from maplab_py.console.commands.maplab_flags import Fate, FormerFlag, former_flags
+from maplab_py.console.commands.flags import COMMON_FLAGS, Fate, FormerFlag, former_flags
 from maplab_py.console.commands.registry import Registry, load_registry
 from tests.docs.test_pages import script_module
 

@@ -11,8 +11,7 @@ from maplab_py.algorithms.dense.resources import FrameResources
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
 from maplab_py.vimap import LandmarkQuality
-from maplab_py.vimap.queries import observer_counts
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap.queries import observer_counts, resources_of
 from tests.support.data import shared_data
 
 _MIN_OBSERVERS = 4

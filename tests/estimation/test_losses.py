@@ -9,9 +9,9 @@ import pytest
 
 from maplab_py.estimation.blocks import Manifold, ParameterBlock, ParameterBlocks
 from maplab_py.estimation.codegen.kernels import visual_kernels
+from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.terms.visual import NodeSystem, Observations, VisualTerms

@@ -8,8 +8,7 @@ import numpy as np
 
 from maplab_py.estimation.window.frame import StartState, WindowFrame
 from maplab_py.frontend.starting import Start
-from maplab_py.geometry.association import nearest_rows
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.interop.trajectories import Trajectory
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.interop.live.messages import image_data, imu_values
 from maplab_py.interop.live.ros1 import header_bytes, parse_header
+from maplab_py.interop.live.source import image_data, imu_values
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.sensors import Camera, Distortion, Projection

@@ -41,9 +41,9 @@ from maplab_py.interop.g2o import read_g2o
 from maplab_py.interop.gps import read_gps
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import CameraImage
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.resources.point_clouds import parse_pcd
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.interop.wheel_odometry import read_wheel_odometry

@@ -24,8 +24,8 @@ from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.ply import PlyCloud, write_ply
 from maplab_py.interop.recordings.bag_writing import BagFormat
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
-from maplab_py.interop.recordings.opening import given_device
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import given_device
 from maplab_py.interop.resources.point_clouds import read_cloud
 from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc, write_tum
 from maplab_py.sensors import Distortion

@@ -15,7 +15,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.interop.colmap.options import ColmapImportReport
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.scale_marks import is_metric
+from maplab_py.vimap.queries import is_metric
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.interop.test_mvs import read_by_colmap
 from tests.support.scene import Scene

@@ -19,8 +19,7 @@ from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import VIMap, ids
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vision.projection import DescriptorProjection
-from maplab_py.vision.projection_file import save_projection
+from maplab_py.vision.projection import DescriptorProjection, save_projection
 from tests.algorithms.self_calibration.scenes import scene_map
 from tests.interop.recordings.written import make_content, write_folder
 from tests.interop.small_map import RIG_ID, make_map

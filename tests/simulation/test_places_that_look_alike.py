@@ -11,8 +11,7 @@ from maplab_py.errors import UserError
 from maplab_py.simulation.motion import check_free_way, motion_spline
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.scenario_file import check_scenario, load_scenario
-from maplab_py.simulation.streets import block_boxes, street_bounds, street_route
-from maplab_py.simulation.world import make_world
+from maplab_py.simulation.world import block_boxes, make_world, street_bounds, street_route
 
 ROOMS = WorldOptions(
     rooms=3,

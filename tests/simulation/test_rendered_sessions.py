@@ -12,8 +12,8 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.simulation.imaging import Brightness, make_brightness

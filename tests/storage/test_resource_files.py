@@ -35,7 +35,7 @@ from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_missions
 from maplab_py.vimap.ids import random_ids
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.resource_queries import resource_missions, resources_of, without_resources
+from maplab_py.vimap.queries import resource_missions, resources_of, without_resources
 from maplab_py.vimap.tables import Resources
 from tests.simulation.small import simulated
 from tests.support.data import shared_data

@@ -27,7 +27,7 @@ from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_to_messages import Partition, contents, index_to_bytes
 from maplab_py.storage.protobuf.vertices_to_messages import id_fields, tag_of
 from maplab_py.storage.reading_processes import parts_ahead
-from maplab_py.storage.written_files import WrittenFiles
+from maplab_py.storage.unchanged_files import WrittenFiles
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.edits import remove_missions

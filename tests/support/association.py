@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maplab_py.array_types import I64
-from maplab_py.geometry.association import nearest_rows
+from maplab_py.geometry.interpolation import nearest_rows
 
 
 def associate(

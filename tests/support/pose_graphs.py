@@ -15,7 +15,7 @@ from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.robust import optimize_robustly
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
-from maplab_py.estimation.kernels.connected_parts import connected_parts
+from maplab_py.estimation.problem.gauge import connected_parts
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import se3, so3

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from maplab_py.algorithms.self_calibration.pruning import test_mutual_consistency, test_segments
 from maplab_py.geometry import so3
-from maplab_py.geometry.association import nearest_rows
+from maplab_py.geometry.interpolation import nearest_rows
 from maplab_py.sensors import ImuIntrinsics
 from tests.mutation.fault import planted
 from tests.mutation.faults import AREAS

@@ -14,9 +14,8 @@ from maplab_py.geometry import se3
 from maplab_py.vimap import VIMap, edits
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import DescriptorBlock
-from maplab_py.vimap.edits import merge_landmarks, with_p_G
+from maplab_py.vimap.edits import merge_landmarks, remove_keypoints, with_p_G
 from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
-from maplab_py.vimap.keypoint_removal import remove_keypoints
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.table import object_column
 from maplab_py.vimap.vertex_removal import composed_covariance, remove_vertices_counted

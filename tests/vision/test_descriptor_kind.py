@@ -9,12 +9,15 @@ from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
-from maplab_py.vision.descriptor_kind import STEPS_PER_UNIT, DescriptorKind
-from maplab_py.vision.descriptors import differences
+from maplab_py.vision.descriptors import STEPS_PER_UNIT, DescriptorKind, differences
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
-from maplab_py.vision.projection import DescriptorProjection, learn_projection
-from maplab_py.vision.projection_file import load_projection, save_projection
+from maplab_py.vision.projection import (
+    DescriptorProjection,
+    learn_projection,
+    load_projection,
+    save_projection,
+)
 from tests.support.float_features import as_numbers
 from tests.vision.synthetic import tracks
 

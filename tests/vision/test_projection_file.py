@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.vision.projection import DescriptorProjection
-from maplab_py.vision.projection_file import load_projection, save_projection
+from maplab_py.vision.projection import DescriptorProjection, load_projection, save_projection
 
 
 def test_a_projection_comes_back(tmp_path):

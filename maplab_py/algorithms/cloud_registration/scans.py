@@ -18,14 +18,12 @@ from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.geometry.association import nearest_rows
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
 from maplab_py.interop.ply import parse_ply
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import as_keys, to_hex
-from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap.queries import mission_sensor_id, resources_of
 
 CLOUD_TYPES = (16, 17, 21)
 """Resource types of clouds: plain, with colours, with intensities."""

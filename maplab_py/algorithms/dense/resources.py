@@ -16,8 +16,7 @@ from maplab_py.sensors import Camera, CameraRig
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_sensor_id
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap.queries import mission_sensor_id, resources_of
 
 IMAGES = (0, 4)
 """Resource types of recorded images: grey, colour."""

@@ -13,8 +13,7 @@ from maplab_py.algorithms.evaluation.plausibility import clock_offset_ns, orient
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
-from maplab_py.geometry.association import nearest_rows
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ids

@@ -19,7 +19,7 @@ from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex, type_name
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures, checked, plugin_extractor
 from maplab_py.vision.features.extractors import KINDS, extract
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.vimap import DescriptorBlock, VIMap
-from maplab_py.vimap.keypoint_removal import remove_keypoints
+from maplab_py.vimap.edits import remove_keypoints
 from maplab_py.vimap.table import object_column, starts_of_counts
 from maplab_py.vimap.tables import DescriptorLayout, FrameField, Keypoints
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures
 
 _FIELDS = np.uint16(

@@ -17,7 +17,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, mission_mask, type_name
 from maplab_py.vimap.tables import FrameField
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images
 from maplab_py.vision.track_union import unite_tracks
 

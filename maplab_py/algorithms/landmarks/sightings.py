@@ -54,7 +54,7 @@ def _T_G_I(vi_map: VIMap, keypoints: I64, camera: Camera) -> F64:
     T_G_I = np.asarray(vi_map.T_G_I[vertex])
     if not camera.is_moving:
         return T_G_I
-    from maplab_py.estimation.imu.angular_velocity import angular_velocity_at_vertices
+    from maplab_py.estimation.imu.inertial_data import angular_velocity_at_vertices
 
     w_I = angular_velocity_at_vertices(vi_map, vertex)[vertex]
     delay_s = camera.delay_s(vi_map.keypoints.uv_px[keypoints])[:, None]

@@ -17,7 +17,7 @@ from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.descriptors import FeatureType, type_name
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DescriptorProjection
 

@@ -33,8 +33,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 from maplab_py.vision.index import MatchRule
-from maplab_py.vision.projection import DescriptorProjection
-from maplab_py.vision.projection_file import load_projection
+from maplab_py.vision.projection import DescriptorProjection, load_projection
 
 _EVERYTHING = SearchScope()
 

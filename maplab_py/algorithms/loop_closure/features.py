@@ -21,7 +21,7 @@ from maplab_py.vimap.descriptors import (
     type_name,
     types_of,
 )
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.kmeans import kmeans, nearest_centre
 from maplab_py.vision.projection import DIMENSIONS, DescriptorProjection, learn_projection

@@ -12,9 +12,9 @@ import numpy as np
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.array_types import F64, Mask
+from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
 from maplab_py.estimation.problem.solver import SLOW_CONVERGENCE, SolverOptions, optimize_states
 from maplab_py.estimation.problem.trust_region import Schedule

@@ -36,7 +36,7 @@ from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
-from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
+from maplab_py.estimation.problem.marginals import cluster_robust_covariance
 from maplab_py.estimation.states import States
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet

@@ -30,7 +30,7 @@ from maplab_py.algorithms.self_calibration.uncertainty import (
 )
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, UserError
-from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
+from maplab_py.estimation.problem.marginals import cluster_robust_covariance
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import SensorSet
 from maplab_py.vimap import VIMap

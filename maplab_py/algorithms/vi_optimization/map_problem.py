@@ -36,7 +36,7 @@ from maplab_py.array_types import I64
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.codegen.kernels import visual_kernels
-from maplab_py.estimation.imu.angular_velocity import angular_velocity_at_vertices
+from maplab_py.estimation.imu.inertial_data import angular_velocity_at_vertices
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import (

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import re
 from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
-from maplab_py.console.commands.flag_types import BOOL, FLOAT, FlagType, format_value
-from maplab_py.console.commands.maplab_flags import explanation
+from maplab_py.console.commands.flag_types import BOOL, FLOAT, FlagType, expand_path, format_value
+from maplab_py.console.commands.lines import split_commands, variable_lookup
 from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.errors import FlagError
+from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 
 REQUIRED: Any = object()
 """Default of a flag that must be given."""
@@ -175,3 +179,147 @@ def _take_value(name: str, rest: list[str]) -> str:
     if not rest or looks_like_flag(rest[0]):
         raise FlagError(f"--{name} needs a value (write --{name}=value)")
     return rest.pop(0)
+
+
+# maplab's flags that have no namesake here: what they are called, or why they were dropped.
+
+TABLE = "maplab_flags.tsv"
+
+
+class Fate(enum.Enum):
+    """Fate of a flag of maplab."""
+
+    RENAMED = "renamed"
+    DROPPED = "dropped"
+
+
+@dataclasses.dataclass(frozen=True)
+class FormerFlag:
+    """One flag of maplab.
+
+    Attributes:
+        fate: What became of it.
+        new_name: Its name here without dashes; empty for a dropped one.
+        note: How the new one differs, may be empty; why it was dropped.
+    """
+
+    fate: Fate
+    new_name: str
+    note: str
+
+
+def former_flags() -> dict[str, FormerFlag]:
+    """Return the flags by maplab's names.
+
+    Raises:
+        ValueError: The table is wrong.
+    """
+    text = resources.files(__package__).joinpath(TABLE).read_text(encoding="utf-8")
+    return parse_table(text)
+
+
+def parse_table(text: str) -> dict[str, FormerFlag]:
+    """Parse lines of names (separated by ", "), fate and text, separated by tabs.
+
+    Raises:
+        ValueError: A line is wrong, or a name is in two lines.
+    """
+    flags: dict[str, FormerFlag] = {}
+    for line in text.splitlines():
+        names, fate, note = line.split("\t")
+        new_name = ""
+        if fate == Fate.RENAMED.value:
+            new_name, _, note = note.removeprefix("--").partition(": ")
+        for name in names.split(", "):
+            if name in flags or not (new_name or note):
+                raise ValueError(f"{TABLE}: the line of '{name}' is wrong")
+            flags[name] = FormerFlag(Fate(fate), new_name, note)
+    return flags
+
+
+def explanation(name: str) -> str:
+    """Return the end of an error about an unknown flag; empty where maplab has no such flag."""
+    flag = former_flags().get(name)
+    if flag is None:
+        return ""
+    if flag.fate is Fate.RENAMED:
+        return f": here it is --{flag.new_name}{f' ({flag.note})' if flag.note else ''}"
+    return f": maplab's flag is not needed here: {flag.note}"
+
+
+# Flag files: flags one per line, with comments, that may include further flag files.
+
+DEPTH_LIMIT = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class FileWords:
+    """The words of one line of a flag file and where it stands."""
+
+    words: tuple[str, ...]
+    origin: str  # path:line
+
+
+def read_flagfile(path: Path, depth: int = 0) -> list[FileWords]:
+    """Read a flag file and all that it includes, in the order in which they apply.
+
+    `#` starts a comment, quotes protect as in a shell, `$NAME` is a variable of the environment,
+    `--flagfile=other` includes a file whose path is relative to the including one.
+
+    Raises:
+        FlagError: A file is missing or unreadable, a line is not a flag, or files include each
+            other more than `DEPTH_LIMIT` deep.
+    """
+    if depth >= DEPTH_LIMIT:
+        raise FlagError(f"{path}: flag files include each other more than {DEPTH_LIMIT} deep")
+    try:
+        remedy = "flag files are shorter"
+        text = read_text(path, SCRIPT_MAX_BYTES, remedy=remedy, error=FlagError)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not a text file"
+        raise FlagError(f"--flagfile={path}: cannot be read: {reason}") from None
+    lines: list[FileWords] = []
+    lookup = variable_lookup({})
+    for number, line in enumerate(text.splitlines(), start=1):
+        origin = f"{path}:{number}"
+        try:
+            words = [word for command in split_commands(line, lookup) for word in command]
+        except FlagError as error:
+            raise FlagError(f"{origin}: {error}") from None
+        if not words or words[0].startswith("//"):
+            continue
+        if not looks_like_flag(words[0]):
+            raise FlagError(f"{origin}: '{words[0]}' is not a flag (write --name=value)")
+        included = _include(words)
+        if included is None:
+            lines.append(FileWords(tuple(words), origin))
+        else:
+            lines += _read_included(_relative_to(path, included, origin), depth + 1, origin)
+    return lines
+
+
+def _read_included(path: Path, depth: int, origin: str) -> list[FileWords]:
+    """Read an included file; that it cannot be read is an error of the line that includes it."""
+    try:
+        return read_flagfile(path, depth)
+    except FlagError as error:
+        if str(error).startswith("--flagfile="):
+            raise FlagError(f"{origin}: {error}") from None
+        raise
+
+
+def _include(words: list[str]) -> str | None:
+    name, _, value = words[0].lstrip("-").partition("=")
+    if name != "flagfile":
+        return None
+    return value or (words[1] if len(words) > 1 else "")
+
+
+def _relative_to(including: Path, text: str, origin: str) -> Path:
+    try:
+        path = expand_path(text)
+    except ValueError as error:
+        raise FlagError(f"{origin}: --flagfile={text}: {error}") from None
+    if path is None:
+        raise FlagError(f"{origin}: --flagfile needs a path")
+    return path if path.is_absolute() else including.parent / path

@@ -5,10 +5,12 @@ from __future__ import annotations
 import datetime as dt
 import logging
 import os
+import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 from prompt_toolkit import PromptSession
@@ -33,7 +35,6 @@ from maplab_py.console.commands.flags import looks_like_flag, resolve_name
 from maplab_py.console.commands.lines import Word, scan
 from maplab_py.console.commands.registry import Registry
 from maplab_py.console.prompt.completion import complete
-from maplab_py.console.prompt.greeting import greeting
 from maplab_py.console.scripts.checking import LEAVE
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.maps import MapEntry
@@ -386,3 +387,39 @@ def _append(path: Path, data: bytes) -> None:
             os.ftruncate(descriptor, size)
     finally:
         os.close(descriptor)
+
+
+_MAP_WORDS = ("--map_folder=", "--save_map_folder=")
+_COMMANDS = ("load", "save", "rovioli")
+_METADATA = Path("vi_map") / "vi_map_metadata"
+_MAX_MAPS = 3
+
+
+def greeting(history: Sequence[str]) -> list[str]:
+    """Return what the prompt says first.
+
+    Args:
+        history: Lines that were typed before, oldest first.
+    """
+    lines = [f"maplab-py {version('maplab-py')} · help lists tasks and commands · Tab completes"]
+    maps = list(dict.fromkeys(_maps_of(history)))[:_MAX_MAPS]
+    if maps:
+        lines.append("recent maps: " + " · ".join(f"load {shlex.quote(path)}" for path in maps))
+    return lines
+
+
+def _maps_of(history: Sequence[str]) -> Iterator[str]:
+    """Yield the map folders of loaded and saved maps that are still there, latest first."""
+    for line in reversed(history):
+        for text in reversed(line.split(";")):
+            try:
+                words = shlex.split(text)
+            except ValueError:
+                continue
+            if not words or words[0] not in _COMMANDS:
+                continue
+            for word in words[1:]:
+                named = next((word[len(f) :] for f in _MAP_WORDS if word.startswith(f)), "")
+                path = named or ("" if word.startswith("-") else word)
+                if path and (Path(path) / _METADATA).is_file():
+                    yield path

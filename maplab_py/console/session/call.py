@@ -9,9 +9,13 @@ from typing import Any
 
 from maplab_py.console.commands.command import Command
 from maplab_py.console.commands.flag_types import expand_path
-from maplab_py.console.commands.flagfile import read_flagfile
-from maplab_py.console.commands.flags import Given, normalise, parse_words
-from maplab_py.console.commands.maplab_flags import explanation
+from maplab_py.console.commands.flags import (
+    Given,
+    explanation,
+    normalise,
+    parse_words,
+    read_flagfile,
+)
 from maplab_py.console.commands.registry import Registry
 from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.console.session.settings import Settings

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
 from maplab_py.array_types import I64
 from maplab_py.console.session.maps import MapManager
-from maplab_py.console.session.missions import MissionChoice
 from maplab_py.console.terminal.protocol import Terminal
 from maplab_py.errors import UserError
 from maplab_py.progress import Progress
@@ -18,6 +17,15 @@ if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
     from maplab_py.storage.native import DiskCopy
     from maplab_py.vimap import VIMap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from maplab_py.options import Options
+
+if TYPE_CHECKING:
+    from maplab_py.vimap import VIMap
+
 
 ArgumentsT = ParamSpec("ArgumentsT")
 ReportT = TypeVar("ReportT")
@@ -102,7 +110,7 @@ class CommandContext:
 
     def apply_drafts(self) -> None:
         """Apply the committed values to the maps; called by the session when the command succeeds."""
-        from maplab_py.console.session.undo import UndoOptions, bounded
+        from maplab_py.console.session.maps import UndoOptions, bounded
 
         for key, vi_map in self._drafts.items():
             if key in self.maps:
@@ -183,3 +191,32 @@ class CommandContext:
             )
         if not self.terminal.ask(question):
             raise UserError(f"{self.command}: not confirmed")
+
+
+class MissionChoice(Options):
+    """Missions to work on; all if none is given."""
+
+    map_mission: str = ""
+    """Mission id or unambiguous prefix; empty = all missions"""
+    map_mission_list: str = ""
+    """Several missions, separated by commas"""
+
+    def rows(self, vi_map: VIMap) -> I64 | None:
+        """Return the rows of the chosen missions in ascending order, None if none is given (all).
+
+        Raises:
+            UserError: An id is unknown or ambiguous; the message lists the candidates.
+        """
+        from maplab_py.vimap.queries import find_mission
+
+        prefixes = [
+            part.strip() for part in f"{self.map_mission},{self.map_mission_list}".split(",")
+        ]
+        chosen = [prefix for prefix in prefixes if prefix]
+        if not chosen:
+            return None
+        rows = [find_mission(vi_map, prefix) for prefix in chosen]
+        return np.array(sorted(set(rows)), dtype=np.int64)
+
+
+ALL_MISSIONS = MissionChoice()

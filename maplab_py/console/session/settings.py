@@ -9,8 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from maplab_py.console.commands.command import Command
-from maplab_py.console.commands.flagfile import read_flagfile
-from maplab_py.console.commands.flags import CONSOLE_FLAGS, normalise, parse_words, resolve_name
+from maplab_py.console.commands.flags import (
+    CONSOLE_FLAGS,
+    normalise,
+    parse_words,
+    read_flagfile,
+    resolve_name,
+)
 from maplab_py.console.commands.registry import Registry
 from maplab_py.errors import FlagError
 

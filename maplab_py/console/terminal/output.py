@@ -18,13 +18,14 @@ from maplab_py.cancellation import current_token
 from maplab_py.console.terminal.drawing import folded, plain_text
 from maplab_py.console.terminal.foreground import in_waiting_thread, interruptible, terminal_lent
 from maplab_py.console.terminal.layout import blocks_of
-from maplab_py.console.terminal.naming import text_with_names, with_names
 from maplab_py.console.terminal.render import (
     render,
     render_json,
     render_json_error,
     rendered,
+    text_with_names,
     wants_colour,
+    with_names,
 )
 from maplab_py.console.terminal.streams import write_message, writing_output
 from maplab_py.errors import Cancelled, UserError

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from maplab_py.array_types import F64
 from maplab_py.compilation import compiled
 from maplab_py.estimation.loss import Loss
@@ -45,3 +47,11 @@ def rho_and_weight_of_all(kind: int, s: F64, c2: F64, rho: F64, weight: F64) -> 
     """Fill in rho (N,) and weight (N,) for squared residuals (N,) and squared scales (N,)."""
     for n in range(len(s)):
         rho[n], weight[n] = rho_and_weight(kind, s[n], c2[n])
+
+
+def loss_and_weight(loss: Loss, c2: F64 | float, s: F64) -> tuple[F64, F64]:
+    """Return rho(s) and its derivative for squared whitened residuals (N,) and squared scales."""
+    rho, weight = np.empty(len(s)), np.empty(len(s))
+    scales = np.full(len(s), c2, dtype=np.float64)
+    rho_and_weight_of_all(int(loss), np.ascontiguousarray(s), scales, rho, weight)
+    return rho, weight

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -306,3 +308,33 @@ class SupernodalCholesky:
     def _require_factor(self) -> None:
         if not self._is_factorised:
             raise ValueError("the matrix has to be factorised before its factor can be used")
+
+
+class BlockSums(Protocol):
+    """Storage in which the blocks of a matrix are summed."""
+
+    layout: BlockLayout
+    numbers: F64  # the storage; see `block_storage`
+
+    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
+        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BlockPlaces:
+    """Blocks (B,) of a pattern, and where they lie in a solver's storage."""
+
+    rows: I32
+    cols: I32
+    places: I32
+
+    @classmethod
+    def of(cls, solver: SupernodalCholesky, rows: I64, cols: I64) -> BlockPlaces:
+        """Find the places in the storage of a solver that has analysed the blocks."""
+        short_rows, short_cols = rows.astype(np.int32), cols.astype(np.int32)
+        return cls(short_rows, short_cols, solver.places(short_rows, short_cols))
+
+    def add(self, solver: BlockSums, values: F64, first: int = 0) -> None:
+        """Add the blocks (k, d, d) from number `first` on to a matrix."""
+        part = slice(first, first + len(values))
+        solver.add(self.rows[part], self.cols[part], self.places[part], values)

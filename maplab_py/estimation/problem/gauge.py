@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.estimation.kernels.connected_parts import connected_parts
+from maplab_py.compilation import compiled
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
 from maplab_py.geometry import so3
@@ -60,3 +60,24 @@ def fix_distance(problem: Problem, states: States, first: I64, second: I64) -> N
     apart = length[:, 0] > 0.0
     direction = offset[apart] / length[apart]
     problem.restrict(NODES_PER_VERTEX * second[apart] + POSITION, null_projector(direction))
+
+
+@compiled()
+def connected_parts(count, first, second):  # type: ignore[no-untyped-def]
+    """Return the smallest node (count,) of each node's part, links being first (E,) to second."""
+    root = np.arange(count)
+    for link in range(len(first)):
+        a, b = first[link], second[link]
+        while root[a] != a:
+            root[a] = root[root[a]]
+            a = root[a]
+        while root[b] != b:
+            root[b] = root[root[b]]
+            b = root[b]
+        if a < b:
+            root[b] = a
+        else:
+            root[a] = b
+    for node in range(count):
+        root[node] = root[root[node]]
+    return root

@@ -23,13 +23,12 @@ from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.preconditioner import Preconditioner
 from maplab_py.estimation.problem.problem import Linearization, Problem
 from maplab_py.estimation.problem.protocol import Step
-from maplab_py.estimation.problem.reduced_operator import Evaluation, ReducedOperator
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms import factor as factor_terms
 from maplab_py.estimation.terms.prior import PosePrior
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import Observations, VisualTerms, pose_part, sample_terms
-from maplab_py.estimation.terms.visual_products import VisualProducts
+from maplab_py.estimation.terms.visual_products import PoseSystem, VisualProducts
 from maplab_py.geometry import se3
 from maplab_py.memory import NotEnoughMemory
 
@@ -375,3 +374,28 @@ def compile_without_images() -> None:
     states = States(se3.identity(1), zero, zero, zero, zero)
     problem = IterativeProblem(states, None, [prior])
     problem.solve(problem.linearize(states, 1e-4), 1e-4)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Everything at some states that does not depend on the damping."""
+
+    states: States
+    observations: Observations | None
+    poses: PoseSystem | None
+    gradient: F64  # (nodes, 3) without landmarks' elimination
+    diagonal: F64  # (nodes, 3)
+    factors: list[tuple[I64, F64, F64]]
+    factor_blocks: list[F64]
+    costs: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReducedOperator(Linearization):
+    """Normal equations of which only the blocks for the preconditioner are formed.
+
+    The next linearisation of the same problem writes into what products read.
+    """
+
+    pose_blocks: F64  # (V, 6, 6) diagonal blocks of the visual Schur complement
+    factor_blocks: list[F64]

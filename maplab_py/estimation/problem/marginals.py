@@ -6,16 +6,19 @@ With robust losses the weights at the optimum count, so down-weighted measuremen
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
+from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
-from maplab_py.estimation.problem.cluster_robust import cluster_robust_covariance
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import States, pose_nodes
+from maplab_py.estimation.terms.visual import VisualTerms
 from maplab_py.geometry import se3, so3
 
 _LANDMARK_DAMPING = 1e-12
@@ -109,3 +112,74 @@ class Marginals:
         J[:3, 3:6] = so3.skew(T_A_B[4:])
         J[3:, 3:6], J[3:, 9:] = -so3.to_matrix(T_A_B[:4]).T, np.eye(3)
         return np.asarray(J @ joint @ J.T)
+
+
+# Cluster-robust covariance: errors may be correlated within a track, or for some time (decision 18).
+#
+# The formal covariance takes all observations of a landmark for independent. Where a tracker drifts, or
+# the model is wrong, errors in neighbouring images are correlated, and the same number of observations
+# contains less information. Clusters are still independent of each other, so the scatter of their
+# contributions to the result shows how uncertain it is, whatever the correlations within one.
+
+_STEP = 1e-3
+"""Step of the numeric derivatives, in formal deviations; landmarks close to a camera allow no more."""
+
+
+def cluster_robust_covariance(
+    problem: Problem,
+    states: States,
+    node: I64,
+    direction: I64,
+    landmark_damping: float,
+    cluster: I64 | None = None,
+) -> F64:
+    """Return the covariance (k, k) of directions of nodes, with landmarks as independent clusters.
+
+    It is C (sum of g g^T + H) C, with C the formal covariance, g the gradients of the costs of single
+    clusters, and H the information of everything else, whose covariances are trusted (K.-Y. Liang
+    and S. L. Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986).
+    Where landmarks are at their optimum their elimination does not change g, so products of C and g
+    are derivatives of a landmark's cost along columns of C.
+
+    Args:
+        problem: Factorised at the states without damping.
+        states: The optimum.
+        node: Nodes (k,).
+        direction: Their directions (k,).
+        landmark_damping: Of the landmarks' elimination.
+        cluster: Cluster (L,) of each landmark, from 0; None = each is one.
+    """
+    columns = problem.covariance_columns(node, direction)
+    size = columns.shape[-1]
+    covariance = np.zeros((size, size))
+    for term in problem.factors:
+        _, jacobian = term.evaluate(states)
+        moved = columns[term.nodes].reshape(*jacobian.shape[::2], -1)
+        change = (jacobian @ moved).reshape(-1, size)
+        covariance += change.T @ change
+    if problem.visual is None:
+        return covariance
+    no_step = np.zeros((problem.num_nodes, 3))
+    p_G, _, _ = problem.visual.take_step(states, no_step, states, landmark_damping)
+    optimum = dataclasses.replace(states, p_G=p_G)
+    formal_sigma = np.sqrt(columns[node, direction, np.arange(len(node))])
+    change = np.empty((len(p_G), size))
+    for k, sigma in enumerate(formal_sigma):
+        step = columns[:, :, k] * (_STEP / max(sigma, 1e-300))
+        difference = _costs(problem.visual, optimum, step)
+        difference -= _costs(problem.visual, optimum, -step)
+        change[:, k] = difference * (sigma / (2.0 * _STEP))
+    if cluster is not None:
+        of_landmark = change
+        change = np.zeros((int(cluster.max(initial=-1)) + 1, size))
+        np.add.at(change, cluster, of_landmark)
+    covariance += change.T @ change
+    return covariance
+
+
+def _costs(visual: VisualTerms, states: States, step: F64) -> F64:
+    """Return the cost (L,) of every landmark after all but the landmarks make a step (nodes, 3)."""
+    data = visual.observations
+    error_px = np.nan_to_num(visual.errors(states.moved(step, states.p_G))[0])
+    cost = loss_and_weight(visual.loss, data.scale2, np.square(error_px * data.inverse_sigma))[0]
+    return np.asarray(0.5 * np.bincount(data.landmark, cost, minlength=len(data.start) - 1))

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I32, I64
-from maplab_py.estimation.linear.assembled import BlockPlaces
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import joint_covariance
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
+from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.states import NODE_NAMES, NODES_PER_VERTEX, States
 from maplab_py.estimation.terms import factor as factor_terms

@@ -20,12 +20,11 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.kernels.visual_arguments import VisualTarget
-from maplab_py.estimation.linear.assembled import BlockPlaces
 from maplab_py.estimation.linear.nested_dissection import has_metis
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.submap_solver import SubmapCholesky
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
+from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky
 from maplab_py.estimation.problem.problem import (
     LARGEST_DAMPED,
     SMALLEST_DAMPED,

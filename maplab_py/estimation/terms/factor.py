@@ -9,8 +9,8 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled, prange
+from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.protocol import FactorTerm
 

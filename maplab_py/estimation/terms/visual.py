@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
 from maplab_py.estimation.kernels import visual_arguments
+from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
-from maplab_py.estimation.linear.assembled import BlockPlaces, BlockSums
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
+from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, BlockSums, SupernodalCholesky
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.loss_values import loss_and_weight
 from maplab_py.estimation.states import NODES_PER_VERTEX, States
 from maplab_py.estimation.terms import visual_structure
 from maplab_py.estimation.terms.cameras import (

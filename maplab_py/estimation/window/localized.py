@@ -15,11 +15,9 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.window.calibration import WindowCalibration
-from maplab_py.estimation.window.map_gate import MAP_GATE_CHI2, contradicted_unless_most
-from maplab_py.estimation.window.map_rule import MapRule
-from maplab_py.estimation.window.map_terms import MapTerms
+from maplab_py.estimation.window.map_terms import MAP_GATE_CHI2, MapTerms, contradicted_unless_most
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
-from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.options import MapRule, WindowOptions
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import se3, so3

@@ -23,6 +23,7 @@ from maplab_py.estimation.kernels.window_arguments import (
 )
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
@@ -279,3 +280,50 @@ def _half_solved(kept: MapElimination) -> tuple[F64, F64]:
     both = np.concatenate([kept.coupling, kept.gradient[:, :, None]], axis=2)
     solved = np.linalg.solve(L, both)
     return solved[:, :, :-1].reshape(-1, solved.shape[2] - 1), solved[:, :, -1].reshape(-1)
+
+
+# Test of associations with a map against the observations of their tracks.
+#
+# A track may leave its point for another one, before or after it was matched with a landmark of the map:
+# then a single observation can be off by hundreds of pixels. The Huber loss bounds the residual of such
+# an observation, but not its Jacobian, which grows without bound near the plane of the camera.
+
+MAP_GATE_CHI2 = 13.8
+"""Largest squared error of an observation of the map in standard deviations (99.9 %).
+
+It is wider than the odometry's gate: an observation that is refused takes the association of a whole track
+with it, and landmarks of the map have errors of their own.
+"""
+
+
+def contradicted(error_px: F64, seen: MapObservations, options: WindowOptions) -> Mask:
+    """Tell which landmarks (A,) have an observation far from where it is expected.
+
+    Args:
+        error_px: Reprojection errors (O,) at predicted poses; infinite where a landmark is not visible.
+        seen: The observations.
+        options: Uncertainty of a predicted place, as for landmarks of the odometry.
+    """
+    if not len(seen):
+        return np.zeros(len(seen.start) - 1, dtype=np.bool_)
+    sigma2 = seen.sigma_px**2 + options.prediction_sigma_px**2
+    far = ~(error_px**2 <= MAP_GATE_CHI2 * sigma2)
+    return np.asarray(np.logical_or.reduceat(far, seen.start[:-1]))
+
+
+def contradicted_unless_most(
+    error_px: F64, seen: MapObservations, options: WindowOptions, *, frame: int | None = None
+) -> Mask:
+    """Tell what `contradicted` does; when most landmarks are, the prediction is wrong and none is.
+
+    Args:
+        error_px: Reprojection errors (O,), see `contradicted`.
+        seen: The observations.
+        options: Uncertainty of a predicted place.
+        frame: The only frame whose observations count; None = all count.
+    """
+    counts: Mask = np.ones(len(seen), dtype=np.bool_) if frame is None else seen.frame == frame
+    result = contradicted(np.where(counts, error_px, 0.0), seen, options)
+    if 2 * np.count_nonzero(result) < len(np.unique(seen.landmark[counts])):
+        return result
+    return np.zeros_like(result)

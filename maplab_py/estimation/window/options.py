@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
+
 from maplab_py.estimation.window.standstill import StandstillSigmas
 from maplab_py.options import Options, option
 
@@ -92,3 +96,14 @@ class WindowOptions(Options, prefix="vio_"):
         return StandstillSigmas(
             self.rest_sigma_m, self.rest_sigma_rad, self.rest_sigma_mps, self.turning_sigma_mps
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class MapRule:
+    """Weights of observations of the map."""
+
+    sigma_px: float = 1.0  # of a keypoint (Paper I)
+    tilt_sigma_rad: float = float(np.radians(0.5))
+    base_sigma_m: float = float(np.sqrt(20.0))  # of T_G_M before anything is observed
+    base_sigma_rad: float = float(np.sqrt(np.radians(90.0)))
+    estimates_landmarks: bool = False  # with the map's covariances; else they are exact

@@ -22,8 +22,7 @@ from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
-from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection
+from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.frame import (
     FrameRows,

@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.kernels.window_arguments import WindowData
-from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import CameraPoses
 
 _NONE = -1
 _MEMORY = 10

@@ -9,7 +9,7 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import WindowPoint
-from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.tracks import Tracks
 

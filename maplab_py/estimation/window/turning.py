@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection
+from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.tracks import Tracks

@@ -19,8 +19,7 @@ from maplab_py.estimation.kernels.window_arguments import (
 )
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
-from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection
+from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3

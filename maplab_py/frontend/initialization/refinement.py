@@ -14,8 +14,7 @@ from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.calibration import WindowCalibration
-from maplab_py.estimation.window.camera_poses import CameraPoses
-from maplab_py.estimation.window.cameras import BackProjection
+from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions

@@ -14,11 +14,9 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.alignment import aligned
 from maplab_py.estimation.window.localized import LocalizedSmoother, composition_jacobian
-from maplab_py.estimation.window.map_gate import MAP_GATE_CHI2, contradicted_unless_most
-from maplab_py.estimation.window.map_rule import MapRule
-from maplab_py.estimation.window.map_terms import MapTerms
+from maplab_py.estimation.window.map_terms import MAP_GATE_CHI2, MapTerms, contradicted_unless_most
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
-from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.options import MapRule, WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.localization.matcher import Answer
 from maplab_py.geometry import se3

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.estimation.window.map_rule import MapRule
+from maplab_py.estimation.window.options import MapRule
 from maplab_py.options import Options, option
 
 MODES = ("vil", "swl", "pose", "odo")

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64, Mask
-from maplab_py.estimation.window.map_gate import contradicted
-from maplab_py.estimation.window.map_terms import MapTerms
+from maplab_py.estimation.window.map_terms import MapTerms, contradicted
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.sensors import Camera

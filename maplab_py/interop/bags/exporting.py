@@ -11,9 +11,8 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.interop.bags import sensor_messages
-from maplab_py.interop.bags.options import BagExportOptions
+from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
 from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
-from maplab_py.interop.bags.reports import BagReport, written_topics
 from maplab_py.interop.ply import parse_ply
 from maplab_py.interop.recordings import bag_layouts, bag_writing
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
@@ -21,8 +20,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_labels, mission_sensor_id
-from maplab_py.vimap.resource_queries import resources_of
+from maplab_py.vimap.queries import mission_labels, mission_sensor_id, resources_of
 
 IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""

@@ -12,8 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F32, F64, I64
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.bags.options import BagImportOptions
-from maplab_py.interop.bags.reports import BagImport
+from maplab_py.interop.bags.options import BagImport, BagImportOptions
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.recordings import bag_files

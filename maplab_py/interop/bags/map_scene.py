@@ -9,8 +9,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.bags.exporting import IMAGES, MessageStream, MissionStreams
-from maplab_py.interop.bags.options import BagExportOptions
-from maplab_py.interop.bags.reports import BagReport, written_topics
+from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
 from maplab_py.interop.bags.sensor_messages import CLOUD, LINES, PATH, MessageMaker
 from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings import bag_writing

@@ -12,8 +12,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.bags.options import PoseToBagOptions
-from maplab_py.interop.bags.reports import BagReport, written_topics
+from maplab_py.interop.bags.options import BagReport, PoseToBagOptions, written_topics
 from maplab_py.interop.recordings import bag_writing
 from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
 from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages

@@ -33,10 +33,9 @@ from maplab_py.vimap.descriptors import (
     type_of_name,
     types_of,
 )
+from maplab_py.vimap.edits import remove_keypoints
 from maplab_py.vimap.ids import from_hex, is_valid
-from maplab_py.vimap.keypoint_removal import remove_keypoints
-from maplab_py.vimap.queries import mission_labels, mission_sensor_id
-from maplab_py.vimap.scale_marks import is_metric
+from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import LandmarkQuality
 

@@ -29,7 +29,7 @@ from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.vimap import VIMap, to_hex_list
-from maplab_py.vimap.scale_marks import is_metric
+from maplab_py.vimap.queries import is_metric
 
 
 def import_colmap(

@@ -23,7 +23,7 @@ from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
 from maplab_py.vimap import MissionSensor, VIMap, from_hex, ragged_rows, random_ids, tables, to_hex
 from maplab_py.vimap.descriptors import no_blocks
-from maplab_py.vimap.scale_marks import KEY
+from maplab_py.vimap.queries import ARBITRARY_SCALE
 
 _PRESENT = tables.FrameField.SIGMA | tables.FrameField.SCALE | tables.FrameField.LANDMARK_ID
 
@@ -215,7 +215,7 @@ def _sensors(
         extrinsics[name] = Extrinsics(name, se3.identity())
         odometry = to_hex(odometry_ids[mission])
         keys = {"id": odometry, "sensor_type": "ODOMETRY_6DOF", "topic": "colmap"}
-        marks = {} if is_metric[mission] else {KEY: True}
+        marks = {} if is_metric[mission] else {ARBITRARY_SCALE: True}
         sensors[odometry] = OtherSensor(odometry, "ODOMETRY_6DOF", {**keys, **marks})
         extrinsics[odometry] = Extrinsics(name, se3.identity())
         sensor_id[mission, MissionSensor.NCAMERA] = from_hex(name)

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.transport import (
     LOOK_EVERY_S,

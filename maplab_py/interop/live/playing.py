@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 from maplab_py.errors import UserError
 from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
 from maplab_py.interop.recordings.bag_layouts import imu_messages

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
+import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,29 +17,32 @@ from maplab_py.array_types import F64
 from maplab_py.cancellation import current_token
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import Pixels, bits_of
-from maplab_py.interop.live.messages import image_data, imu_values
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
 from maplab_py.interop.live.transport import (
     LOOK_EVERY_S,
+    MAX_MESSAGE_BYTES,
     RAISE_RECEIVE_BUFFERS,
     Topic,
     Transport,
     topic_of,
     wait_for_topics,
 )
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.bag_files import imu_sample, message_types
 from maplab_py.interop.recordings.bags import IMAGE_TYPES, IMU_TYPE
+from maplab_py.interop.recordings.images import image_of_message
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.paired_imu import PairedImu
+from maplab_py.interop.recordings.paired_imu import PairedImu, Sample
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
+    ImageData,
     ImuBatch,
     Item,
     PartSpan,
     RecordedSensors,
 )
 from maplab_py.report import counted
+from maplab_py.sensors import Camera
 
 _MAX_REMEMBERED = 1000
 _MAX_NOTED = 20
@@ -419,3 +425,47 @@ def _check_type(transport: Transport, topic: Topic, wanted: Sequence[str]) -> No
             f"{transport.name}: {topic.name} has messages of type {topic.type}, needed is "
             f"{' or '.join(wanted)}: choose another topic; live_topics lists what there is"
         )
+
+
+# Messages as they arrive: decoded with the functions that bags use, damage told as such.
+
+
+def imu_values(data: bytes, *, is_ros_2: bool) -> Sample:
+    """Return [ax ay az gx gy gz] of a serialised sensor_msgs/Imu.
+
+    Raises:
+        MapError: The message is damaged, or a value is not a number.
+    """
+    try:
+        values = imu_sample(data, is_ros_2=is_ros_2)
+    except (struct.error, IndexError) as error:
+        raise MapError("the message is damaged") from error
+    if not all(map(math.isfinite, values)):
+        raise MapError("a value is not a number")
+    return values
+
+
+def image_data(
+    data: bytes, kind: str, camera: Camera, name: str, store: Any, *, is_ros_2: bool
+) -> ImageData:
+    """Return the image of a serialised message.
+
+    Args:
+        data: Message.
+        kind: Its type, one of `IMAGE_TYPES`.
+        camera: Camera that took it.
+        name: What messages call it.
+        store: Definitions of messages.
+        is_ros_2: CDR, else ROS 1.
+
+    Raises:
+        MapError: The message is damaged.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise MapError(f"{name}: the message has {len(data):,} bytes: refused")
+    decode = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
+    try:
+        message = decode(data, kind)
+    except Exception as error:  # the parser's own, of any type
+        raise MapError(f"{name}: the message is damaged: check its publisher") from error
+    return image_of_message(message, name, camera)

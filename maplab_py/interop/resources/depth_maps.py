@@ -16,7 +16,7 @@ from maplab_py.array_types import F32
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.interop.resources import matching
-from maplab_py.interop.resources.reports import ImportedResources
+from maplab_py.interop.resources.matching import ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera

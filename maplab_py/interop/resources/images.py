@@ -13,7 +13,7 @@ from maplab_py.interop.recordings.folders import FolderRecording, image_root
 from maplab_py.interop.recordings.images import EncodedImage
 from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors
 from maplab_py.interop.resources import matching
-from maplab_py.interop.resources.reports import ExportedImages, ImportedResources
+from maplab_py.interop.resources.matching import ExportedImages, ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.progress import SILENT, Progress

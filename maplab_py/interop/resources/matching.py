@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import UserError
-from maplab_py.geometry.association import nearest_rows
+from maplab_py.geometry.interpolation import nearest_rows
+from maplab_py.report import Report
 from maplab_py.sensors import CameraRig
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_id
 
@@ -80,3 +82,27 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...], flag: str) -> tuple[I
     files.sort(key=lambda path: (int(path.stem), path.name))
     times = np.array([int(path.stem) for path in files], dtype=np.uint64).astype(np.int64)
     return times, files
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportedResources(Report):
+    """Files that became resources of a mission; they are written when the map is saved."""
+
+    mission: str
+    resource_types: tuple[str, ...]
+    files_in_folder: int
+    attached: int
+    frames_that_had_some: int = dataclasses.field(
+        default=0, metadata={"title": "frames with a resource before"}
+    )
+    frames_without_file: int = 0
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedImages(Report):
+    """Images that were written as an EuRoC folder."""
+
+    folder: Path
+    images: int
+    cameras: int

@@ -13,8 +13,7 @@ from maplab_py.array_types import I64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import EmptyCloud, PlyCloud, encode_ply, parse_ply
-from maplab_py.interop.resources.matching import stamped_files
-from maplab_py.interop.resources.reports import ImportedResources
+from maplab_py.interop.resources.matching import ImportedResources, stamped_files
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.sensors import CameraRig

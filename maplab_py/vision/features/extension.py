@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from maplab_py.array_types import F64, U8
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, type_of_name
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 
 _MAX_NUMBERS = 4096
 

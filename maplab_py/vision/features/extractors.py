@@ -13,7 +13,7 @@ import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.vimap.descriptors import FeatureType
-from maplab_py.vision.descriptor_kind import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures
 
 KINDS = {

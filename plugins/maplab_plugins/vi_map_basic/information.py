@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.console.session.undo import UndoOptions
+from maplab_py.console.session.maps import UndoOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, Report, UserError, command
 from maplab_py.vimap.ids import to_hex_list
 
@@ -243,8 +243,8 @@ def memory(context: CommandContext, *, undo: UndoOptions = UndoOptions()) -> Mem
 
     A limit that is given holds for the rest of the session.
     """
+    from maplab_py.console.session.maps import bounded, former_values
     from maplab_py.console.session.settings import Layer
-    from maplab_py.console.session.undo import bounded, former_values
     from maplab_py.memory import available_bytes, resident_bytes
     from maplab_py.storage.cache.column_file import mapped_bytes
     from maplab_py.storage.cache.map_cache import MapCache

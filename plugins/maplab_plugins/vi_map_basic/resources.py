@@ -195,7 +195,7 @@ def remove_resources(
         resource_type: Number or name of the type, as `resource_statistics` lists them.
     """
     from maplab_py.storage.resources.types import resource_type_of
-    from maplab_py.vimap.resource_queries import resources_of, without_resources
+    from maplab_py.vimap.queries import resources_of, without_resources
 
     kind = resource_type_of(resource_type)
     removed = resources_of(context.vi_map, (kind.number,), missions.rows(context.vi_map))

@@ -45,7 +45,7 @@ from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex, to_hex
-from maplab_py.vimap.resource_queries import without_resources
+from maplab_py.vimap.queries import without_resources
 from tests.simulation.small import simulated
 
 ROOM = WorldOptions(landmarks_per_room=200)

@@ -25,8 +25,7 @@ from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionO
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import cut_by_time
 from maplab_py.vimap.vertex_removal import remove_vertices
-from maplab_py.vision.descriptor_kind import DescriptorKind
-from maplab_py.vision.descriptors import pack_words
+from maplab_py.vision.descriptors import DescriptorKind, pack_words
 from maplab_py.vision.index import DescriptorSet, MatchRule
 from maplab_py.vision.multi_index import InvertedMultiIndex
 from maplab_py.vision.projection import learn_projection

@@ -9,13 +9,13 @@ import numba
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.vi_optimization import linear_solver
 from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MaplabError, UserError
 from maplab_py.estimation.linear import supernodal_solver
-from maplab_py.estimation.problem import solver_choice
 from maplab_py.estimation.problem.iterative import IterativeProblem
 from maplab_py.memory import NotEnoughMemory
 from maplab_py.progress import SilentProgress
@@ -242,8 +242,8 @@ def test_conjugate_gradients_on_request_give_the_same_map() -> None:
 def test_many_pairs_of_observations_decide_without_an_analysis(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(solver_choice, "ITERATIVE_FROM", 1.0)
-    monkeypatch.setattr(solver_choice, "analyse", None)
+    monkeypatch.setattr(linear_solver, "ITERATIVE_FROM", 1.0)
+    monkeypatch.setattr(linear_solver, "analyse", None)
     is_iterative, (line,) = built()
     assert is_iterative
     assert "would take as long as at least" in line
@@ -255,13 +255,13 @@ def test_between_the_bounds_the_graph_of_the_vertices_decides(
     map_problem = build(sessions(), VIOptimizationOptions())
     visual = map_problem.problem.visual
     assert visual is not None
-    bound = solver_choice.predict_costs(visual)
+    bound = linear_solver.predict_costs(visual)
     assert bound.is_bound
-    monkeypatch.setattr(solver_choice, "ITERATIVE_FROM", 0.999 * bound.break_even)
-    exact = solver_choice.predict_costs(visual)
+    monkeypatch.setattr(linear_solver, "ITERATIVE_FROM", 0.999 * bound.break_even)
+    exact = linear_solver.predict_costs(visual)
     assert not exact.is_bound
     assert 0.0 < exact.break_even <= bound.break_even
-    monkeypatch.setattr(solver_choice, "_FLOPS_PER_S", 1e3)  # factorisations take for ever
+    monkeypatch.setattr(linear_solver, "_FLOPS_PER_S", 1e3)  # factorisations take for ever
     is_iterative, (line,) = built()
     assert is_iterative
     assert "would take as long as at least" not in line

@@ -14,8 +14,13 @@ from hypothesis import strategies as st
 
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.flag_types import FLOAT, expand_path, flag_type, format_value
-from maplab_py.console.commands.flags import Flag, parse_words
-from maplab_py.console.commands.maplab_flags import explanation, former_flags, parse_table
+from maplab_py.console.commands.flags import (
+    Flag,
+    explanation,
+    former_flags,
+    parse_table,
+    parse_words,
+)
 from maplab_py.errors import FlagError, UserError
 from maplab_py.options import option
 from maplab_py.plugin import CommandContext, command

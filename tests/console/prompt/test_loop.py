@@ -15,8 +15,7 @@ from prompt_toolkit.history import InMemoryHistory
 from prompt_toolkit.input import create_pipe_input
 from prompt_toolkit.output import DummyOutput
 
-from maplab_py.console.prompt.greeting import greeting
-from maplab_py.console.prompt.loop import open_history, run_prompt
+from maplab_py.console.prompt.loop import greeting, open_history, run_prompt
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.terminal.drawing import drawn, folded
 from maplab_py.console.terminal.layout import Block, Pairs, Paragraph, blocks_of
-from maplab_py.console.terminal.naming import text_with_names, with_names
 from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.console.terminal.render import text_with_names, with_names
 from maplab_py.progress import Progress, SilentProgress
 from maplab_py.report import Report
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from maplab_py.console.commands.flagfile import read_flagfile
+from maplab_py.console.commands.flags import read_flagfile
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.prompt.completion import complete
 from maplab_py.console.scripts.runner import Runner

@@ -11,10 +11,16 @@ import pytest
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
-from maplab_py.console.session.maps import MAX_UNDO, MapEntry, MapManager, MapsState, merge_states
+from maplab_py.console.session.maps import (
+    MAX_UNDO,
+    MapEntry,
+    MapManager,
+    MapsState,
+    UndoOptions,
+    merge_states,
+)
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.session.undo import UndoOptions
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import FlagError, UserError
 from maplab_py.storage.native import load_map, save_map

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from maplab_py.console.commands.flagfile import DEPTH_LIMIT, read_flagfile
+from maplab_py.console.commands.flags import DEPTH_LIMIT, read_flagfile
 from maplab_py.console.session.maps import MapManager
-from maplab_py.console.session.session import Session
+from maplab_py.console.session.session import Session, Watchers
 from maplab_py.console.session.settings import Layer
-from maplab_py.console.session.watchers import Watchers
 from maplab_py.errors import EstimationError, FlagError, MaplabError, UserError
 from maplab_py.report import Message
 from maplab_py.vimap import VIMap

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from maplab_py.console.terminal.drawing import GAP, drawn, fitted
 from maplab_py.console.terminal.layout import Pairs, Table, blocks_of, format_column
-from maplab_py.console.terminal.naming import names_by_id, text_with_names, with_names
+from maplab_py.console.terminal.render import names_by_id, text_with_names, with_names
 from maplab_py.report import Message, Report, counted
 
 WORDS = st.text("abcdefgh.0123456789", min_size=1, max_size=12)

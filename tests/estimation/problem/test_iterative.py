@@ -13,10 +13,13 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
+from maplab_py.estimation.problem.iterative import (
+    IterativeOptions,
+    IterativeProblem,
+    ReducedOperator,
+)
 from maplab_py.estimation.problem.marginals import Marginals
 from maplab_py.estimation.problem.problem import Problem
-from maplab_py.estimation.problem.reduced_operator import ReducedOperator
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.states import NODES_PER_VERTEX, POSITION, States, pose_nodes
 from maplab_py.estimation.symbolic.sources import relative_pose

@@ -20,7 +20,7 @@ from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.terms.prior import PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.estimation.window.calibration import WindowCalibration
-from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.inertial import InertialChain

@@ -12,9 +12,8 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import DenseSystem
 from maplab_py.estimation.window.alignment import aligned
 from maplab_py.estimation.window.localized import LocalizedSmoother
-from maplab_py.estimation.window.map_rule import MapRule
 from maplab_py.estimation.window.map_tracks import MapMatches
-from maplab_py.estimation.window.options import WindowOptions
+from maplab_py.estimation.window.options import MapRule, WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import se3, so3
 from tests.estimation.window.recordings import SimulatedTracks, scenario, simulated

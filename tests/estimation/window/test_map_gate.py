@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.estimation.window.map_gate import contradicted, contradicted_unless_most
+from maplab_py.estimation.window.map_terms import contradicted, contradicted_unless_most
 from maplab_py.estimation.window.options import WindowOptions
 from tests.estimation.window.test_map_terms import LANDMARKS, window
 

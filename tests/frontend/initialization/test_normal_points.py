@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64
-from maplab_py.estimation.window.camera_poses import CameraPoses
+from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.normal_points import (
     Landmarks,

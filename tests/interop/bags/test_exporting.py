@@ -28,8 +28,8 @@ from maplab_py.interop.recordings.bag_writing import (
 )
 from maplab_py.interop.recordings.bag_writing import write_bag as write_messages_as_bag
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SilentProgress

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.gps_bags import NAV_SAT_FIX, read_fixes
+from maplab_py.interop.gps import NAV_SAT_FIX, read_fixes
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bag_writing import (

@@ -11,8 +11,8 @@ import pytest
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.interop.calibration_import import import_calibration, read_calibration
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.summary import summarise
 from maplab_py.sensors import Distortion, Projection
 from tests.interop.recordings.written import make_content, write_bag, write_folder

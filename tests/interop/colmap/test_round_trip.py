@@ -27,7 +27,7 @@ from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.scale_marks import is_metric
+from maplab_py.vimap.queries import is_metric
 from tests.interop.small_map import make_map
 from tests.support.data import shared_data
 from tests.support.scene import Scene

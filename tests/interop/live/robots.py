@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, RecordedSensors
+from maplab_py.interop.recordings.reader_choice import open_recording
 from tests.interop.live.environments import in_network_namespace, python_of
 from tests.interop.recordings.written import write_calibration
 

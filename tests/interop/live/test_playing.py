@@ -15,15 +15,14 @@ from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.live.bag_recording import RecordingOptions, record_bag
-from maplab_py.interop.live.listing import list_topics
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import list_topics, open_transport
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.playing import PlayingOptions, play_recording
 from maplab_py.interop.live.publishing import Estimate, PosePublisher, ros_covariances
 from maplab_py.interop.live.transport import wait_for_topics
 from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from tests.interop.live.support import (
     IMU,

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.live import receiving
-from maplab_py.interop.live.messages import image_data, imu_values
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.receiving import Inbox, Message, SetMatcher, TopicCounts
+from maplab_py.interop.live.source import image_data, imu_values
 from maplab_py.interop.live.transport import Topic
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions

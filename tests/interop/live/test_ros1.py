@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.ros1 import (
     ConnectionProblem,

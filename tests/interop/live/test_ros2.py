@@ -11,7 +11,7 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.interop.live import ros2
-from maplab_py.interop.live.opening import open_transport
+from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.receiving import TopicCounts
 from maplab_py.interop.live.ros2 import dds_type_name, ros_type_name

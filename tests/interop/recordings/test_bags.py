@@ -14,9 +14,9 @@ import pytest
 
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.interop.calibration_import import import_calibration
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import FrameSet, RecordedSensors
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (

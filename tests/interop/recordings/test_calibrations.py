@@ -18,8 +18,8 @@ from maplab_py.interop.calibration_import import (
 )
 from maplab_py.interop.calibrations.kalibr import upper_triangular_and_rotation
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.sensors import Camera, Distortion, Imu, ImuIntrinsics, Projection
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from tests.interop.recordings.written import make_content, write_calibration, write_folder

@@ -14,8 +14,8 @@ import pytest
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.calibration_import import import_calibration
 from maplab_py.interop.recordings.clocks import ClockFilter, ClockRestart, parts_of
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (

@@ -14,9 +14,9 @@ import pytest
 
 from maplab_py.errors import FlagError, MapError, MaplabError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import CameraImage, FrameSet, ImuBatch
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from maplab_py.sensors import Distortion

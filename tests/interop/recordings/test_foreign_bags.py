@@ -13,8 +13,8 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.listing import bag_info
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import assert_content, make_content, write_folder

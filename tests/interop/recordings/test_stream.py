@@ -15,7 +15,6 @@ from maplab_py.array_types import I64
 from maplab_py.errors import FlagError, MapError
 from maplab_py.interop.recordings.images import RawImage, camera_bits
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.protocol import (
     CameraImage,
@@ -24,6 +23,7 @@ from maplab_py.interop.recordings.protocol import (
     ImuBatch,
     TrackedFrameSet,
 )
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream, Synchroniser
 from maplab_py.interop.recordings.summary import summarise
 from maplab_py.sensors import Camera, Distortion, Projection

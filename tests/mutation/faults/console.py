@@ -86,7 +86,7 @@ CONSOLE = (
     ),
     Fault(
         "included_flag_file_beside_the_shell",
-        "maplab_py/console/commands/flagfile.py",
+        "maplab_py/console/commands/flags.py",
         "    return path if path.is_absolute() else including.parent / path\n",
         "    return path\n",
         _FLAGS,

@@ -9,10 +9,10 @@ import pytest
 
 from maplab_py.array_types import F64, I64
 from maplab_py.geometry import se3, so3
-from maplab_py.geometry.association import nearest_rows
-from maplab_py.interop.recordings.opening import open_recording
+from maplab_py.geometry.interpolation import nearest_rows
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import FrameSet, RecordedSensors
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.sensors.projection import back_project

@@ -1,18 +1,61 @@
-"""The topics of running robots as a table."""
+"""Connecting to the topics of a robot."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
+from collections.abc import Iterator
 from functools import partial
 
-from maplab_py.errors import FlagError
-from maplab_py.interop.live.opening import open_transport
-from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.errors import FlagError, UserError
+from maplab_py.interop.live.options import TRANSPORTS, NetworkOptions
 from maplab_py.interop.live.transport import LOOK_EVERY_S, Topic, Transport
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
+
+
+@contextlib.contextmanager
+def open_transport(
+    kind: str, network: NetworkOptions, *, is_server: bool = False
+) -> Iterator[Transport]:
+    """Connect to ROS 2, ROS 1 or Foxglove, as one of `TRANSPORTS` says.
+
+    Args:
+        kind: One of `TRANSPORTS`.
+        network: Where.
+        is_server: Be the server of Foxglove, in place of its client.
+
+    Raises:
+        UserError: The transport is unknown, a library is missing, or nobody answers.
+    """
+    if kind not in TRANSPORTS:
+        raise UserError(f"transport {kind}: wants one of {', '.join(TRANSPORTS)}")
+    transport: Transport
+    if kind == "ros2":
+        from maplab_py.interop.live.ros2 import Ros2
+
+        transport = Ros2(network)
+    elif kind == "ros1":
+        from maplab_py.interop.live.ros1 import Ros1
+
+        transport = Ros1(network)
+    elif is_server:
+        from maplab_py.interop.live.foxglove import FoxgloveServer
+
+        transport = FoxgloveServer(network)
+    else:
+        from maplab_py.interop.live.foxglove import FoxgloveClient
+
+        transport = FoxgloveClient(network)
+    try:
+        yield transport
+    finally:
+        transport.close()
+
+
+# The topics of running robots as a table.
 
 
 @dataclasses.dataclass(frozen=True)
