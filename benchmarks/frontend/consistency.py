@@ -68,8 +68,7 @@ def _nees(
 
 
 VARIANTS: dict[str, WindowOptions] = {
-    "first estimates kept": WindowOptions(),
-    "first estimates not kept": WindowOptions(keep_first_estimates=False),
+    "as it is": WindowOptions(),
     "policy of the thesis": WindowOptions(landmark_policy="thesis"),
 }
 

@@ -186,11 +186,7 @@ def run(vi_map: VIMap, truth: Trajectory, variant: str, seed: int, end_s: float)
 
 VARIANTS = {
     "as it is": WindowOptions(),
-    "first estimates not kept": WindowOptions(keep_first_estimates=False),
     "12 keyframes": WindowOptions(num_keyframes=12),
-    "12 keyframes, first estimates not kept": WindowOptions(
-        num_keyframes=12, keep_first_estimates=False
-    ),
 }
 """Choices that are compared."""
 

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.vi_optimization.calibration_choice import (
@@ -20,9 +19,8 @@ from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimiza
 from maplab_py.algorithms.vi_optimization.report_building import make_report
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.algorithms.vi_optimization.solution import apply_states
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.estimation.problem.solver import AfterStep, SolverOptions, optimize_states
-from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
 from maplab_py.progress import SILENT, Progress, SilentProgress
 from maplab_py.vimap import VIMap
@@ -180,7 +178,6 @@ def solver_options(options: SolverFlags) -> SolverOptions:
         function_tolerance=options.function_tolerance,
         gradient_tolerance=options.gradient_tolerance,
         parameter_tolerance=options.parameter_tolerance,
-        schedule=Schedule(options.trust_region_schedule),
         max_uphill_steps=(
             options.max_consecutive_nonmonotonic_steps if options.use_nonmonotonic_steps else 0
         ),

@@ -174,9 +174,6 @@ class SolverFlags(Options):
     submap_rounds: int = option(0, ge=0)
     """Largest number of rounds over all submaps with --ba_submaps, each of which is an iteration of the joint
     problem; 0 = --ba_num_iterations."""
-    trust_region_schedule: str = option("step_quality", choices=("step_quality", "ceres"))
-    """Update of the trust region radius: as in Ceres, or the same with a larger increase after steps of high
-    quality"""
     use_nonmonotonic_steps: bool = False
     """Accept steps that increase the cost temporarily"""
     max_consecutive_nonmonotonic_steps: int = 5

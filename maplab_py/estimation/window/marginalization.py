@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import Mask
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.window.factors import Part
 from maplab_py.estimation.window.prior import WindowPrior, schur_complement
@@ -20,7 +19,6 @@ def marginalized(
     states: WindowStates,
     *,
     frame: int | None,
-    keep_first_estimates: bool,
 ) -> WindowPrior:
     """Return the prior that takes the place of all landmarks of a problem and, optionally, a frame.
 
@@ -33,7 +31,6 @@ def marginalized(
         prior: The prior of the problem.
         states: Where to linearise what is not fixed.
         frame: Which frame is removed; None = only landmarks.
-        keep_first_estimates: Whether linearisation points are fixed.
     """
     linear = problem.undamped(states, _factors_of(frame))
     lower = linear.system.matrix
@@ -47,9 +44,8 @@ def marginalized(
         information, gradient = schur_complement(information, gradient, rows)
         x0, fixed = x0.without_frame(frame), np.delete(fixed, frame)
     result = WindowPrior.of_information(information, gradient, x0, fixed)
-    is_fixed: Mask = result.touched if keep_first_estimates else np.zeros_like(fixed)
-    is_base_fixed = keep_first_estimates and (is_base_fixed or result.touches_base)
-    return dataclasses.replace(result, is_fixed=is_fixed, is_base_fixed=is_base_fixed)
+    is_base_fixed = is_base_fixed or result.touches_base
+    return dataclasses.replace(result, is_fixed=result.touched, is_base_fixed=is_base_fixed)
 
 
 def _factors_of(frame: int | None) -> Part:

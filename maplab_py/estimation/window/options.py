@@ -51,8 +51,6 @@ class WindowOptions(Options, prefix="vio_"):
     """Largest number of iterations of an update."""
     function_tolerance: float = 1e-3
     """Relative decrease of the cost that ends an update."""
-    keep_first_estimates: bool = True
-    """Evaluate Jacobians of frames in the prior where they entered it."""
     max_joined_s: float = 2.0
     """Longest inertial interval that is joined when a frame is dropped."""
     rest_sigma_m: float = 1e-3

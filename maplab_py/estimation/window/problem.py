@@ -54,7 +54,6 @@ class WindowProblem:
         prior: WindowPrior,
         *,
         loss: Loss = Loss.HUBER,
-        keep_first_estimates: bool = True,
         map_terms: MapTerms | None = None,
         times: FrameTimes | None = None,
     ) -> None:
@@ -67,14 +66,12 @@ class WindowProblem:
             factors: Of the frames.
             prior: From what has left the window.
             loss: Robust loss of reprojection errors.
-            keep_first_estimates: Evaluate Jacobians of frames in the prior where they entered it.
             map_terms: Observations of a map, for states with a base frame; None = there are none.
             times: When images were taken; None = all rows at the times of the frames.
         """
         self._kernels, self._data, self._calibration = kernels, data, calibration
         self._times = times
         self._factors, self._prior, self._loss = factors, prior, loss
-        self._keeps_first_estimates = keep_first_estimates
         self._map_terms = map_terms
         self._latest: WindowLinearization | None = None
 
@@ -221,7 +218,7 @@ class WindowProblem:
         kept = Elimination.empty(landmarks, frames, count)
         at, is_elsewhere = states, np.zeros(frames, dtype=np.bool_)
         fixed = self._prior.is_fixed
-        if self._keeps_first_estimates and (fixed.any() or self._prior.is_base_fixed):
+        if fixed.any() or self._prior.is_base_fixed:
             at, is_elsewhere = self._prior.linearization_point(states), fixed
         rule = WindowRule(int(self._loss), float(damping), at.T_M_I, is_elsewhere)
         rho = self._kernels.eliminate(self._data, self._point(states), rule, system, kept)

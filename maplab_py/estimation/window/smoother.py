@@ -325,8 +325,7 @@ class FixedLagSmoother:
         )
         problem = WindowProblem(
             self._kernels, data, self.calibration, factors, self._prior,
-            keep_first_estimates=self.options.keep_first_estimates, map_terms=map_terms,
-            times=self._times(),
+            map_terms=map_terms, times=self._times(),
         )  # fmt: skip
         self._states = dataclasses.replace(self._states, h=self.tracks.h[rows])
         return problem, rows, order
@@ -459,10 +458,7 @@ class FixedLagSmoother:
     def _marginalize(self, rows: I64, frame: int | None, map_terms: MapTerms | None = None) -> None:
         """Put all that landmarks (rows) and a frame say about other states into the prior."""
         problem, _, _ = self._problem(rows, map_terms)
-        keeps = self.options.keep_first_estimates
-        self._prior = marginalized(
-            problem, self._prior, self._states, frame=frame, keep_first_estimates=keeps
-        )
+        self._prior = marginalized(problem, self._prior, self._states, frame=frame)
 
     def _release(self, frame: int) -> None:
         self._released.append(self._nav_state(frame))

@@ -26,21 +26,14 @@ from maplab_py.vimap.tables import AbsolutePoses
 from tests.support.scene import Scene, corrupted
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"trust_region_schedule": "ceres"},
-        {"use_nonmonotonic_steps": True},
-        {"trust_region_schedule": "ceres", "use_nonmonotonic_steps": True},
-    ],
-)
-def test_every_way_to_step_reaches_the_same_minimum(settings: dict[str, Any]) -> None:
+def test_steps_that_may_go_uphill_reach_the_same_minimum() -> None:
     rng = np.random.default_rng(4)
     true = Scene(vertices=10, landmarks=150, noise=1.0).make()
     disturbed = corrupted(true, rng, position_m=0.05, quaternion=0.01, landmark_m=0.05)
     options = VIOptimizationOptions(loss="none", num_iterations=60, function_tolerance=1e-12)
     _, wanted = optimize(disturbed, options)
-    _, found = optimize(disturbed, dataclasses.replace(options, **settings))
+    uphill = dataclasses.replace(options, use_nonmonotonic_steps=True)
+    _, found = optimize(disturbed, uphill)
     assert found.cost_after == pytest.approx(wanted.cost_after, rel=1e-8)
 
 

@@ -23,12 +23,10 @@ def tracks() -> SimulatedTracks:
     return simulated(scenario(duration_s=2.0, keypoints=30))
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["kept", "not kept"])
-def smoother(tracks: SimulatedTracks, request: pytest.FixtureRequest) -> FixedLagSmoother:
+@pytest.fixture(scope="module")
+def smoother(tracks: SimulatedTracks) -> FixedLagSmoother:
     """Return a smoother after some marginalisations."""
-    options = WindowOptions(
-        num_keyframes=3, num_recent_frames=2, keep_first_estimates=request.param
-    )
+    options = WindowOptions(num_keyframes=3, num_recent_frames=2)
     result = FixedLagSmoother(tracks.cameras, tracks.T_I_C, tracks.imu, options)
     result.start(tracks.frames[0], tracks.start_state(SIGMA, np.random.default_rng(1)))
     for frame in tracks.frames[1:16]:
@@ -106,9 +104,6 @@ def _diagonals(square: F64) -> F64:
 
 def test_fixed_frames_keep_their_jacobians(smoother: FixedLagSmoother) -> None:
     """The second derivatives do not change when frames that were marginalised upon move."""
-    if not smoother.options.keep_first_estimates:
-        assert not smoother.prior.is_fixed.any()
-        return
     problem, states = at_first_estimates(smoother)
     fixed = np.repeat(smoother.prior.is_fixed, 15)
     move = np.where(fixed, 1e-3, 0.0)
