@@ -11,7 +11,6 @@ from maplab_py.array_types import F64, I64
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern, joint_covariance
 from maplab_py.estimation.linear.protocol import FactorStatistics
-from maplab_py.estimation.linear.quotient_graph import QuotientGraph
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 
 
@@ -100,4 +99,3 @@ def compile_kernels() -> None:
     matrix.clear()
     matrix.add_to_diagonal(np.ones((1, 3)))
     matrix.project(np.ones(1, dtype=np.bool_), np.eye(3)[None], np.ones(1))
-    QuotientGraph.without_groups(BlockPattern(node, node, 1, 3)).adjacency()

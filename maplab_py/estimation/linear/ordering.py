@@ -12,7 +12,6 @@ from enum import Enum
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.compilation import compiled
 from maplab_py.errors import FlagError
 from maplab_py.estimation.linear.nested_dissection import (
     dissect_by_metis,
@@ -27,30 +26,11 @@ from maplab_py.estimation.linear.quotient_graph import QuotientGraph, indistingu
 # INCOMPLETE factorisation that drops every off-diagonal entry makes it hand out the order without
 # paying for the fill of a factorisation whose numbers nobody needs.
 
-_SMALL = 2000
-"""Groups up to which neighbourhoods as rows of bits cost less than SuperLU's detour."""
-
 
 def minimum_degree(pattern: BlockPattern) -> I64:
     """Return the order (num_nodes,): entry k is the node that is eliminated as number k."""
     graph = QuotientGraph.of(pattern)
     return graph.order_of_nodes(minimum_degree_of_groups(graph))
-
-
-def exact_minimum_degree(pattern: BlockPattern) -> I64:
-    """Return the order (num_nodes,) of exact minimum degree; see `exact_minimum_degree_of_groups`."""
-    graph = QuotientGraph.without_groups(pattern)
-    return graph.order_of_nodes(exact_minimum_degree_of_groups(graph))
-
-
-def exact_minimum_degree_of_groups(graph: QuotientGraph) -> I64:
-    """Return the order (groups,) of exact minimum degree; of many groups, that of SuperLU.
-
-    For graphs that are solved in a few iterations: a tenth of the time where groups are few.
-    """
-    if len(graph) > _SMALL:
-        return minimum_degree_of_groups(graph)
-    return np.asarray(_eliminate(graph.rows, graph.cols, len(graph)), dtype=np.int64)
 
 
 def minimum_degree_of_groups(graph: QuotientGraph) -> I64:
@@ -77,64 +57,10 @@ def minimum_degree_of_groups(graph: QuotientGraph) -> I64:
     return np.argsort(factors.perm_c).astype(np.int64)
 
 
-@compiled()
-def _eliminate(rows, cols, num_nodes):  # type: ignore[no-untyped-def]
-    """Eliminate the node of fewest neighbours again and again, the first of equal ones.
-
-    The neighbours of each node are bits of a row.
-    """
-    words = (num_nodes + 63) // 64
-    bits = np.zeros((num_nodes, words), np.uint64)
-    bit = np.uint64(1)
-    for block in range(len(rows)):
-        row, col = rows[block], cols[block]
-        if row != col:
-            bits[row, col >> 6] |= bit << np.uint64(col & 63)
-            bits[col, row >> 6] |= bit << np.uint64(row & 63)
-    degree = np.empty(num_nodes, np.int64)
-    for node in range(num_nodes):
-        degree[node] = _count(bits[node])
-    order = np.empty(num_nodes, np.int64)
-    for place in range(num_nodes):
-        best = np.argmin(degree)
-        order[place] = best
-        degree[best] = num_nodes + 1
-        for word in range(words):
-            left = bits[best, word]
-            while left != 0:
-                lowest = left & (~left + bit)
-                node = word * 64 + _count_word(lowest - bit)
-                left ^= lowest
-                for k in range(words):
-                    bits[node, k] |= bits[best, k]
-                bits[node, node >> 6] &= ~(bit << np.uint64(node & 63))
-                bits[node, best >> 6] &= ~(bit << np.uint64(best & 63))
-                degree[node] = _count(bits[node])
-    return order
-
-
-@compiled(forceinline=True)
-def _count_word(x):  # type: ignore[no-untyped-def]
-    """Return how many bits of a word are set."""
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@compiled(forceinline=True)
-def _count(row):  # type: ignore[no-untyped-def]
-    total = 0
-    for word in row:
-        total += _count_word(word)
-    return total
-
-
 __all__ = [
     "AUTOMATIC",
     "Ordering",
     "OrderingKind",
-    "exact_minimum_degree",
     "indistinguishable_nodes",
     "minimum_degree",
 ]
@@ -159,13 +85,10 @@ class Ordering:
         kind: Algorithm; AUTO takes the order of fewer predicted operations.
         position_m: Position (num_nodes, 3) of every node, not-a-number = none: nested dissection cuts
             there where METIS is not installed.
-        has_few_steps: Whether few factorisations follow: exact minimum degree, and no search for
-            indistinguishable nodes, take less time where nodes are few.
     """
 
     kind: OrderingKind = OrderingKind.AUTO
     position_m: F64 | None = None
-    has_few_steps: bool = False
 
     def __call__(self, pattern: BlockPattern) -> I64:
         """Return the order (num_nodes,): entry k is the node that is eliminated as number k.
@@ -173,16 +96,14 @@ class Ordering:
         Raises:
             FlagError: Nested dissection is asked for, and neither METIS nor positions are there.
         """
-        make = QuotientGraph.without_groups if self.has_few_steps else QuotientGraph.of
-        graph = make(pattern)
+        graph = QuotientGraph.of(pattern)
         return graph.order_of_nodes(self._order(graph, pattern.node_size))
 
     def _order(self, graph: QuotientGraph, node_size: int) -> I64:
         """Return the order (groups,)."""
         if self.kind is OrderingKind.NESTED_DISSECTION:
             return self._nested_dissection(graph)
-        minimum = exact_minimum_degree_of_groups if self.has_few_steps else minimum_degree_of_groups
-        first = minimum(graph)
+        first = minimum_degree_of_groups(graph)
         if self.kind is OrderingKind.MINIMUM_DEGREE or not self._can_dissect:
             return first
         work = graph.work(first, node_size)

@@ -41,16 +41,6 @@ class QuotientGraph:
         size = np.bincount(group, minlength=count).astype(np.int64)
         return cls(group, size, key // max(count, 1), key % max(count, 1))
 
-    @classmethod
-    def without_groups(cls, pattern: BlockPattern) -> QuotientGraph:
-        """Make every node of a pattern a group."""
-        n = pattern.num_nodes
-        off_diagonal = pattern.rows != pattern.cols
-        rows = pattern.rows[off_diagonal].astype(np.int64)
-        key = sorted_distinct(rows * n + pattern.cols[off_diagonal])
-        size = np.ones(n, dtype=np.int64)
-        return cls(np.arange(n), size, key // max(n, 1), key % max(n, 1))
-
     def __len__(self) -> int:
         return len(self.size)
 

@@ -120,7 +120,7 @@ class PoseGraphProblem:
             np.concatenate([node[kept].min(axis=1), nodes]),
             size,
             6,
-            ordering=Ordering(ordering, has_few_steps=True),
+            ordering=Ordering(ordering),
         )
         self._has_second_order = False
         self._linear: tuple[F64, PoseLinearization] | None = None

@@ -61,6 +61,14 @@ def _sessions_on_a_loop(sessions: int, keyframes: int) -> tuple[BlockPattern, np
     return BlockPattern.checked(rows, cols, 5 * len(along_m), 3), np.repeat(circle, 5, axis=0)
 
 
+def _without_groups(pattern: BlockPattern) -> QuotientGraph:
+    """Make every node of a pattern a group."""
+    n = pattern.num_nodes
+    off_diagonal = pattern.rows != pattern.cols
+    key = np.unique(pattern.rows[off_diagonal].astype(np.int64) * n + pattern.cols[off_diagonal])
+    return QuotientGraph(np.arange(n), np.ones(n, dtype=np.int64), key // n, key % n)
+
+
 def _dense_columns(pattern: BlockPattern, order: np.ndarray) -> np.ndarray:
     """Return the nodes below the diagonal of each factor column, by dense elimination."""
     n = pattern.num_nodes
@@ -83,15 +91,14 @@ def test_orders_are_permutations(
     monkeypatch.setattr(ordering, "_WORTH_ANOTHER", 0.0)
     pattern = _pattern(name)
     position_m = np.random.default_rng(1).normal(size=(pattern.num_nodes, 3))
-    for has_few_steps in (False, True):
-        order = Ordering(kind, position_m, has_few_steps)(pattern)
-        np.testing.assert_array_equal(np.sort(order), np.arange(pattern.num_nodes))
+    order = Ordering(kind, position_m)(pattern)
+    np.testing.assert_array_equal(np.sort(order), np.arange(pattern.num_nodes))
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_predicted_work_is_that_of_a_dense_elimination(name: str) -> None:
     pattern = _pattern(name)
-    graph = QuotientGraph.without_groups(pattern)
+    graph = _without_groups(pattern)
     order = np.random.default_rng(5).permutation(pattern.num_nodes)
     below = 3.0 * _dense_columns(pattern, order)
     assert graph.work(order, 3) == pytest.approx(np.sum(9.0 + 9.0 * below + 3.0 * below**2))
@@ -99,7 +106,7 @@ def test_predicted_work_is_that_of_a_dense_elimination(name: str) -> None:
 
 def test_work_of_groups_is_that_of_their_nodes() -> None:
     pattern, _ = _sessions_on_a_loop(2, 40)
-    graph, single = QuotientGraph.of(pattern), QuotientGraph.without_groups(pattern)
+    graph, single = QuotientGraph.of(pattern), _without_groups(pattern)
     assert len(graph) < len(single)
     order = minimum_degree_of_groups(graph)
     # a group's triangle: its columns one by one have the same entries
@@ -146,12 +153,12 @@ def test_cuts_separate_and_nodes_without_position_come_last(
 ) -> None:
     monkeypatch.setattr(nested_dissection, "_LEAF", 4)
     pattern = _pattern("chain")
-    graph = QuotientGraph.without_groups(pattern)
+    graph = _without_groups(pattern)
     position_m = np.random.default_rng(2).normal(size=(40, 3))
     position_m[[7, 20]] = np.nan
     order = dissect_by_position(graph, position_m)
     assert set(order[-2:]) == {7, 20}
-    parts = dissect_by_position(QuotientGraph.without_groups(_pattern("singletons")), np.eye(7, 3))
+    parts = dissect_by_position(_without_groups(_pattern("singletons")), np.eye(7, 3))
     assert sorted(parts) == list(range(7))
 
 

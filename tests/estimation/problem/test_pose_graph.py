@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
-from maplab_py.estimation.linear.ordering import exact_minimum_degree, minimum_degree
-from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.symbolic import analyse
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
@@ -195,19 +192,3 @@ def test_clusters_count_from_their_first_vertex():
     links = [(np.array([7, 1]), np.array([6, 3])), (np.array([3, 4]), np.array([5, 7]))]
     np.testing.assert_array_equal(clusters(9, links), [0, 1, 2, 1, 3, 1, 3, 3, 4])
     np.testing.assert_array_equal(clusters(3, []), [0, 1, 2])
-
-
-@pytest.mark.parametrize("count", [1, 60, 64, 65, 400])
-def test_exact_minimum_degree_fills_in_no_more_than_the_other(count):
-    rng = np.random.default_rng(count)
-    nodes = np.arange(count)
-    far = np.sort(rng.integers(0, count, (2, count // 4)), axis=0)
-    rows = np.concatenate([nodes, nodes[1:], far[1]])
-    cols = np.concatenate([nodes, nodes[:-1], far[0]])
-    pattern = BlockPattern.checked(rows, cols, count, 6)
-    order = exact_minimum_degree(pattern)
-    np.testing.assert_array_equal(np.sort(order), nodes)
-    exact, other = (
-        analyse(pattern, way).statistics.nonzeros for way in (exact_minimum_degree, minimum_degree)
-    )
-    assert exact <= 1.1 * other
