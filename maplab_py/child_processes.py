@@ -1,6 +1,7 @@
 """Child processes: leaders of groups of their own, with few threads, that end with this process.
 
 A `Service` is a child that answers requests; both sides are pickled, and arrays travel as they lie in memory.
+`in_order` works in threads of this process.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 from maplab_py.errors import Cancelled
 
+_Item, _Value = TypeVar("_Item"), TypeVar("_Value")
 _PARENT_VARIABLE = "MAPLAB_ENDS_WITH_PROCESS"
 """Process whose end ends this one."""
 _THREAD_VARIABLES = (
@@ -220,3 +223,26 @@ def _receive_bytes(connection: socket.socket, size: int) -> bytearray:
             raise EOFError
         view = view[count:]
     return data
+
+
+def in_order(
+    function: Callable[[_Item], _Value], items: Iterable[_Item], threads: int
+) -> Generator[_Value]:
+    """Yield the values of a function that several threads compute, in the order of the items."""
+    if threads == 1:
+        yield from map(function, items)
+        return
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    pending: deque[Future[_Value]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                pending.append(pool.submit(function, item))
+                if len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()

@@ -48,11 +48,6 @@ class OdometryUpdate:
     stamp_ns: int = 0  # of the images, without a delay that was estimated
     backfill: Backfill | None = None  # states of frames that had none at their time
 
-    @property
-    def total_ms(self) -> float:
-        """Elapsed time of all stages."""
-        return sum(self.stage_ms.values())
-
     def window_frame(self) -> WindowFrame:
         """Return the frame as the smoother takes it."""
         cameras = self.tracked.cameras

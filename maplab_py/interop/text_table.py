@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.input_files import LARGEST, read_foreign_text
 from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
@@ -82,11 +81,6 @@ class TextTable:
             values=self.values[rows],
             line_numbers=self.line_numbers[rows],
         )
-
-    @property
-    def is_nanoseconds(self) -> bool:
-        """The file's time stamps were nanoseconds."""
-        return self.unit == "ns"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from contextlib import closing, nullcontext
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.atomic import replaced_folder, write_file
 from maplab_py.cancellation import lasting_effect
+from maplab_py.child_processes import in_order
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import ImuRecording as ImuFile
@@ -249,7 +247,7 @@ def write_images(
             millimetres = np.clip(np.round(1000.0 * depth), 0, 65535).astype(np.uint16)
             return [_png(image), _png(millimetres)]
 
-        with closing(_in_order(rendered, range(count), threads or os.cpu_count() or 1)) as files:
+        with closing(in_order(rendered, range(count), threads or os.cpu_count() or 1)) as files:
             for frame, contents in enumerate(files):
                 progress.step(frame, count, f"images of session {number + 1}, camera {row}")
                 name = f"{session.recording.time_ns[frame]}.png"
@@ -267,24 +265,6 @@ def _camera_motion(session: RecordedSession, row: int) -> Callable[[F64], F64]:
         return se3.compose(spline.evaluate(inside).T_G_I, T_I_C)
 
     return at_time
-
-
-def _in_order(
-    function: Callable[[int], list[bytes]], items: Iterable[int], threads: int
-) -> Generator[list[bytes]]:
-    """Yield the values of a function that several threads compute, in the order of the items."""
-    pending: deque[Future[list[bytes]]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                pending.append(pool.submit(function, item))
-                if len(pending) > 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
 
 
 def _png(image: NDArray[np.generic]) -> bytes:

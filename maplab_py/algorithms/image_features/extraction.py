@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from maplab_py.algorithms.dense.resources import IMAGES, FrameResources, check_s
 from maplab_py.algorithms.image_features import keypoint_edits
 from maplab_py.algorithms.image_features.options import PLUGIN, ExtractionOptions, ExtractionReport
 from maplab_py.array_types import I64, U8, Mask
+from maplab_py.child_processes import in_order
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
@@ -173,7 +172,7 @@ def _features_of_images(
         return extractor(_grey(store, frame, int(resources[number])))
 
     features = []
-    for number, (part, part_kind) in enumerate(_in_order(of_frame, range(len(frames)), threads)):
+    for number, (part, part_kind) in enumerate(in_order(of_frame, range(len(frames)), threads)):
         progress.step(number + 1, len(frames), "images")
         if kind is not None and part_kind != kind and len(part.scores):
             raise MaplabError(
@@ -219,26 +218,3 @@ def _strongest(features: ExtractedFeatures, most: int) -> ExtractedFeatures:
         features.descriptors[order],
         None if diameters is None else diameters[order],
     )
-
-
-def _in_order(
-    function: Callable[[int], tuple[ExtractedFeatures, DescriptorKind]],
-    items: Iterable[int],
-    threads: int,
-) -> Generator[tuple[ExtractedFeatures, DescriptorKind]]:
-    """Yield the values of a function that several threads compute, in the order of the items."""
-    if threads == 1:
-        yield from map(function, items)
-        return
-    pending: deque[Future[tuple[ExtractedFeatures, DescriptorKind]]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                pending.append(pool.submit(function, item))
-                if len(pending) > 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()

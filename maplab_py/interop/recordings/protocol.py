@@ -14,7 +14,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, U8, Mask
 from maplab_py.interop.device import RecordedSensors as RecordedSensors
-from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_8_bits, as_grey
+from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_grey
 from maplab_py.sensors import Imu
 
 
@@ -94,10 +94,6 @@ class CameraImage:
     def grey(self) -> U8:
         """Return 8-bit grey values (H, W); of more bits the upper eight, of colours the luminance."""
         return as_grey(self.decode(), self.bits)
-
-    def eight_bits(self) -> U8:
-        """Return the pixels (H, W) or (H, W, 3) BGR of 8 bits."""
-        return as_8_bits(self.decode(), self.bits)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
