@@ -14,3 +14,5 @@ U32 = NDArray[np.uint32]
 U8 = NDArray[np.uint8]
 I8 = NDArray[np.int8]
 Mask = NDArray[np.bool_]
+
+__all__ = ["F32", "F64", "I8", "I32", "I64", "U8", "U32", "U64", "Mask", "NDArray"]

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Distortion, Imu, Projection, SensorSet

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F32, I64, U8
+from maplab_py.array_types import F32, I64, U8, NDArray
 from maplab_py.interop.text_table import format_rows
 from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_text

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import decode_foreign, read_bytes
 from maplab_py.interop.recordings import bag_files

@@ -15,9 +15,8 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import U8
+from maplab_py.array_types import U8, NDArray
 from maplab_py.errors import MapError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]

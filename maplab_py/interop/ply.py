@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, U8
+from maplab_py.array_types import F64, U8, NDArray
 from maplab_py.errors import MapError
 from maplab_py.input_files import DEFAULT_MAX_BYTES
 from maplab_py.output_files import write_bytes

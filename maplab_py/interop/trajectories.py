@@ -11,9 +11,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import LARGEST, read_foreign_text

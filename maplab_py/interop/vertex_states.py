@@ -10,9 +10,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3

@@ -8,7 +8,6 @@ segments; scores of single segments avoid this.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.estimation.solution import solve
@@ -19,7 +18,7 @@ from maplab_py.algorithms.self_calibration.segments.splitting import (
 )
 from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap

@@ -14,7 +14,6 @@ import dataclasses
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.calibration import parameter_estimates
 from maplab_py.algorithms.self_calibration.device import device_of
@@ -26,7 +25,7 @@ from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.uncertainty import Uncertainty, name_directions, spectrum
 from maplab_py.algorithms.vi_optimization import calibration_states
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.imu.inertial_data import InertialData

@@ -6,9 +6,8 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of

@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3, yaw

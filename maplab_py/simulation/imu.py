@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.geometry import so3
 from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.scenario import ImuOptions

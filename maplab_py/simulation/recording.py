@@ -6,9 +6,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import read_imu_csv

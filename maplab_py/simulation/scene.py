@@ -7,9 +7,8 @@ from collections.abc import Iterable, Iterator
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F32, F64, I64, U8, Mask
+from maplab_py.array_types import F32, F64, I64, U8, Mask, NDArray
 from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions, ImageOptions
 from maplab_py.simulation.shading_kernels import LEVELS

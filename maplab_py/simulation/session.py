@@ -6,9 +6,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, U64
+from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.triangulation import triangulate

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.localization import Localizations, Reference
-from maplab_py.array_types import F64, I64, U64
+from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.atomic import recover
 from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress

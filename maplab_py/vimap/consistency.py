@@ -6,9 +6,8 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import Mask
+from maplab_py.array_types import Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.report import Report, counted
 from maplab_py.sensors.wheels import wheel_scale

@@ -6,9 +6,8 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.sensors.sensor_set import OtherSensor

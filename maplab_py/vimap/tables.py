@@ -14,9 +14,8 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I32, I64, U64
+from maplab_py.array_types import F64, I32, I64, U64, NDArray
 from maplab_py.vimap.table import Table, column
 
 NO_ROW = -1

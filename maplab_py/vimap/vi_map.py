@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.geometry import se3
 from maplab_py.report import counted, to_html
 from maplab_py.sensors import SensorSet

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I8, I64, U8, U64, Mask
+from maplab_py.array_types import F64, I8, I64, U8, U64, Mask, NDArray
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, type_name
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.compilation import compiled
 
 

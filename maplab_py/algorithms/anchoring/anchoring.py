@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.anchoring.absolute import (
     AbsoluteAnchoringOptions,
@@ -44,7 +43,7 @@ from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchS
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.workflow import describe
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import yaw
 from maplab_py.progress import SILENT, Progress

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.cells.options import CellOptions
-from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.array_types import F64, I32, I64, Mask, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress

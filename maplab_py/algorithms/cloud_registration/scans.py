@@ -8,14 +8,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
 from maplab_py.algorithms.cloud_registration.registration import PreparedCloud, prepare_cloud
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows

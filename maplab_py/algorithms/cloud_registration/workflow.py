@@ -6,7 +6,6 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport
 from maplab_py.algorithms.cloud_registration.registration import (
@@ -36,7 +35,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.algorithms.loop_closure.workflow import missions_joined
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap

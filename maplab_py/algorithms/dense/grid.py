@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.dense import grid_kernels
 from maplab_py.algorithms.dense.pinhole import Pinhole
-from maplab_py.array_types import F32, F64, I32
+from maplab_py.array_types import F32, F64, I32, NDArray
 from maplab_py.errors import MapError
 from maplab_py.memory import require_memory
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.evaluation.reports import Difference, MapComparisonReport, RowCounts
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig
 from maplab_py.sensors.sensor_set import Sensor

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.evaluation import pose_errors, reports
 from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.plausibility import clock_offset_ns, orientation_hint
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.vimap import DescriptorBlock, VIMap
 from maplab_py.vimap.edits import remove_keypoints
 from maplab_py.vimap.table import object_column, starts_of_counts

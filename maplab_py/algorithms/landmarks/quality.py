@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.gate import Gate, any_failed
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance, largest_sigma
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, LandmarkQualityReport
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.options import (
     InvalidObservationOptions,
@@ -13,7 +12,7 @@ from maplab_py.algorithms.landmarks.options import (
 from maplab_py.algorithms.landmarks.sightings import Residuals, is_lidar, residuals
 from maplab_py.algorithms.landmarks.tracks import add_tracks, group_tracks
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
-from maplab_py.array_types import I64, Mask
+from maplab_py.array_types import I64, Mask, NDArray
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.edits import remove_landmarks, remove_observations

@@ -6,9 +6,8 @@ import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Projection
 from maplab_py.sensors.projection import back_project, project

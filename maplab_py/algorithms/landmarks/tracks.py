@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
 from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangulate_keypoints
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, mission_mask, ragged_rows, starts_of_counts

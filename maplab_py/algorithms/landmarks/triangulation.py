@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, RetriangulationReport
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residuals
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import triangulation
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts

@@ -6,11 +6,10 @@ import dataclasses
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
-from maplab_py.array_types import F64, I64, U64
+from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap

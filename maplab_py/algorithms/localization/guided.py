@@ -11,10 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
-from maplab_py.array_types import F64, I8, I64, U64
+from maplab_py.array_types import F64, I8, I64, U64, NDArray
 from maplab_py.compilation import compiled
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows

@@ -10,12 +10,11 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.guided import guided_matches
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level

@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import so3
 from maplab_py.vimap import IdArray, LoopClosureEdges, VIMap, ragged_rows, starts_of_counts
 

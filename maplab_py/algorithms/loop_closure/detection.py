@@ -7,7 +7,6 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.alignment_contest import AlignmentChoice, Contest
 from maplab_py.algorithms.loop_closure.candidates import (
@@ -26,7 +25,7 @@ from maplab_py.algorithms.loop_closure.features import (
 from maplab_py.algorithms.loop_closure.gates import judge, measure
 from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress

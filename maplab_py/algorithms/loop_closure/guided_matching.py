@@ -11,13 +11,12 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays, landmark_covariance
 from maplab_py.algorithms.loop_closure import features
 from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import differences

@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.gate import failures
 from maplab_py.algorithms.loop_closure import closure_record
@@ -17,7 +16,7 @@ from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.gates import closure_gates
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureLine, ClosureReport, Verdict
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.output_files import write_text

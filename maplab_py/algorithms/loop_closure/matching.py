@@ -15,12 +15,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.candidates import Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import I32, I64
+from maplab_py.array_types import I32, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.memory import available_bytes
 from maplab_py.vision.descriptors import differences

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.landmarks.quality import predicted_sigma
@@ -15,7 +14,7 @@ from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap, observer_counts, ragged_rows, starts_of_counts

@@ -7,11 +7,10 @@ import hashlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.array_types import F64, U64, Mask
+from maplab_py.array_types import F64, U64, Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph

@@ -12,12 +12,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build, is_calibrating
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import CalibratedParameter, VIOptimizationReport
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING

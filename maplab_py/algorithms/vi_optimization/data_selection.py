@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.vi_optimization.options import DataOptions, RobustnessOptions
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.estimation.states import States

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.calibration_states import MountedSensors
 from maplab_py.algorithms.vi_optimization.data_selection import Selection
@@ -14,7 +13,7 @@ from maplab_py.algorithms.vi_optimization.options import (
     PriorOptions,
     VIOptimizationOptions,
 )
-from maplab_py.array_types import F64, I64, U64, Mask
+from maplab_py.array_types import F64, I64, U64, Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu.inertial_data import InertialData

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization import data_selection, fixed_states
 from maplab_py.algorithms.vi_optimization.calibration_states import (
@@ -32,7 +31,7 @@ from maplab_py.algorithms.vi_optimization.options import (
     VIOptimizationOptions,
 )
 from maplab_py.algorithms.vi_optimization.outliers import OutlierRejection
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.codegen.kernels import visual_kernels

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.options import RobustnessOptions
-from maplab_py.array_types import F64, Mask
+from maplab_py.array_types import F64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import Observations, VisualTerms

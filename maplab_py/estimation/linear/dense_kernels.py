@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.compilation import compiled, numba
 
 # scipy exports the addresses of its bundled Fortran-style routines for Cython; numba can call any

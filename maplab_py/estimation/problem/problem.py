@@ -7,9 +7,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I32, I64
+from maplab_py.array_types import F64, I32, I64, NDArray
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import joint_covariance
 from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky

@@ -7,9 +7,8 @@ from types import ModuleType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.symbolic.sources import PoseError
 

@@ -7,9 +7,8 @@ from functools import cached_property
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I32, I64
+from maplab_py.array_types import F64, I32, I64, NDArray
 from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
 from maplab_py.estimation.kernels import visual_arguments
 from maplab_py.estimation.kernels.loss import loss_and_weight

@@ -6,9 +6,8 @@ import dataclasses
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I32, Mask
+from maplab_py.array_types import F64, I32, Mask, NDArray
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.sensors.distortion import largest_radius

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.interop.ply import EmptyCloud, PlyCloud
 from maplab_py.interop.recordings.bag_files import message_types

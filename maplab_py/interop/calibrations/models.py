@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE

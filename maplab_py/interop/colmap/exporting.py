@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3

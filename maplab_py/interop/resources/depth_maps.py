@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import F32
+from maplab_py.array_types import F32, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.interop.resources import matching

@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I64, U8
+from maplab_py.array_types import I64, U8, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import EmptyCloud, PlyCloud, encode_ply, parse_ply

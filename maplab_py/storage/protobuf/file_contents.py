@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I64, U64
+from maplab_py.array_types import I64, U64, NDArray
 from maplab_py.vimap.table import starts_of_counts
 
 Columns = Mapping[str, NDArray[Any]]

@@ -7,9 +7,8 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I32, I64, U64
+from maplab_py.array_types import I32, I64, U64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.report import counted
 from maplab_py.storage.protobuf import message_numbers

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import I64, U64
+from maplab_py.array_types import I64, U64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError
 from maplab_py.storage.protobuf import message_numbers

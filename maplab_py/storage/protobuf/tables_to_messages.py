@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maplab_py.array_types import U64
+from maplab_py.array_types import U64, NDArray
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.protobuf.file_contents import (
     Columns,
