@@ -23,7 +23,8 @@ from typing import Any, TypeVar
 
 from maplab_py.errors import Cancelled
 
-_Item, _Value = TypeVar("_Item"), TypeVar("_Value")
+_Item = TypeVar("_Item")
+_Value = TypeVar("_Value")
 _PARENT_VARIABLE = "MAPLAB_ENDS_WITH_PROCESS"
 """Process whose end ends this one."""
 _THREAD_VARIABLES = (
