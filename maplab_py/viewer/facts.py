@@ -21,6 +21,14 @@ Facts = tuple[tuple[str, str], ...]
 """Names and values, in the order in which they are shown."""
 
 
+ID_DIGITS = 8
+"""Digits of ids in the panel: as the console prints them."""
+
+
+def _short(id_: IdArray) -> str:
+    return to_hex(id_)[:ID_DIGITS]
+
+
 def facts(vi_map: VIMap, entity: Entity, row: int) -> Facts:
     """Return what is known of an entity of a map."""
     if entity is Entity.VERTEX:
@@ -42,8 +50,8 @@ def vertex_facts(vi_map: VIMap, row: int) -> Facts:
     mission = vi_map.mission(vertex.mission)
     since_s = 1e-9 * (vertex.timestamp_ns - int(vi_map.vertices.timestamp_ns[mission.vertices[0]]))
     return (
-        ("vertex", vertex.id),
-        ("mission", mission.id),
+        ("vertex", vertex.id[:ID_DIGITS]),
+        ("mission", mission_labels(vi_map)[vertex.mission]),
         ("time", f"{since_s:.3f} s after the start"),
         ("time stamp", f"{vertex.timestamp_ns} ns"),
         ("number", f"{row - mission.vertices[0] + 1} of {len(mission.vertices)}"),
@@ -70,7 +78,7 @@ def landmark_facts(vi_map: VIMap, row: int) -> Facts:
     labels = mission_labels(vi_map)
     names = ", ".join(labels[mission] for mission in missions.tolist())
     return (
-        ("landmark", landmark.id),
+        ("landmark", landmark.id[:ID_DIGITS]),
         ("quality", LandmarkQuality(landmark.quality).name.lower()),
         ("p_G", f"{_vector(landmark.p_G)} m"),
         (
@@ -82,7 +90,7 @@ def landmark_facts(vi_map: VIMap, row: int) -> Facts:
         ("distance", _range_text(distance, "m")),
         ("largest ray angle", f"{_largest_angle_deg(vi_map, landmark.p_G, observers):.1f} deg"),
         ("reprojection error", _error_text(vi_map, landmark.keypoints)),
-        ("stored in", to_hex(vi_map.vertices.id[landmark.vertex])),
+        ("stored in", _short(vi_map.vertices.id[landmark.vertex])),
         ("feature type", str(int(vi_map.landmarks.feature_type[row]))),
     )
 
@@ -94,13 +102,13 @@ def loop_closure_facts(vi_map: VIMap, row: int) -> Facts:
     T_A_B = se3.relative(vi_map.T_G_I[start], vi_map.T_G_I[end])
     wrong = se3.local(edges.T_A_B[row], T_A_B)
     common = len(np.intersect1d(_landmarks_of(vi_map, start), _landmarks_of(vi_map, end)))
-    mission = vi_map.vertices.mission
+    mission, labels = vi_map.vertices.mission, mission_labels(vi_map)
     return (
-        ("loop closure", to_hex(edges.id[row])),
-        ("query vertex", to_hex(vi_map.vertices.id[start])),
-        ("query mission", to_hex(vi_map.missions.id[mission[start]])),
-        ("target vertex", to_hex(vi_map.vertices.id[end])),
-        ("target mission", to_hex(vi_map.missions.id[mission[end]])),
+        ("loop closure", _short(edges.id[row])),
+        ("query vertex", _short(vi_map.vertices.id[start])),
+        ("query mission", labels[mission[start]]),
+        ("target vertex", _short(vi_map.vertices.id[end])),
+        ("target mission", labels[mission[end]]),
         ("switch value", f"{edges.switch_variable[row]:.3f}"),
         ("correction", f"{np.linalg.norm(wrong[:3]):.3f} m"),
         ("correction of heading", f"{np.degrees(np.linalg.norm(wrong[3:])):.2f} deg"),

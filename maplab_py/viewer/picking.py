@@ -7,10 +7,13 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F32, F64, I64, U64
-from maplab_py.errors import UserError
+from maplab_py.errors import MapError, UserError
 from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.viewer.scene import Entity, Points, Scene, Segments
+from maplab_py.vimap import IdArray, VIMap, to_hex
 from maplab_py.vimap.ids import HEX_DIGITS
 
 _CONE_RAD = np.radians(1.2)
@@ -132,16 +135,28 @@ def find_by_id(drawing: Drawing, text: str) -> Pick:
             f"'{text.strip()}': {MIN_DIGITS} to {HEX_DIGITS} hexadecimal digits of an id are expected"
         )
     vi_map = drawing.vi_map
+    recorded = recorded_ids(vi_map)
     tables = (
         ("vertex", vi_map.vertices.id, Entity.VERTEX),
         ("landmark", vi_map.landmarks.id, Entity.LANDMARK),
         ("loop closure", vi_map.loop_closure_edges.id, Entity.LOOP_CLOSURE),
+        ("closure", recorded, Entity.CLOSURE),
         ("mission", vi_map.missions.id, Entity.NONE),
     )
     matches = [
         (name, row, entity)
         for name, ids, entity in tables
         for row in _rows_with_prefix(ids, prefix).tolist()
+    ]
+    edges = [
+        to_hex(vi_map.loop_closure_edges.id[row])
+        for name, row, _ in matches
+        if name == "loop closure"
+    ]
+    matches = [  # an edge that was made from a recorded closure has its id
+        match
+        for match in matches
+        if match[2] is not Entity.CLOSURE or to_hex(recorded[match[1]]) not in edges
     ]
     if not matches:
         raise UserError(
@@ -157,6 +172,25 @@ def find_by_id(drawing: Drawing, text: str) -> Pick:
             raise UserError(f"mission {prefix} has no vertices: there is nothing to show")
         row, entity = start, Entity.VERTEX
     return Pick(entity, row, _position(drawing, entity, row), 0.0)
+
+
+def recorded_ids(vi_map: VIMap) -> IdArray:
+    """Return the ids (N, 2) of the recorded closures; none if the record is damaged."""
+    try:
+        return np.asarray(read_record(vi_map).closures.id)
+    except MapError:
+        return np.zeros((0, 2), dtype=np.uint64)
+
+
+def id_of(vi_map: VIMap, picked: Pick) -> str:
+    """Return the id of what was picked."""
+    ids = {
+        Entity.VERTEX: vi_map.vertices.id,
+        Entity.LANDMARK: vi_map.landmarks.id,
+        Entity.LOOP_CLOSURE: vi_map.loop_closure_edges.id,
+    }
+    table = recorded_ids(vi_map) if picked.entity is Entity.CLOSURE else ids[picked.entity]
+    return to_hex(table[picked.row])
 
 
 def _rows_with_prefix(ids: U64, prefix: str) -> I64:
@@ -183,8 +217,12 @@ def _position(drawing: Drawing, entity: Entity, row: int) -> F64:
     elif entity is Entity.VERTEX:
         p = drawing.p_vertices[row]
     else:
-        edges = drawing.vi_map.loop_closure_edges
-        ends = np.array([edges.from_vertex[row], edges.to_vertex[row]])
+        if entity is Entity.CLOSURE:
+            closures = read_record(drawing.vi_map).closures.take(np.array([row]))
+            ends = np.concatenate(closure_ends(drawing, closures))
+        else:
+            edges = drawing.vi_map.loop_closure_edges
+            ends = np.array([edges.from_vertex[row], edges.to_vertex[row]])
         p = drawing.p_vertices[ends].mean(axis=0)
     if not np.isfinite(p).all():
         raise UserError(f"this {entity.value} has no finite position: it cannot be shown")

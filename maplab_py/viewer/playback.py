@@ -65,18 +65,25 @@ def make_timeline(drawing: Drawing, options: PlaybackOptions) -> Timeline:
     return Timeline(steps, vertex_step, landmark_step, good, head, seconds)
 
 
+def step_seconds(drawing: Drawing, options: PlaybackOptions) -> F64:
+    """Return the time (steps + 1,) of each step since the start of the longest mission [s]."""
+    return _progress(drawing, options)[1]
+
+
 def _progress(drawing: Drawing, options: PlaybackOptions) -> tuple[F64, F64]:
     """Return how far along (V,) each vertex is in [0, 1], and the time of each step."""
     vi_map = drawing.vi_map
     time_s = 1e-9 * vi_map.vertices.timestamp_ns
     value = np.zeros(len(time_s))
-    longest, duration = 0.0, 0.0
+    longest, duration = 0.0, -1.0
+    timed = slice(0, 0)  # vertices of the mission that lasts longest
     for mission in range(len(vi_map.missions)):
         mission_vertices = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
         if mission_vertices.start == mission_vertices.stop:
             continue
         travelled = time_s[mission_vertices] - time_s[mission_vertices][0]
-        duration = max(duration, float(travelled[-1]))
+        if travelled[-1] > duration:
+            duration, timed = float(travelled[-1]), mission_vertices
         if options.synchronize_missions_on_distance:
             step = np.linalg.norm(
                 np.diff(vi_map.vertices.T_M_I[mission_vertices, 4:], axis=0), axis=1
@@ -86,8 +93,11 @@ def _progress(drawing: Drawing, options: PlaybackOptions) -> tuple[F64, F64]:
             travelled = travelled / max(float(travelled[-1]), 1e-12)
         value[mission_vertices] = travelled
         longest = max(longest, float(travelled[-1]))
-    seconds = np.linspace(0.0, duration, options.steps + 1)
-    return value / max(longest, 1e-12), seconds
+    progress = value / max(longest, 1e-12)
+    share = np.linspace(0.0, 1.0, options.steps + 1)
+    since = time_s[timed] - time_s[timed][:1]
+    seconds = np.interp(share, progress[timed], since) if len(since) else share
+    return progress, seconds
 
 
 def without_played(scene: Scene) -> Scene:

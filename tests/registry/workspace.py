@@ -86,7 +86,7 @@ for _name in (
     "visualize_loop_closures",
 ):
     PREPARED[_name] = CLOSED
-for _name in ("save_view", "export_view", "viewer_keep", "viewer_stop"):
+for _name in ("save_view", "export_view", "viewer_go_to", "viewer_keep", "viewer_stop"):
     PREPARED[_name] = f"{MERGED}; visualize --viewer_port=0"
 for _name in ("print_summary_map", "localize"):
     PREPARED[_name] = f"{MERGED}; summary_map --summary_map_save_path=office_summary"

@@ -23,12 +23,19 @@ _ASPECT = 1.35
 _MARGIN = 1.08
 _FREE = 0.74
 """Part of a page's width that the panel leaves free."""
+_FREE_HEIGHT = 0.58
+"""Part of an upright page's height that the sheet at its lower edge leaves free."""
 _LEAST_SHARE, _ROOM = 0.5, 1.25
 """Share of the picture below which a map is moved closer to; room that a map gets to grow."""
 
 
 def view_of(
-    extent: Extent, view: str = "overview", *, beside_panel: bool = False, room: float = 1.0
+    extent: Extent,
+    view: str = "overview",
+    *,
+    beside_panel: bool = False,
+    room: float = 1.0,
+    upright: float = 0.0,
 ) -> tuple[F64, F64]:
     """Return camera position (3,) and target (3,) that just show the whole outline; z is up.
 
@@ -39,6 +46,7 @@ def view_of(
         view: One of `VIEWS`.
         beside_panel: Leave the part of the page free that the panel covers.
         room: Width of the picture by that of the outline.
+        upright: Width by height of an upright page; 0 = it is not upright.
     """
     azimuth = _across(extent.outline)
     if view == "overview":
@@ -55,17 +63,18 @@ def view_of(
     right = right / np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back])
     p = (extent.outline - extent.centre) @ axes.T
-    tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([_ASPECT, 1.0]) / (_MARGIN * room)
-    if beside_panel:
-        tangent[0] *= _FREE
+    half = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([upright or _ASPECT, 1.0])
+    free = (
+        np.array([1.0, _FREE_HEIGHT] if upright else [_FREE, 1.0]) if beside_panel else np.ones(2)
+    )
+    tangent = half * free / (_MARGIN * room)
     middle = 0.5 * (p[:, :2].min(axis=0) + p[:, :2].max(axis=0))
     for _ in range(3):  # near points need more room: centre what is seen, not what is there
         distance = _distance(p, middle, tangent)
         seen = (p[:, :2] - middle) / (distance - p[:, 2:])
         middle = middle + 0.5 * distance * (seen.min(axis=0) + seen.max(axis=0))
     distance = max(_distance(p, middle, tangent), 0.2 * extent.radius_m)
-    if beside_panel:
-        middle[0] += distance * (1.0 - _FREE) * _ASPECT * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+    middle = middle + distance * (1.0 - free) * half * [1.0, -1.0]
     target = extent.centre + middle @ axes[:2]
     return target + distance * back, target
 
@@ -107,6 +116,9 @@ class Cameras:
         self._server = server
         self._view = (np.array([0.0, -1.0, 1.0]), np.zeros(3))  # of new pages
         self._given: dict[int, F64] = {}  # where a page's camera was put, by client
+        self._extent: Extent | None = None
+        self._room = 1.0
+        server.on_client_connect(self._aim_upright)
 
     def show_all(self, extent: Extent) -> None:
         """Let all pages, and those that will be opened, see everything."""
@@ -130,12 +142,24 @@ class Cameras:
         return bool(off < 0.01 * np.linalg.norm(self._view[0] - self._view[1]))
 
     def _move(self, extent: Extent, clients: list[Any], room: float) -> None:
+        self._extent, self._room = extent, room
         self._view = view_of(extent, beside_panel=True, room=room)
         self.aim_new_pages(extent)
         for client in clients:
-            with client.atomic():
-                _look(client.camera, extent, self._view)
-            self._given[client.client_id] = self._view[0]
+            self._show(client, extent, self._view)
+            self._aim_upright(client)
+
+    def _aim_upright(self, client: Any) -> None:
+        """Let an upright page, as that of a phone, see everything above its panel."""
+        aspect = float(client.camera.aspect)
+        if self._extent is not None and aspect < 1.0:
+            view = view_of(self._extent, beside_panel=True, room=self._room, upright=aspect)
+            self._show(client, self._extent, view)
+
+    def _show(self, client: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+        with client.atomic():
+            _look(client.camera, extent, view)
+        self._given[client.client_id] = view[0]
 
 
 def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bool = True) -> None:

@@ -12,12 +12,14 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from maplab_py.errors import UserError
 from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
+from maplab_py.viewer.picking import MIN_DIGITS
 from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
 
 MAX_SWITCHES = 24
@@ -61,8 +63,8 @@ class Actions(Protocol):
     def set_measuring(self, is_measuring: bool) -> None:
         """Measure between picks."""
 
-    def jump_to_id(self, client: Any, text: str) -> None:
-        """Select what an id means, and move the camera of one page there."""
+    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
+        """Select what an id means, and move the cameras of pages there; UserError if it means nothing."""
 
     def clear_pick(self) -> None:
         """Forget what was picked."""
@@ -151,11 +153,17 @@ class Panel:
                 "measure", False, hint="measure the distance between two picks"
             )
             self.clear = self._gui.add_button("clear", visible=False)
-        self._bind(
-            self.jump, lambda event: self._actions.jump_to_id(event.client, event.target.value)
-        )
+        self._bind(self.jump, self._jump)
         self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
         self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
+
+    def _jump(self, event: Any) -> None:
+        """Go where an id is as soon as it is long enough: the page sends every key."""
+        if len(event.target.value.strip()) >= MIN_DIGITS:
+            try:
+                self._actions.fly_to(event.target.value, [event.client])
+            except UserError as error:
+                self.show_hint(str(error))
 
     def _add_view(self) -> None:
         with self._gui.add_folder("View", order=5, expand_by_default=False):

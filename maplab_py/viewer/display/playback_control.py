@@ -24,7 +24,7 @@ from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import ImageOf, no_image
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.playback import Signal, vertex_signals
+from maplab_py.viewer.playback import Signal, step_seconds, vertex_signals
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +76,7 @@ class Playback:
         self._mission = -1  # row whose plots are shown, -1 = the first that is played
         self._signals: tuple[Signal, ...] = ()
         self._curves: list[tuple[str, tuple[str, ...]]] = []
+        self._seconds = np.zeros(2)  # of the steps
         self._is_stopped = False
         self._ticker = threading.Thread(target=self._tick, name="maplab playback", daemon=True)
         self._ticker.start()
@@ -99,6 +100,10 @@ class Playback:
         if self.player is not None:
             self.player.go(max(step, 0))
             self._show(self.player)
+
+    def set_time(self, time_s: float) -> None:
+        """Show the map as it was at a time of the longest mission; at its end the whole map."""
+        self.set_step(int(np.searchsorted(self._seconds, time_s - 1e-6)))
 
     def set_playing(self, is_playing: bool) -> None:
         """Play or pause; playing from the end starts again at the beginning."""
@@ -128,8 +133,9 @@ class Playback:
             self.player = None
             self._signals, self._curves = (), []
         self.time_line.set_playing(False)
-        steps = self.options.steps
-        self.time_line.show_step(steps, steps, "the whole map")
+        if self._view.subject is not None:
+            self._seconds = step_seconds(self._view.drawing, self.options)
+        self.time_line.show_step(self._seconds, self.options.steps, "the whole map")
 
     def end(self) -> None:
         """End the thread that plays."""
@@ -156,8 +162,12 @@ class Playback:
         if self._mission < 0:
             return []
         vertices = self._vertices_of_mission()
-        progress = player.timeline.vertex_step[vertices] / self.options.steps
+        progress = self._share(player.timeline.vertex_step[vertices])
         return [(s.title, plot_paths(s, vertices, progress)) for s in self._signals]
+
+    def _share(self, step: I64) -> F64:
+        """Return where steps are along the slider, in [0, 1]."""
+        return np.asarray(self._seconds[step] / max(float(self._seconds[-1]), 1e-9))
 
     def _vertices_of_mission(self) -> I64:
         start = self._view.drawing.vi_map.vertex_start
@@ -171,9 +181,9 @@ class Playback:
             (title, paths, value_text(signal, vertex) if vertex >= 0 else "")
             for signal, (title, paths) in zip(self._signals, self._curves, strict=True)
         ]
-        at = player.step / self.options.steps
+        at = float(self._share(np.array(player.step)))
         plots = strip_chart(rows, at, "" if image is None else image_tag(image))
-        self.time_line.show_step(player.step, self.options.steps, player.note(), plots)
+        self.time_line.show_step(self._seconds, player.step, player.note(), plots)
         if vertex >= 0 and self._ride != FREE:
             for client in self._server.get_clients().values():
                 with client.atomic():
@@ -312,6 +322,8 @@ def _row(title: str, paths: tuple[str, ...], value: str, at: float) -> str:
 
 
 _WIDTH_PX = 640
+_SLIDER_STEP_S = 0.01
+_PLAY, _PAUSE = "play", "pause"
 _MARGIN_PX = 15
 _HINT = "Move the slider to play the missions: plots of the first one appear here."
 
@@ -319,8 +331,8 @@ _HINT = "Move the slider to play the missions: plots of the first one appear her
 class Playing(Protocol):
     """Requests of the time line."""
 
-    def set_step(self, step: int) -> None:
-        """Show the map as it was after a step."""
+    def set_time(self, time_s: float) -> None:
+        """Show the map as it was at a time."""
 
     def set_playing(self, is_playing: bool) -> None:
         """Play or pause."""
@@ -344,12 +356,12 @@ class TimeLine:
     ) -> None:
         """Make the widgets."""
         self._playing = playing
-        self._steps = 200
         self._is_sliding = False
+        self.is_playing = False
         self.panel = server.gui.add_panel()
         with self.panel.add_tab("Time line"):
-            self.slider: Any = server.gui.add_slider("step", 0, self._steps, 1, self._steps)
-            self.play: Any = server.gui.add_checkbox("play", False)
+            self.slider: Any = server.gui.add_slider("time [s]", 0.0, 1.0, _SLIDER_STEP_S, 1.0)
+            self.play: Any = server.gui.add_button(_PLAY, hint="space bar")
             self.ride: Any = server.gui.add_dropdown(
                 "view", RIDES, hint="let the view ride along with the plotted mission"
             )
@@ -360,17 +372,19 @@ class TimeLine:
         self.panel.minimize()
         for widget, action in (
             (self.slider, self._slide),
-            (self.play, lambda event: playing.set_playing(event.target.value)),
             (self.ride, lambda event: playing.set_ride(event.target.value)),
             (self.mission, lambda event: playing.choose_mission(event.target.value)),
         ):
             widget.on_update(by_user(lock, action, say))
+        toggle = by_user(lock, lambda _: playing.set_playing(not self.is_playing), say)
+        self.play.on_click(toggle)
+        server.gui.add_command("play or pause the missions", hotkey="space").on_trigger(toggle)
 
     def _slide(self, event: Any) -> None:
         """Follow the slider, which the user may hold: it must not be pushed back meanwhile."""
         self._is_sliding = True
         try:
-            self._playing.set_step(int(event.target.value))
+            self._playing.set_time(float(event.target.value))
         finally:
             self._is_sliding = False
 
@@ -388,20 +402,21 @@ class TimeLine:
         if self.mission.visible != (len(labels) > 1):
             self.mission.visible = len(labels) > 1
 
-    def show_step(self, step: int, steps: int, note: str, plots: str = "") -> None:
-        """Move the slider, which may have another number of steps now, unless it moved us.
+    def show_step(self, seconds: F64, step: int, note: str, plots: str = "") -> None:
+        """Move the slider, which may have another length now, unless it moved us.
 
         Args:
-            step: Where playback is; the last step is the whole map.
-            steps: Their number.
+            seconds: Times (N,) of all steps; the last one is the whole map.
+            step: Where playback is.
             note: Words beside the slider.
             plots: HTML of the plots; empty = the hint.
         """
-        if steps != self._steps:
-            self.slider.max = steps
-            self._steps = steps
-        if not self._is_sliding and int(self.slider.value) != step:
-            self.slider.value = step
+        length = max(_SLIDER_STEP_S, float(np.ceil(seconds[-1] / _SLIDER_STEP_S)) * _SLIDER_STEP_S)
+        if abs(float(self.slider.max) - length) > 0.5 * _SLIDER_STEP_S:
+            self.slider.max = length
+        value = length if step >= len(seconds) - 1 else float(seconds[step])
+        if not self._is_sliding and abs(float(self.slider.value) - value) > 1e-6:
+            self.slider.value = value
         self.time.content = panel.hint(note)
         self.plots.content = plots or panel.hint(_HINT)
 
@@ -410,12 +425,9 @@ class TimeLine:
         if self.ride.value != ride:
             self.ride.value = ride
 
-    @property
-    def is_playing(self) -> bool:
-        """Tell whether the box is ticked."""
-        return bool(self.play.value)
-
     def set_playing(self, is_playing: bool) -> None:
-        """Tick the box or not."""
-        if self.play.value != is_playing:
-            self.play.value = is_playing
+        """Show whether it plays."""
+        self.is_playing = is_playing
+        label = _PAUSE if is_playing else _PLAY
+        if self.play.label != label:
+            self.play.label = label

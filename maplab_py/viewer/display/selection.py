@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.errors import UserError
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.camera import approach
 from maplab_py.viewer.display.panel import Panel
@@ -22,7 +21,7 @@ from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.facts import facts
 from maplab_py.viewer.layers import cameras
 from maplab_py.viewer.layers.closures import closure_ends
-from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id
+from maplab_py.viewer.picking import Pick, find_by_id, id_of
 from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, ragged_rows
@@ -53,10 +52,12 @@ class Selection:
         self.is_measuring = False
         self.picked: Pick | None = None
         self.distance_m: float | None = None
+        self.on_pick: Callable[[str], None] = lambda _: None  # told the id of each pick
 
     def pick(self, drawing: Drawing, picked: Pick, image_of: ImageOf) -> None:
         """Mark what was clicked and show its facts."""
         previous, self.picked, self.distance_m = self.picked, picked, None
+        self.on_pick(id_of(drawing.vi_map, picked))
         self._clear_marks()
         self._ends = ()
         note = ""
@@ -73,17 +74,15 @@ class Selection:
             image, note = pair or (None, note)
         self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
 
-    def jump(self, drawing: Drawing, text: str, image_of: ImageOf, client: Any) -> None:
-        """Pick what an id means, and move the camera of one page there."""
-        if len(text.strip()) < MIN_DIGITS:
-            return  # the page sends every key
-        try:
-            picked = find_by_id(drawing, text)
-        except UserError as error:
-            self._panel.show_hint(str(error))
-            return
+    def jump(self, drawing: Drawing, text: str, image_of: ImageOf, clients: list[Any]) -> None:
+        """Pick what an id means, and move the cameras of pages there.
+
+        Raises:
+            UserError: Nothing has an id that starts so, or several have.
+        """
+        picked = find_by_id(drawing, text)
         self.pick(drawing, picked, image_of)
-        if client is not None:
+        for client in clients:
             with client.atomic():
                 approach(client.camera, picked.p, 0.25 * drawing.extent.radius_m)
 

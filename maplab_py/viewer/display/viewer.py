@@ -411,10 +411,15 @@ class Viewer:
         with self._lock:
             self._selection.pick(self.drawing, picked, self._image_of)
 
-    def jump_to_id(self, client: Any, text: str) -> None:
-        """Select what an id means, and move the camera of one page there."""
+    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
+        """Select what an id means, and move the cameras of pages there, None = of all.
+
+        Raises:
+            UserError: Nothing has an id that starts so, or several have.
+        """
         with self._lock:
-            self._selection.jump(self.drawing, text, self._image_of, client)
+            pages = list(self._server.get_clients().values()) if clients is None else clients
+            self._selection.jump(self.drawing, text, self._image_of, pages)
 
     def _click(self, event: Any) -> None:
         if self.scene is None:

@@ -27,11 +27,18 @@ from maplab_plugins.visualization.maps import (
     visualize_sequentially,
 )
 from maplab_plugins.visualization.meshes import visualize_esdf, visualize_mesh
-from maplab_plugins.visualization.output import export_view, save_view, viewer_keep, viewer_stop
+from maplab_plugins.visualization.output import (
+    export_view,
+    save_view,
+    viewer_go_to,
+    viewer_keep,
+    viewer_stop,
+)
 
 __all__ = [
     "export_view",
     "save_view",
+    "viewer_go_to",
     "viewer_keep",
     "viewer_stop",
     "visualize",

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -177,6 +178,7 @@ def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
     viewer = Viewer(options.port, is_dark=options.dark)
     try:
         with lasting_effect():
+            viewer.selection.on_pick = partial(context.session.variables.__setitem__, "pick")
             context.session.watchers.set(NAME, Following(viewer))
             context.announce(NAME, viewer.url)
     except Cancelled:

@@ -85,6 +85,28 @@ def export_view(context: CommandContext, *, file: Path, overwrite: bool = False)
 
 
 @command(
+    "viewer_go_to",
+    "go",
+    example="viewer_go_to 59f0",
+    see_also=("visualize", "why"),
+    acts_outside=True,
+    guards_effects=True,
+)
+def viewer_go_to(context: CommandContext, id_: str) -> Message:
+    """Select a vertex, landmark, closure or mission in the viewer, and move the open pages there.
+
+    $pick is the id of what was last selected, by a click in a page as well: `why $pick`.
+
+    Args:
+        id_: Beginning of the id, as other commands print it.
+    """
+    viewer = running_viewer(context)
+    viewer.wait()
+    viewer.fly_to(id_)
+    return Message(f"{context.session.variables['pick'][:8]} is selected in the viewer")
+
+
+@command(
     "viewer_stop", needs_map=False, see_also=("visualize",), acts_outside=True, guards_effects=True
 )
 def viewer_stop(context: CommandContext) -> Message:

@@ -129,6 +129,39 @@ def test_the_history_is_a_slider_in_the_page_and_in_a_file(browser: Any, tmp_pat
     page.page.close()
 
 
+_CONTRASTS = """[...document.querySelectorAll("label")].filter((label) => label.offsetWidth).map((label) => {
+  const light = (colour) => colour.match(/[0-9.]+/g).slice(0, 3).map((c) => c / 255)
+    .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+  const [text, ground] = [getComputedStyle(label).color, getComputedStyle(document.body).backgroundColor]
+    .map(light).map((l) => l + 0.05);
+  return Math.max(text, ground) / Math.min(text, ground);
+})"""
+"""Contrast of the words beside widgets (WCAG 2.1)."""
+
+
+def test_the_panel_suits_phones_and_its_words_can_be_read(browser: Any) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    page = Page(browser, viewer.url, (390, 844))
+    header = page.page.get_by_text("walk", exact=True)
+    assert page.wait_until(lambda: header.count() == 1)
+    assert page.wait_until(lambda: header.bounding_box()["y"] > 0.55 * 844)
+    assert page.page.locator("div[style*='max-height: 60%']").bounding_box()["width"] == 390
+    for width, height in ((800, 600), (1440, 900)):
+        page.page.set_viewport_size({"width": width, "height": height})
+        assert page.wait_until(lambda w=width: header.bounding_box()["x"] > w - 340)
+    for is_dark in (False, True):
+        viewer.set_dark(is_dark)
+        page.settle()
+        contrasts = page.page.evaluate(_CONTRASTS)
+        assert len(contrasts) > 5
+        assert min(contrasts) >= 4.5
+    assert page.errors == []
+    viewer.stop()
+    page.page.close()
+
+
 _OVERFLOWING = """[...document.querySelectorAll(".mantine-ScrollArea-viewport")]
   .filter((area) => area.scrollHeight > area.clientHeight).length"""
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.viewer.display.camera import Cameras, share_of_picture, view_of
+from maplab_py.viewer.display.camera import FIELD_OF_VIEW_RAD, Cameras, share_of_picture, view_of
 from maplab_py.viewer.scene import Extent
 
 
@@ -19,8 +19,8 @@ def extent(radius_m: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     return Extent(np.asarray(centre), radius_m, centre[2], outline)
 
 
-def page(number: int) -> Any:
-    camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+def page(number: int, aspect: float = 1.6) -> Any:
+    camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3), aspect=aspect)
     return SimpleNamespace(client_id=number, camera=camera, atomic=threading.Lock)
 
 
@@ -36,7 +36,11 @@ def test_a_view_shows_everything_beside_the_panel(radius_m: float, room: float) 
 
 def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     pages = {3: page(3), 7: page(7)}
-    server = SimpleNamespace(initial_camera=SimpleNamespace(), get_clients=lambda: pages)
+    server = SimpleNamespace(
+        initial_camera=SimpleNamespace(),
+        get_clients=lambda: pages,
+        on_client_connect=lambda _: None,
+    )
     cameras = Cameras(server)
     cameras.show_all(extent(1.0))
     pages[7].camera.position = np.add(
@@ -60,3 +64,31 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     np.testing.assert_array_equal(pages[9].camera.position, pages[3].camera.position)
     cameras.show_all(extent(1.0))  # another map is for all
     np.testing.assert_array_equal(pages[7].camera.position, pages[3].camera.position)
+
+
+def test_a_phone_sees_everything_above_its_sheet() -> None:
+    seen = extent(4.0, (5.0, -2.0, 1.0))
+    phones, connected = {1: page(1, 390 / 844)}, []
+    server = SimpleNamespace(
+        initial_camera=SimpleNamespace(),
+        get_clients=lambda: phones,
+        on_client_connect=connected.append,
+    )
+    cameras = Cameras(server)
+    cameras.show_all(seen)
+    phones[2] = page(2, 390 / 844)
+    connected[0](phones[2])
+    for phone in phones.values():
+        back = phone.camera.position - phone.camera.look_at
+        back /= np.linalg.norm(back)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        p = (seen.outline - phone.camera.position) @ np.stack(
+            [right, np.cross(back, right), back]
+        ).T
+        at = p[:, :2] / (-p[:, 2:] * np.tan(0.5 * FIELD_OF_VIEW_RAD))
+        assert np.abs(at[:, 0]).max() < 390 / 844
+        assert -0.16 - 1e-6 < at[:, 1].min() < at[:, 1].max() < 1.0
+    before = phones[2].camera.position
+    cameras.keep_in_view(extent(30.0))  # nobody has moved it
+    assert np.linalg.norm(phones[2].camera.position - before) > 10.0
