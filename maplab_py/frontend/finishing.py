@@ -17,7 +17,8 @@ from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
-from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.calibration_choice import describe_freed
+from maplab_py.algorithms.vi_optimization.optimization import contradicted_calibration, optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.frontend.localization.record import summarised
@@ -79,7 +80,7 @@ def finish(
             doubts = scale_doubts(vi_map)
             first = cause(check_map(vi_map) if mapping.doubts is None else mapping.doubts)
             notes += [] if first is None else [f"this recording shows: {first.line}"]
-            if mapping.is_mended and not is_to_end():
+            if _has_wrong_calibration(vi_map, mapping, progress, is_to_end):
                 vi_map, doubts, words = _adjusted(vi_map, doubts, progress)
                 notes += words
             if output.optimize_map_to_localization_map:
@@ -131,10 +132,22 @@ def localization_map(vi_map: VIMap, output: OutputOptions, *, progress: Progress
     return result
 
 
+def _has_wrong_calibration(
+    vi_map: VIMap, mapping: Mapping, progress: Progress, is_to_end: Callable[[], bool]
+) -> bool:
+    """Tell whether the calibration was mended, or is contradicted by the residuals of the map."""
+    if is_to_end() or not mapping.options.odometry.apply_calibration:
+        return False
+    try:
+        return mapping.is_mended or contradicted_calibration(vi_map, progress)
+    except EstimationError:  # nothing in the map can be optimised
+        return False
+
+
 def _adjusted(
     vi_map: VIMap, doubts: tuple[str, ...], progress: Progress
 ) -> tuple[VIMap, tuple[str, ...], list[str]]:
-    """Optimise the map of a recording whose calibration was mended, with the calibration of the cameras free.
+    """Optimise the map of a recording whose calibration is wrong, with the calibration of the cameras free.
 
     Most vertices have left the window before it knew the calibration.
 
@@ -143,8 +156,9 @@ def _adjusted(
     """
     names = [field.name for field in dataclasses.fields(VIOptimizationOptions)]
     free: dict[str, Any] = {name: False for name in names if name.startswith("fix_ncamera_")}
+    options = VIOptimizationOptions(**free)
     try:
-        result, report = optimize(vi_map, VIOptimizationOptions(**free), progress=progress)
+        result, report = optimize(vi_map, options, progress=progress)
     except EstimationError as error:
         return vi_map, doubts, [f"not optimised with its calibration free: {error}"]
     left = scale_doubts(result)
@@ -152,8 +166,9 @@ def _adjusted(
         return vi_map, doubts, [f"not optimised with its calibration free: {left[0]}"]
     note = (
         "the map was optimised with the calibration of the cameras free, since the recording's was wrong: "
-        f"reprojection error {report.median_reprojection_before_px:.2f} px before, "
-        f"{report.median_reprojection_after_px:.2f} px after"
+        f"{', '.join(describe_freed(options, report))}; reprojection error "
+        f"{report.median_reprojection_before_px:.2f} px before, {report.median_reprojection_after_px:.2f} px "
+        "after (--vio_apply_calibration=false keeps it)"
     )
     return result, left, [note]
 

@@ -66,8 +66,9 @@ class OdometryOptions(Options, prefix="vio_"):
     images on the clock of the IMU), intrinsics, line_delay; or none; auto = time_offset, and all of them
     where check_recording has found the calibration wrong"""
     apply_calibration: bool = True
-    """Give the map the calibration that was estimated, where it differs significantly; and read a recording
-    in the units, axes and calibration that check_recording finds, where its own do not fit"""
+    """Give the map the calibration that was estimated, where it differs significantly; read a recording in
+    the units, axes and calibration that check_recording finds, where its own do not fit; and optimise the map
+    with the calibration of the cameras free, where its residuals contradict it"""
     imu_noise: str = option("auto", choices=("auto", "file"))
     """Noise of the IMU: file = as the calibration says, auto = the same unless the samples show that it
     cannot be"""

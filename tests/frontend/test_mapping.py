@@ -17,8 +17,10 @@ from maplab_py.frontend import finishing
 from maplab_py.frontend.finishing import finish, scale_verdict
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import OutputOptions, RunOptions
+from maplab_py.geometry import so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
@@ -28,6 +30,7 @@ from maplab_py.storage.native import load_map
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.nav_state import NavState
+from tests.algorithms.recording_check.faults import with_rig
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import EditedRecording, position_errors, replayed
 from tests.support.own_process import in_own_process
@@ -409,3 +412,21 @@ def test_there_is_one_verdict_on_the_scale(
     notes = scale_verdict(sigma, since_s, doubts)
     assert len(notes) == bool(words)
     assert all(words in note for note in notes)
+
+
+def test_a_map_that_contradicts_its_calibration_is_optimised_with_it_free() -> None:
+    recording, start = recording_of()
+    wrong = with_rig(recording, turn_deg=(0.0, 1.5, 0.0), move_m=(0.02, 0.0, 0.0))
+    mapping = Mapping(wrong, make_starter=start)
+    mapping.run()
+    finished = finish(mapping, wrong.name)
+    assert finished.vi_map is not None
+    device, sensors = recording.device, finished.vi_map.sensors
+    T_I_C = sensors.T_I_C(device.imu.id, device.rig.id)
+    turned = so3.log(so3.multiply(so3.inverse(device.T_I_C[:, :4]), T_I_C[:, :4]))
+    assert np.degrees(np.linalg.norm(turned, axis=1)).max() < 0.3
+    (note,) = (line for line in finished.report.notes if "calibration of the cameras free" in line)
+    assert "rotation on the IMU" in note
+    kept = dataclasses.replace(OdometryOptions(), apply_calibration=False)
+    mapping.options = dataclasses.replace(mapping.options, odometry=kept)
+    assert not any("calibration" in line for line in finish(mapping, wrong.name).report.notes)

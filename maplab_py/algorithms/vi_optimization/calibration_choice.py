@@ -27,6 +27,7 @@ from maplab_py.vimap import VIMap
 _LANDMARK_DAMPING = 1e-12
 _CONVERGED = ("cost has converged", "no more decrease is expected", "step is small")
 _MIN_OBSERVATIONS = 3000
+_DIRECT = "multifrontal"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +74,18 @@ def may_free(options: VIOptimizationOptions, report: VIOptimizationReport) -> bo
         and options.include_visual
         and options.include_inertial
         and not (options.fix_vertices or options.fix_landmark_positions or is_calibrating(options))
-        and report.linear_solver == "multifrontal"
-        and report.termination in _CONVERGED
+        and may_free_more(report)
     )
+
+
+def may_free_more(report: VIOptimizationReport) -> bool:
+    """Tell whether more calibration may be freed after an optimisation."""
+    return is_direct(report) and report.termination in _CONVERGED
+
+
+def is_direct(report: VIOptimizationReport) -> bool:
+    """Tell whether the linear solver was the one that supports cameras as states."""
+    return report.linear_solver == _DIRECT
 
 
 def with_contradicted_freed(
@@ -89,12 +99,12 @@ def with_contradicted_freed(
 
     Args:
         vi_map: The map at its optimum.
-        options: Whose calibration is fixed.
+        options: Of the optimisation; what they free stays free.
         missions: Mission rows.
         progress: Shown meanwhile.
     """
     flags: dict[str, Any] = {group.flag: False for group in _GROUPS}
-    free = dataclasses.replace(options, **flags, linear_solver_type="multifrontal")
+    free = dataclasses.replace(options, **flags, linear_solver_type=_DIRECT)
     problem = build(vi_map, free, missions=missions, progress=progress)
     visual = problem.problem.visual
     if visual is None or np.count_nonzero(visual.observations.inverse_sigma) < _MIN_OBSERVATIONS:
@@ -102,8 +112,9 @@ def with_contradicted_freed(
     step = _newton_step(problem)
     if step is None:
         return options
-    chosen: dict[str, Any] = dict.fromkeys(_chosen(step), False)
-    if not chosen:
+    known = [k for k, group in enumerate(_GROUPS) if not getattr(options, group.flag)]
+    chosen: dict[str, Any] = dict.fromkeys(_chosen(step, known), False)
+    if len(chosen) == len(known):
         return options
     progress.line("the residuals contradict the calibration: it is freed where they do")
     return dataclasses.replace(options, **chosen)
@@ -169,11 +180,11 @@ def _counts(map_problem: MapProblem, group: _Group, row: int, column: int) -> fl
     return float(map_problem.states.blocks[INTRINSICS].values[row, column]) if is_focal else np.inf
 
 
-def _chosen(step: _Step) -> list[str]:
-    """Return the flags of the groups that are chosen, the most wanted first."""
-    chosen: list[int] = []
+def _chosen(step: _Step, known: list[int]) -> list[str]:
+    """Return the flags of the groups that are chosen, after the known ones the most wanted first."""
+    chosen = list(known)
     while True:
-        _, known = step.of(chosen)
+        _, reached = step.of(chosen)
         wanted: dict[int, float] = {}
         for k, group in enumerate(_GROUPS):
             if k in chosen:
@@ -182,7 +193,7 @@ def _chosen(step: _Step) -> list[str]:
             change, gain = step.of([*chosen, k, 0] if k == 1 else [*chosen, k])
             in_units = np.abs(change / step.units)[step.group == k].max(initial=0.0)
             if in_units >= group.least_change:
-                wanted[k] = (gain - known) / group.least_gain
+                wanted[k] = (gain - reached) / group.least_gain
         best = max(wanted, key=wanted.__getitem__, default=-1)
         if best < 0 or wanted[best] < 1.0:
             return [_GROUPS[k].flag for k in chosen]
@@ -191,14 +202,19 @@ def _chosen(step: _Step) -> list[str]:
 
 def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> str:
     """Return in words what was freed, and what was found."""
-    parts = []
+    return (
+        "the residuals contradict the calibration, so this was estimated: "
+        f"{', '.join(describe_freed(options, report))} (--ba_calibration=fixed keeps it)"
+    )
+
+
+def describe_freed(options: VIOptimizationOptions, report: VIOptimizationReport) -> list[str]:
+    """Return the largest change of every group that the options free."""
+    parts: list[str] = []
     for group in _GROUPS:
         if not getattr(options, group.flag):
             parts += _describe_values(group, report.calibration)
-    return (
-        f"the residuals contradict the calibration, so this was estimated: {', '.join(parts)} "
-        "(--ba_calibration=fixed keeps it)"
-    )
+    return parts
 
 
 def _describe_values(group: _Group, rows: list[CalibratedParameter]) -> list[str]:

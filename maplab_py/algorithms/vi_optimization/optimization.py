@@ -11,13 +11,15 @@ import numpy as np
 from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.vi_optimization.calibration_choice import (
     freed_note,
+    is_direct,
     may_free,
+    may_free_more,
     with_contradicted_freed,
 )
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build
 from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.report_building import make_report
-from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
+from maplab_py.algorithms.vi_optimization.reports import CalibratedParameter, VIOptimizationReport
 from maplab_py.algorithms.vi_optimization.solution import apply_states
 from maplab_py.array_types import I64, NDArray
 from maplab_py.estimation.problem.solver import AfterStep, SolverOptions, optimize_states
@@ -26,6 +28,7 @@ from maplab_py.progress import SILENT, Progress, SilentProgress
 from maplab_py.vimap import VIMap
 
 _DOUBTFUL_ERROR_PX = 3.0
+_FEW_ITERATIONS = 3
 
 Watch = Callable[[Callable[[], VIMap]], None]
 """Called between iterations with a function that returns the current map."""
@@ -61,16 +64,36 @@ def optimize(
     if fixed_vertices is not None or not may_free(options, report):
         return result, report
     free = with_contradicted_freed(result, options, missions=missions, progress=progress)
-    if free == options:
-        return result, report
-    result, more = _optimize(result, free, missions, progress, watch)
-    return result, _joined(report, more, freed_note(free, more))
+    while free != options:
+        options = free
+        result, more = _optimize(result, options, missions, progress, watch)
+        report = _joined(report, more, options)
+        if may_free_more(more):
+            free = with_contradicted_freed(result, options, missions=missions, progress=progress)
+    return result, report
+
+
+def contradicted_calibration(vi_map: VIMap, progress: Progress = SILENT) -> bool:
+    """Tell whether the residuals of a map contradict its calibration, before it has been optimised.
+
+    After a few iterations the gains of a free calibration are about those at the optimum.
+    """
+    options = VIOptimizationOptions(calibration="auto", num_iterations=_FEW_ITERATIONS)
+    quiet = _Quiet(progress)
+    result, report = _optimize(vi_map, options, None, quiet, None)
+    if not is_direct(report):
+        return False
+    return with_contradicted_freed(result, options, progress=quiet) != options
 
 
 def _joined(
-    first: VIOptimizationReport, second: VIOptimizationReport, note: str
+    first: VIOptimizationReport, second: VIOptimizationReport, options: VIOptimizationOptions
 ) -> VIOptimizationReport:
     """Return the report of an optimisation and of what went on with a free calibration."""
+    second = dataclasses.replace(
+        second, calibration=_changes(first.calibration, second.calibration)
+    )
+    note = freed_note(options, second)
     before = {row.mission: row for row in first.missions}
     missions = [
         dataclasses.replace(
@@ -97,6 +120,23 @@ def _joined(
             for name in ("iterations", "rejected_steps", "seconds_build", "seconds_solve", "seconds_total")
         },
     )  # fmt: skip
+
+
+def _changes(
+    first: list[CalibratedParameter], second: list[CalibratedParameter]
+) -> list[CalibratedParameter]:
+    """Return the rows of the second with what has changed since before the first."""
+    before = {row.parameter: row for row in first}
+    rows = []
+    for row in second:
+        known = before.get(row.parameter, row)
+        if known is row:
+            rows.append(row)
+        elif row.before == known.after:
+            rows.append(dataclasses.replace(row, before=known.before))
+        else:  # poses are given as changes
+            rows.append(dataclasses.replace(row, after=row.after + known.after))
+    return rows
 
 
 def _optimize(

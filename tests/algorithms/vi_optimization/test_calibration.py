@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.optimization import contradicted_calibration, optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig
@@ -174,6 +174,8 @@ def with_fault(vi_map: VIMap, fault: str) -> VIMap:
         camera = dataclasses.replace(camera, image_delay_s=camera.image_delay_s + 0.005)
     elif fault == "extrinsics_rotation":
         T_B_C = se3.retract(T_B_C, np.array([[0, 0, 0, 0.015, -0.01, 0.01]]))
+    elif fault == "mounting":
+        T_B_C = se3.retract(T_B_C, np.array([[0.06, -0.05, 0.03, 0.03, -0.02, 0.02]]))
     elif fault == "intrinsics":
         camera = dataclasses.replace(camera, intrinsics=camera.intrinsics * [1.02, 1.02, 1.0, 1.0])
     elif fault == "line_delay":
@@ -186,6 +188,7 @@ def with_fault(vi_map: VIMap, fault: str) -> VIMap:
 def test_a_true_calibration_stays_to_the_last_bit(data: SimulatedData) -> None:
     result, report = optimize(data.maps[0], AUTO)
     wanted, _ = optimize(data.maps[0], FIXED)
+    assert not contradicted_calibration(data.maps[0])
     assert report.calibration == []
     assert "calibration" not in report.note
     np.testing.assert_array_equal(result.vertices.T_M_I, wanted.vertices.T_M_I)
@@ -204,6 +207,7 @@ def test_a_fault_is_freed_named_and_mended(
     data: SimulatedData, fault: str, words: str, block: str
 ) -> None:
     start = with_fault(data.maps[0], fault)
+    assert contradicted_calibration(start)
     result, report = optimize(start, AUTO)
     free = {f"fix_ncamera_{fault}": False}  # the same from a true calibration
     wanted, _ = optimize(data.maps[0], dataclasses.replace(FIXED, **free))
@@ -217,6 +221,21 @@ def test_a_fault_is_freed_named_and_mended(
     assert evaluate_map(result, truth).ate_m <= 1.1 * of_truth_m
     assert evaluate_map(kept, truth).ate_m > 1.3 * of_truth_m
     assert optimize(result, AUTO)[1].calibration == []
+
+
+def test_what_shows_once_a_rotation_is_free_is_freed_then(data: SimulatedData) -> None:
+    start = with_fault(data.maps[0], "mounting")
+    result, report = optimize(start, AUTO)
+    assert "rotation on the IMU" in report.note
+    assert "position on the IMU" in report.note
+    before, after = (
+        next(s for s in m.sensors.sensors.values() if isinstance(s, CameraRig)).T_B_C[0, 4:]
+        for m in (start, result)
+    )
+    reported = {row.parameter[-5:]: row.after - row.before for row in report.calibration}
+    moved = [reported[f"{axis} [m]"] for axis in "xyz"]
+    np.testing.assert_allclose(moved, after - before, atol=1e-9)
+    np.testing.assert_allclose(moved, [-0.06, 0.05, -0.03], atol=0.02)
 
 
 def test_a_rolling_shutter_is_found() -> None:
