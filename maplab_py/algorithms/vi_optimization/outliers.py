@@ -16,6 +16,8 @@ _MIN_OBSERVATIONS = 2
 """Minimum number of inliers of an active landmark."""
 _OUTLYING = 3.0
 """Minimum error of an outlier in multiples of the median, for states far from the optimum."""
+_USUAL_PX = 2.0
+"""Error from which on observations count little where positions of a landmark are compared."""
 
 
 class OutlierRejection:
@@ -74,14 +76,22 @@ class OutlierRejection:
         return self._used_per_landmark() >= _MIN_OBSERVATIONS
 
     def better_placed(self, states: States, others: States) -> States:
-        """Return the states with each landmark at the position where more observations pass the gate."""
-        data, limit = self._visual.observations, self._options.gate_reprojection_error_px
-        passing = [
-            np.bincount(data.landmark, self._agree(s, limit), minlength=len(data.start) - 1)
-            for s in (states, others)
-        ]
-        is_better = (passing[1] > passing[0])[:, None]
-        return dataclasses.replace(states, p_G=np.where(is_better, others.p_G, states.p_G))
+        """Return the states with each landmark at the position that its observations contradict less.
+
+        Outliers count alike, so that an optimised landmark does not leave its inliers for them.
+        """
+        data, errors = self._visual.observations, []
+        for candidate in (states, others):
+            error_px, depth_m = self._visual.errors(candidate)
+            ahead = (depth_m > 0.0) & np.isfinite(error_px)
+            errors.append(np.where(ahead, error_px, np.inf))
+        largest_px = self._options.outlier_rejection_max_reprojection_error_px
+        largest_px = max(largest_px, _OUTLYING * float(np.median(errors[0])))
+        loss = [np.log1p((np.minimum(e, largest_px) / _USUAL_PX) ** 2) for e in errors]
+        now, new = (np.bincount(data.landmark, x, minlength=len(data.start) - 1) for x in loss)
+        return dataclasses.replace(
+            states, p_G=np.where((new < now)[:, None], others.p_G, states.p_G)
+        )
 
     def _agree(self, states: States, max_error_px: float) -> Mask:
         """Return which observations lie in front of the camera with an error below the limit."""

@@ -99,6 +99,19 @@ def test_doubtful_landmarks_are_triangulated_anew() -> None:
     assert np.mean(is_bad) <= 0.2
 
 
+def test_a_second_run_begins_where_the_first_has_ended() -> None:
+    truth = SCENE.make()
+    uv, landmark = truth.keypoints.uv_px.copy(), truth.keypoints.landmark
+    for row in range(0, len(truth.landmarks), 10):  # tracks that have jumped
+        of_track = np.flatnonzero(landmark == row)
+        uv[of_track[-(2 * len(of_track) // 5) :], 0] += 25.0
+    jumped = truth.replace(keypoints=truth.keypoints.replace(uv_px=uv))
+    once, first = optimize(jumped, TIGHT)
+    _, second = optimize(once, TIGHT)
+    assert first.observations_rejected + first.observations_not_used > 0
+    assert second.cost_before <= 1.001 * first.cost_after
+
+
 def test_observations_return_when_poses_have_improved() -> None:
     truth = SCENE.make()
     rng = np.random.default_rng(1)
