@@ -307,12 +307,3 @@ def _feed(value: Any, checksum: Any) -> None:
             _feed(item, checksum)
     else:
         checksum.update(repr(value).encode())
-
-
-def folder_digest(folder: Path) -> dict[str, str]:
-    """Return a checksum of every file below a folder."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
