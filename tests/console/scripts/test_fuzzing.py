@@ -123,50 +123,29 @@ FLAG_LINES = st.lists(
     ),
     max_size=4,
 ).map("\n".join)
+MANY = max(300, settings().max_examples)  # --hypothesis-profile=search asks for more
 IN_ONE_PLACE = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 
 
 @given(LINES)
-@settings(max_examples=100, deadline=None, suppress_health_check=IN_ONE_PLACE)
+@settings(max_examples=MANY, suppress_health_check=IN_ONE_PLACE)
 def test_lines(capsys: pytest.CaptureFixture[str], line: str) -> None:
     check_line(line, capsys)
 
 
 @given(REFUSED)
-@settings(max_examples=100, deadline=None, suppress_health_check=IN_ONE_PLACE)
+@settings(max_examples=MANY, suppress_health_check=IN_ONE_PLACE)
 def test_a_refused_line_changes_nothing(capsys: pytest.CaptureFixture[str], line: str) -> None:
     assert check_line(line, capsys) == Status.USER_ERROR
 
 
 @given(FLAG_LINES)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=MANY)
 def test_flag_files(flagfile: Path, text: str) -> None:
     check_flagfile(flagfile, text)
 
 
 @given(LINES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_completion_and_colours(line: str) -> None:
     check_completion(line)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [1, 2])
-@given(line=LINES)
-@settings(max_examples=2000, deadline=None, suppress_health_check=IN_ONE_PLACE)
-def test_many_lines(capsys: pytest.CaptureFixture[str], share: int, line: str) -> None:
-    check_line(line, capsys)
-
-
-@pytest.mark.slow
-@given(REFUSED)
-@settings(max_examples=1000, deadline=None, suppress_health_check=IN_ONE_PLACE)
-def test_many_refused_lines(capsys: pytest.CaptureFixture[str], line: str) -> None:
-    assert check_line(line, capsys) == Status.USER_ERROR
-
-
-@pytest.mark.slow
-@given(FLAG_LINES)
-@settings(max_examples=5000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_many_flag_files(flagfile: Path, text: str) -> None:
-    check_flagfile(flagfile, text)
