@@ -343,7 +343,7 @@ def moved(flags: tuple[str, ...]) -> LoopClosureOptions:
 
 @pytest.mark.slow
 def test_moving_the_named_flags_accepts_closures_of_a_real_map() -> None:
-    assert_that_named_flags_accept(euroc(), closures=5)
+    assert_that_named_flags_accept(euroc(), closures=2)
 
 
 def euroc() -> VIMap:
@@ -357,7 +357,7 @@ def euroc() -> VIMap:
 @pytest.mark.slow
 def test_moving_the_named_flags_accepts_closures_of_the_tango_map() -> None:
     vi_map = load_map(shared_data("maplab_maps/tango_handheld"))[0]
-    assert_that_named_flags_accept(vi_map, closures=5)
+    assert_that_named_flags_accept(vi_map, closures=2)
 
 
 def assert_that_named_flags_accept(vi_map: VIMap, closures: int) -> None:

@@ -53,10 +53,7 @@ def of_one_colour(picture: Any) -> int:
     return int(np.count_nonzero(channels.max(axis=2) - channels.min(axis=2) > 40))
 
 
-@pytest.mark.parametrize(
-    ("rule", "legend"),
-    [("shaded", ""), ("colour", ""), ("distance", "distance")],
-)
+@pytest.mark.parametrize(("rule", "legend"), [("shaded", ""), ("distance", "distance")])
 def test_a_mesh_by_every_rule(page: Page, viewer: Viewer, rule: MeshColouring, legend: str) -> None:
     viewer.show(SUBJECT)
     viewer.look_at_everything()
