@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from maplab_py.atomic import PendingFile, replaced_file
-from maplab_py.atomic.targets import reason, resolved
+from maplab_py.atomic.files import reason, resolved
 from maplab_py.cancellation import cleaned_up
 from maplab_py.errors import UserError
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 
+from maplab_py.atomic.files import make_folders, reason, remove_folders, resolved, sibling
 from maplab_py.atomic.system import exchanged, flush_folder, flush_tree, opened_locked
-from maplab_py.atomic.targets import make_folders, reason, remove_folders, resolved, sibling
 from maplab_py.cancellation import cleaned_up, lasting_effect, provisional_effects
 from maplab_py.errors import UserError
 

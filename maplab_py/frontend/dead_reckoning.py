@@ -18,8 +18,8 @@ from maplab_py.geometry import se3, so3, yaw
 from maplab_py.sensors import Imu
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap.merge import stack
 from maplab_py.vimap.nav_state import NavState
-from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.tables import LoopClosureEdges
 
 LONGEST_S = 20.0

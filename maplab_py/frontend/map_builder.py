@@ -18,8 +18,8 @@ from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.merge import stack
 from maplab_py.vimap.nav_state import NavState
-from maplab_py.vimap.stacking import stack
 
 _EARLY = 0.95
 """A frame may come this share of the interval after the last vertex (maplab's tolerance)."""

@@ -6,7 +6,8 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from maplab_py.array_types import F64, Mask
 
 TRIANGLE_NAMES = {
     "x scale": (0, 0),
@@ -19,7 +20,7 @@ TRIANGLE_NAMES = {
 """Names of the entries of the upper triangular matrices, in the order of the estimated parameters."""
 
 
-def _identity() -> NDArray[np.float64]:
+def _identity() -> F64:
     return np.eye(3)
 
 
@@ -30,9 +31,9 @@ class ImuIntrinsics:
     w_measured = T_g w_I + b_g;  a_measured = T_a R_AI R_IG (a_G - g_G) + b_a, T upper triangular.
     """
 
-    T_g: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
-    T_a: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
-    R_A_I: NDArray[np.float64] = dataclasses.field(default_factory=_identity)
+    T_g: F64 = dataclasses.field(default_factory=_identity)
+    T_a: F64 = dataclasses.field(default_factory=_identity)
+    R_A_I: F64 = dataclasses.field(default_factory=_identity)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,3 +52,15 @@ class Imu:
     topic: str = ""
     description: str = ""
     extra: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def is_saturated(self, accel_gyro: F64) -> Mask:
+        """Return which samples (N, 6) [m/s^2, rad/s] reach a limit of the sensor on some axis."""
+        limits = np.repeat([self.saturation_accel_max_mps2, self.saturation_gyro_max_radps], 3)
+        return np.asarray(np.any(np.abs(accel_gyro) >= limits, axis=1))
+
+
+def gravity_mps2(latitude_deg: float, altitude_m: float) -> float:
+    """Return gravity on the WGS 84 ellipsoid (Somigliana) with the free-air gradient [m/s^2]."""
+    sine2 = np.sin(np.radians(latitude_deg)) ** 2
+    at_sea = 9.7803253359 * (1 + 0.00193185265241 * sine2) / np.sqrt(1 - 0.00669437999013 * sine2)
+    return float(at_sea - 3.086e-6 * altitude_m)

@@ -36,7 +36,7 @@ from maplab_py.storage import checksums
 from maplab_py.storage.native import is_map_folder
 from maplab_py.storage.resources.store import MAP_FOLDER
 from maplab_py.vimap import VIMap
-from maplab_py.vimap.stacking import resource_folder_name
+from maplab_py.vimap.merge import resource_folder_name
 
 _PUSHED = ".pushed.json"
 QUIET_S = 5.0

@@ -12,10 +12,10 @@ from maplab_py.geometry import se3, yaw
 from maplab_py.report import Report
 from maplab_py.vimap.edits import merge_landmarks, transform_mission
 from maplab_py.vimap.ids import IdArray, IdIndex, is_valid, to_hex
+from maplab_py.vimap.merge import stack
 from maplab_py.vimap.queries import has_link
 from maplab_py.vimap.selection import keep_rows
 from maplab_py.vimap.sensor_merge import conflicting_sensors
-from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vimap.tables import NO_ROW, AbsolutePoses, ResourceOwner, Resources
 from maplab_py.vimap.vi_map import VIMap

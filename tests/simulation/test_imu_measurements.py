@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.propagation import propagate
+from maplab_py.estimation.imu.preintegration import propagate
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from maplab_py.simulation.imu import ImuRecording, intrinsics_of, measure

@@ -16,9 +16,9 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.vimap import IdArray, ResourceOwner, VIMap, as_keys, is_valid, ragged_rows, to_hex
 from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, remove_missions
+from maplab_py.vimap.merge import stack
 from maplab_py.vimap.selection import keep_rows
 from maplab_py.vimap.sensor_merge import conflicting_sensors
-from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.tables import NO_ROW
 from maplab_py.vimap.vertex_removal import remove_vertices
 

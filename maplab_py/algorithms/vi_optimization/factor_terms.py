@@ -28,6 +28,7 @@ from maplab_py.estimation.terms.wheel import WHEEL_SCALE, ScaledRelativePoseTerm
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.progress import Progress
 from maplab_py.sensors import Imu
+from maplab_py.sensors.imu import gravity_mps2
 from maplab_py.sensors.wheels import wheel_scale
 from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
 from maplab_py.vimap.ids import from_hex, to_hex
@@ -208,13 +209,6 @@ def _gravity_M(data: InertialData, options: DataOptions) -> F64:
     if options.gravity_magnitude_mps2 > 0.0:
         magnitudes = np.full(len(data), options.gravity_magnitude_mps2)
     return np.stack([np.zeros(len(data)), np.zeros(len(data)), -magnitudes], axis=1)
-
-
-def gravity_mps2(latitude_deg: float, altitude_m: float) -> float:
-    """Return gravity on the WGS 84 ellipsoid (Somigliana) with the free-air gradient [m/s^2]."""
-    sine2 = np.sin(np.radians(latitude_deg)) ** 2
-    at_sea = 9.7803253359 * (1 + 0.00193185265241 * sine2) / np.sqrt(1 - 0.00669437999013 * sine2)
-    return float(at_sea - 3.086e-6 * altitude_m)
 
 
 def _with_mountings(

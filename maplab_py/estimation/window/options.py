@@ -6,12 +6,21 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.estimation.window.standstill import StandstillSigmas
 from maplab_py.options import Options, option
 
 CALIBRATED = ("extrinsics", "time_offset", "intrinsics", "line_delay")
 """Groups of numbers of a calibration that can be estimated."""
 _RIG_KEYFRAMES, _MONO_KEYFRAMES = 7, 12
+
+
+@dataclasses.dataclass(frozen=True)
+class StandstillSigmas:
+    """Largest motion of a body at rest."""
+
+    position_m: float  # over an edge
+    rotation_rad: float
+    velocity_mps: float
+    turning_velocity_mps: float  # of a body that only turns
 
 
 class WindowOptions(Options, prefix="vio_"):

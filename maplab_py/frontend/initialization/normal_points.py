@@ -16,7 +16,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
-from maplab_py.estimation.imu.propagation import propagate
+from maplab_py.estimation.imu.preintegration import propagate
 from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.segment import ObservedFrames, Segment

@@ -15,12 +15,11 @@ from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
-from maplab_py.estimation.window.factors import FrameFactors
+from maplab_py.estimation.window.factors import FrameFactors, Standstill
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
-from maplab_py.estimation.window.standstill import Standstill
 from maplab_py.estimation.window.states import WindowStates, scale_sigma
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.estimation.window.triangulation import Triangulator

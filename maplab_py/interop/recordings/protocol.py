@@ -10,8 +10,6 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Protocol
 
-import numpy as np
-
 from maplab_py.array_types import F64, I32, I64, U8, Mask
 from maplab_py.interop.device import RecordedSensors as RecordedSensors
 from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_grey
@@ -29,8 +27,7 @@ class ImuBatch:
     @classmethod
     def of(cls, imu: Imu, times_ns: I64, accel_gyro: F64) -> ImuBatch:
         """Make a batch; saturation follows from the limits of the IMU."""
-        limits = np.repeat([imu.saturation_accel_max_mps2, imu.saturation_gyro_max_radps], 3)
-        return cls(times_ns, accel_gyro, np.any(np.abs(accel_gyro) >= limits, axis=1))
+        return cls(times_ns, accel_gyro, imu.is_saturated(accel_gyro))
 
     def __len__(self) -> int:
         return len(self.times_ns)

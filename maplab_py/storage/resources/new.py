@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from maplab_py.array_types import U8
 from maplab_py.atomic import replaced_file
-from maplab_py.atomic.targets import make_folders, remove_folders
+from maplab_py.atomic.files import make_folders, remove_folders
 from maplab_py.cancellation import check_cancelled, cleaned_up, lasting_effect, provisional_effects
 from maplab_py.storage.resources.store import MAP_FOLDER, path_in_folder
 from maplab_py.storage.resources.types import resource_type

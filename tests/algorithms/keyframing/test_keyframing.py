@@ -11,7 +11,7 @@ import pytest
 from maplab_py.algorithms.keyframing.heuristic import Reason, choose_keyframes, keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.propagation import propagate
+from maplab_py.estimation.imu.preintegration import propagate
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions

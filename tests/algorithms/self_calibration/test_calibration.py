@@ -28,7 +28,7 @@ from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import true_map
 from maplab_py.vimap.edits import with_new_ids
-from maplab_py.vimap.stacking import stack
+from maplab_py.vimap.merge import stack
 from tests.algorithms.self_calibration.scenes import EXACT, OPTIONS, device, scene_map, uncalibrated
 
 

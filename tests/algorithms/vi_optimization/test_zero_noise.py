@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.propagation import propagate
+from maplab_py.estimation.imu.preintegration import propagate
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig, Distortion, ImuIntrinsics, Projection
 from maplab_py.vimap import VIMap

@@ -9,8 +9,7 @@ import pytest
 
 from maplab_py.errors import MapError
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.estimation.imu.propagation import propagate
+from maplab_py.estimation.imu.preintegration import integrate, propagate
 from maplab_py.estimation.terms.inertial import SPEEDED_MPS, TURNED_RAD
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics

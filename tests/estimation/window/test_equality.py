@@ -21,14 +21,13 @@ from maplab_py.estimation.terms.prior import PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.cameras import CameraPoses
-from maplab_py.estimation.window.factors import FrameFactors
+from maplab_py.estimation.window.factors import FrameFactors, Standstill
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.estimation.window.standstill import Standstill
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT

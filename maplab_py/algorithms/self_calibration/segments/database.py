@@ -20,8 +20,8 @@ from maplab_py.output_files import write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, read_sensors, write_sensors
 from maplab_py.vimap import IdIndex, VIMap, from_hex
+from maplab_py.vimap.merge import stack
 from maplab_py.vimap.selection import sorted_by_time
-from maplab_py.vimap.stacking import stack
 from maplab_py.vimap.table import Table
 
 Key = tuple[str, str]
