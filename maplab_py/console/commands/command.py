@@ -24,6 +24,39 @@ ValueSource = str | Callable[[Any], list[tuple[str, str]]]
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 
+_OUTPUTS = (
+    "save_map_folder",
+    "rosbag_plugin_output_bag",
+    "dense_result_mesh_output_file",
+    "dense_esdf_export_map_for_panning_path",
+    "csv_export_path",
+    "summary_map_save_path",
+    "pose_export_file",
+    "mission_info_export_path",
+    "ncamera_calibration_export_folder",
+    "localization_csv",
+    "colmap_folder",
+    "colmap_workspace",
+    "pmvs_reconstruction_folder",
+    "dataset_folder",
+    "sensors_file",
+    "plot_file",
+    "viewer_file",
+    "output_file",
+    "map_folder",
+    "maps_folder",
+    "bag",
+    "apply",
+    "csv",
+    "file",
+    "folder",
+    "recording",
+)
+"""Flags that name what a command writes, maplab's names among them; a command has one of them at most."""
+_SENDERS = ("push", "simulate_robots", "play_recording")
+"""Commands that act outside, with a flag of such a name for what they read."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Command:
     """A registered command: the function and what its signature and docstring say."""
@@ -47,6 +80,14 @@ class Command:
     obeys_dry_run: bool = False  # acts outside, but not where `context.is_trial` is set
     completes: Mapping[str, ValueSource] = dataclasses.field(default_factory=dict)  # by flag
     reads: tuple[str, ...] = ()  # flags that name files or folders which must exist
+
+    @property
+    def output(self) -> str:
+        """Flag that `-o` stands for, of the file or folder that the command writes; empty if none."""
+        writes = self.writes_files or self.acts_outside or self.name == "lc_report"
+        writes = writes and self.name not in _SENDERS
+        outputs = (name for name in _OUTPUTS if writes and name in self.flags)
+        return next((name for name in outputs if name not in self.reads), "")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ def call_from_words(words: Sequence[str], registry: Registry, settings: Settings
     if command.raw_arguments:
         wants_help = list(words[1:]) == ["--help"]
         return Call(command, {}, () if wants_help else tuple(words[1:]), {}, wants_help)
-    given, plain = parse_words(words[1:], command.flags, command.name)
+    given, plain = parse_words(_with_output(words[1:], command), command.flags, command.name)
     common = {g.name: g.text for g in given if g.name not in command.flags}
     texts: dict[str, str] = {}
     for path in (g.text for g in given if g.name == "flagfile"):
@@ -115,6 +115,21 @@ def call_from_keywords(
         is_trial=bool(keywords.get("dry_run")) and _may_be_tried(command),
         max_memory_gb=_max_memory_gb(str(keywords.get("max_memory_gb", "0")), command),
     )
+
+
+def _with_output(words: Sequence[str], command: Command) -> list[str]:
+    """Return the words with the flag of the command's output in place of `-o`.
+
+    Raises:
+        FlagError: The command writes no file or folder.
+    """
+    is_output = [word == "-o" or word.startswith("-o=") for word in words]
+    if any(is_output) and not command.output:
+        raise FlagError(f"{command.name} writes no file: it has no -o")
+    return [
+        f"--{command.output}{word[2:]}" if is_flag else word
+        for word, is_flag in zip(words, is_output, strict=True)
+    ]
 
 
 def _may_be_tried(command: Command) -> bool:

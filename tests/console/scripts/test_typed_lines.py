@@ -298,6 +298,33 @@ def test_a_flag_without_which_a_command_refuses_may_be_given_by_position(name: s
     assert str(call.values[flag]) == "9"
 
 
+@pytest.mark.parametrize(
+    ("line", "flag"),
+    [
+        ("save -o x", "map_folder"),
+        ("rovioli walk -o x", "save_map_folder"),
+        ("rovioli walk -o=x", "save_map_folder"),
+        ("export_g2o -o x", "file"),
+        ("plot_trajectory -o x", "plot_file"),
+        ("ettc -o x", "pose_export_file"),
+        ("export_mcap -o x", "recording"),
+        ("check_recording walk -o x", "apply"),
+    ],
+)
+def test_one_letter_names_what_any_command_writes(line: str, flag: str) -> None:
+    assert Session().parse(line.split()).values[flag] == Path("x")
+
+
+def test_what_is_read_is_no_output() -> None:
+    registry = load_registry()
+    assert {"load", "push", "play_recording"} & {
+        c.name for c in registry.commands if c.output
+    } == set()
+    assert all(c.output not in c.reads for c in registry.commands)
+    with pytest.raises(FlagError, match="map_stats writes no file"):
+        Session().parse(["map_stats", "-o", "x"])
+
+
 REGISTRY = load_registry()
 
 
@@ -426,6 +453,8 @@ def test_a_script_is_predicted_from_former_runs(
     monkeypatch.chdir(tmp_path)
     for name, count in (("small", 1), ("large", 3)):
         save_map(map_of(count), tmp_path / name)
+    (tmp_path / "large" / "resources").mkdir()
+    (tmp_path / "large" / "resources" / "images").write_bytes(bytes(1_000_000))
     text = "load small; map_stats; save copies"
     Path("s.maplab").write_text(text)
     plan = session.check("s.maplab")
