@@ -135,7 +135,7 @@ class StereoOptions(Options, prefix="dense_stereo_"):
     downscaling_factor: float = option(1.0, gt=0, le=1)
     """Images are matched at this fraction of their size"""
     adapt_params_to_image_size: bool = True
-    """Take an eighth of the image's width as the number of disparities"""
+    """Take an eighth of the image's width as the number of disparities, more where landmarks are nearer"""
     min_baseline: float = option(0.02, gt=0, unit="m")
     """Pairs of cameras nearer to each other are left out"""
     max_angle_between_opt_axes: float = option(0.785, unit="rad")

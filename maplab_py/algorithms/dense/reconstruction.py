@@ -7,12 +7,12 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from maplab_py.algorithms.dense.clouds import CloudMaker
-from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions, check_matcher
+from maplab_py.algorithms.dense.depth_matcher import DepthMatcher, without_edges
+from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions
 from maplab_py.algorithms.dense.rectification import StereoPair, pinhole_pose, stereo_pairs
 from maplab_py.algorithms.dense.resources import (
     COLOUR_CLOUDS,
@@ -22,6 +22,7 @@ from maplab_py.algorithms.dense.resources import (
     chosen_missions,
     mission_rig,
 )
+from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.array_types import F32, F64, I64, U8, Mask
 from maplab_py.compilation import compiled, prange
 from maplab_py.errors import UserError
@@ -31,10 +32,19 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import ResourceOwner, VIMap, resources_of, to_hex, without_resources
+from maplab_py.vimap import (
+    LandmarkQuality,
+    ResourceOwner,
+    VIMap,
+    resources_of,
+    to_hex,
+    without_resources,
+)
 
 OUTPUT_TYPES = (RAW_DEPTH_MAPS, COLOUR_CLOUDS)
 _NEIGHBOURS_EACH_WAY = 3
+_LEAST_LANDMARKS, _INLIER_PX, _NEAR_QUANTILE = 200, 3.0, 0.02
+"""Observations that tell the depth of a scene, and the share of them that may be wrong and too near."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +56,8 @@ class PairReport:
     right_camera: int
     vertices: int
     without_images: int
+    disparities_px: int
+    nearest_m: float  # surfaces nearer than this have no depth
     matched_share: float  # of the rectified pixels, before neighbouring vertices are asked
     kept_share: float  # after that, without edges
 
@@ -168,6 +180,24 @@ class _Sequence:
     def left_frames(self) -> I64:
         return self.frames[:, 0]
 
+    @property
+    def near_m(self) -> float:
+        """Depth of the nearest landmarks in the left images; infinite where there are too few."""
+        vi_map = self.vi_map
+        of_frame = np.zeros(len(vi_map.frames), dtype=np.bool_)
+        of_frame[self.left_frames] = True
+        keypoints = np.flatnonzero(
+            of_frame[vi_map.keypoint_frame] & (vi_map.keypoints.landmark >= 0)
+        )
+        landmark = vi_map.keypoints.landmark[keypoints]
+        good = vi_map.landmarks.quality[landmark] != LandmarkQuality.BAD
+        if np.count_nonzero(good) < _LEAST_LANDMARKS:
+            return float("inf")
+        compared = residuals(vi_map, keypoints[good], vi_map.p_G[landmark[good]])
+        inliers = (compared.signed_distance_m > 0.0) & (compared.error_px < _INLIER_PX)
+        depth_m = compared.signed_distance_m[inliers]
+        return float(np.quantile(depth_m, _NEAR_QUANTILE)) if len(depth_m) else float("inf")
+
     def neighbour_offsets(self, interval_s: float) -> list[int]:
         """Return the steps to the neighbours that are asked, nearest first."""
         times_ns = self.vi_map.vertices.timestamp_ns[self.vertices]
@@ -183,7 +213,8 @@ def _reconstruct(
     what = f"depth of cameras {pair.left} and {pair.right}"
     matched, kept = 0.0, 0.0
     count = len(sequence.vertices)
-    depths = _raw_depths(sequence, writer.resources, settings)
+    matcher = DepthMatcher(pair, settings.stereo, settings.sgbm, settings.bm, sequence.near_m)
+    depths = _raw_depths(sequence, writer.resources, matcher)
     if settings.stereo.multi_view:
         poses = np.stack(
             [pinhole_pose(pair, writer.resources.T_G_C(f)) for f in sequence.left_frames.tolist()]
@@ -201,15 +232,22 @@ def _reconstruct(
         writer.add(frame, pair.depth_of_left(depth), sequence.images)
     mission_id = to_hex(vi_map.missions.id[sequence.mission])
     return PairReport(
-        mission_id, pair.left, pair.right, count, sequence.without_images, matched, kept
+        mission_id,
+        pair.left,
+        pair.right,
+        count,
+        sequence.without_images,
+        matcher.disparities_px,
+        matcher.nearest_m,
+        matched,
+        kept,
     )
 
 
 def _raw_depths(
-    sequence: _Sequence, resources: FrameResources, settings: StereoSettings
+    sequence: _Sequence, resources: FrameResources, matcher: DepthMatcher
 ) -> Iterator[F32]:
     """Yield the rectified depths (H, W) of the vertices in order."""
-    matcher = DepthMatcher(sequence.pair, settings.stereo, settings.sgbm, settings.bm)
     for frames in sequence.frames.tolist():
         left, right = (sequence.images.grey(f, resources.camera(f)) for f in frames)
         yield matcher.depth(left, right)
@@ -299,132 +337,6 @@ class _Writer:
         owned = vi_map.resources.owner_kind == ResourceOwner.FRAME
         of_type = resources_of(vi_map, (self._type,))
         return np.asarray(of_type & owned & np.isin(vi_map.resources.owner, frames))
-
-
-_SUBPIXELS = 16.0
-"""OpenCV's disparities are multiples of a sixteenth of a pixel."""
-_MIN_DISPARITY_PX = 0.5
-_NO_CHECK = -1
-_SURFACE_SIGMA_PX, _APART_PX = 1.0, -100.0
-"""Disparities that differ by much more are of other surfaces; a value that differs from all."""
-_STEP_M, _STEP_SHARE = 0.05, 0.1
-"""A difference of depths in a window that is a step: this much, and this part of the depth."""
-
-
-class DepthMatcher:
-    """Computes the depth of rectified images of one pair of cameras."""
-
-    def __init__(
-        self, pair: StereoPair, stereo: StereoOptions, sgbm: SgbmOptions, bm: BmOptions
-    ) -> None:
-        """Prepare the matcher.
-
-        Raises:
-            UserError: An option is out of range.
-        """
-        self.pair = pair
-        self._median_window = stereo.median_window
-        self._bilateral_window = stereo.bilateral_window
-        matcher: SgbmOptions | BmOptions = sgbm if stereo.use_sgbm else bm
-        if stereo.adapt_params_to_image_size:
-            # maplab: an eighth of the width, rounded to a multiple of 16
-            count = max(16, (pair.pinhole.width_px // 8 + 15) & -16)
-            matcher = dataclasses.replace(matcher, num_disparities=count)
-        if not stereo.depth_check:
-            matcher = dataclasses.replace(matcher, disp12_max_diff=_NO_CHECK)
-        try:
-            check_matcher(matcher)
-        except ValueError as error:
-            raise UserError(str(error)) from None
-        self._padding = matcher.min_disparity + matcher.num_disparities
-        self._matcher = _opencv_matcher(matcher)
-
-    def depth(self, left: U8, right: U8) -> F32:
-        """Return the depths (H, W) [m] of the rectified left image; 0 = unknown.
-
-        Args:
-            left: Recorded image (H, W) of the left camera.
-            right: Recorded image of the right camera.
-        """
-        import cv2
-
-        pair = self.pair
-        images = [pair.to_left.image(left), pair.to_right.image(right)]
-        # OpenCV leaves out as many columns on the left as there are disparities
-        padded = [
-            cv2.copyMakeBorder(image, 0, 0, self._padding, 0, cv2.BORDER_REPLICATE)
-            for image in images
-        ]
-        disparity = self._matcher.compute(*padded)[:, self._padding :].astype(np.float32)
-        disparity /= np.float32(_SUBPIXELS)
-        disparity = self._smooth(disparity)
-        columns = np.arange(disparity.shape[1], dtype=np.float32)
-        known = (disparity > _MIN_DISPARITY_PX) & (columns >= disparity) & pair.valid
-        focal_baseline = np.float32(pair.pinhole.focal_px * pair.baseline_m)
-        depth = focal_baseline / np.maximum(disparity, np.float32(_MIN_DISPARITY_PX))
-        return np.where(known, depth, np.float32(0.0))
-
-    def _smooth(self, disparity: F32) -> F32:
-        """Filter the disparities (H, W) on surfaces; those that are not known stay below zero."""
-        import cv2
-
-        known = disparity > 0.0
-        if self._median_window:
-            median = cv2.medianBlur(np.maximum(disparity, 0.0), self._median_window)
-            disparity = np.where(known, median, disparity)
-        if self._bilateral_window:
-            apart = np.where(known, disparity, np.float32(_APART_PX))
-            smooth = cv2.bilateralFilter(
-                apart, self._bilateral_window, _SURFACE_SIGMA_PX, 0.45 * self._bilateral_window
-            )
-            disparity = np.where(known, smooth, disparity)
-        return np.asarray(disparity, dtype=np.float32)
-
-
-def without_edges(depth: F32, margin_px: int) -> F32:
-    """Remove the depths (H, W) [m] within some pixels of a step: matched blocks lie on both sides."""
-    import cv2
-
-    if margin_px == 0:
-        return depth
-    window = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
-    farthest = cv2.dilate(depth, window)
-    nearest = cv2.erode(np.where(depth > 0.0, depth, np.float32(np.inf)), window)
-    is_step = farthest - nearest > _STEP_M + _STEP_SHARE * depth
-    return np.where(is_step, np.float32(0.0), depth)
-
-
-def _opencv_matcher(options: SgbmOptions | BmOptions) -> Any:
-    import cv2
-
-    if isinstance(options, SgbmOptions):
-        return cv2.StereoSGBM.create(
-            options.min_disparity,
-            options.num_disparities,
-            options.sad_window_size,
-            options.p1,
-            options.p2,
-            options.disp12_max_diff,
-            options.pre_filter_cap,
-            options.uniqueness_ratio,
-            options.speckle_window_size,
-            options.speckle_range,
-            options.mode,
-        )
-    matcher = cv2.StereoBM.create(options.num_disparities, options.sad_window_size)
-    matcher.setMinDisparity(options.min_disparity)
-    matcher.setDisp12MaxDiff(options.disp12_max_diff)
-    matcher.setPreFilterCap(options.pre_filter_cap)
-    matcher.setPreFilterSize(options.pre_filter_size)
-    is_sobel = options.prefilter_type == "xsobel"
-    matcher.setPreFilterType(
-        cv2.StereoBM_PREFILTER_XSOBEL if is_sobel else cv2.StereoBM_PREFILTER_NORMALIZED_RESPONSE
-    )
-    matcher.setTextureThreshold(options.texture_threshold)
-    matcher.setUniquenessRatio(options.uniqueness_ratio)
-    matcher.setSpeckleWindowSize(options.speckle_window_size)
-    matcher.setSpeckleRange(options.speckle_range)
-    return matcher
 
 
 _NEAREST_M = 0.1

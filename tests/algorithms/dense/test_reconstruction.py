@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.dense.clouds import convert_depth_maps, depth_of_cloud
+from maplab_py.algorithms.dense.depth_matcher import DepthMatcher
 from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions
 from maplab_py.algorithms.dense.pinhole import ImageMap, undistorted
 from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
@@ -290,6 +291,22 @@ def test_clouds_are_the_depth_maps_in_space(with_images: VIMap) -> None:
     once_more, counts = convert_depth_maps(converted, Path())
     assert once_more is converted
     assert counts.frames_with_cloud == counts.depth_maps
+
+
+def test_near_scenes_are_matched_over_more_disparities() -> None:
+    (pair,), _ = pairs_of(make_rig())
+    width, focal_baseline = pair.pinhole.width_px, pair.pinhole.focal_px * pair.baseline_m
+    options = StereoOptions(), SgbmOptions(), BmOptions()
+    usual = DepthMatcher(pair, *options)
+    assert usual.disparities_px == (width // 8 + 15) & -16
+    near_m = 0.6 * usual.nearest_m
+    near = DepthMatcher(pair, *options, near_m)
+    assert near.nearest_m <= near_m < usual.nearest_m
+    assert near.nearest_m == pytest.approx(focal_baseline / near.disparities_px)
+    assert DepthMatcher(pair, *options, 5.0).disparities_px == usual.disparities_px
+    assert DepthMatcher(pair, *options, 1e-6).disparities_px <= 0.4 * width + 16
+    as_given = StereoOptions(adapt_params_to_image_size=False)
+    assert DepthMatcher(pair, as_given, *options[1:], near_m).disparities_px == 128
 
 
 def test_bad_input_is_refused_in_one_line(room: StereoRoom, with_images: VIMap) -> None:
