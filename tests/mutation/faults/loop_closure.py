@@ -52,7 +52,7 @@ LOOP_CLOSURE = (
     Fault(
         "edges_without_smallest_deviation",
         "maplab_py/algorithms/loop_closure/closure_table.py",
-        "    covariance += np.diag(_FLOOR_STD**2)\n",
+        " + np.diag(_FLOOR_STD**2)",
         "",
         _EDGES,
     ),
