@@ -97,7 +97,7 @@ class Mapping:
         self._recording, self._observer, self._status = recording, observer, status
         self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization
-        self.localization = opened_localization(localization, device, self.options.odometry.window)
+        self.localization = opened_localization(localization, device, self.options.odometry)
         self.localized = LocalizationRecord()
         self.localized_frame: LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"
@@ -320,7 +320,7 @@ def _frames(update: OdometryUpdate) -> Sequence[TrackedFrame | None]:
     """Return the keypoints of a frame with descriptors."""
     if update.tracks is not None:
         return update.tracks.frames
-    return described_frames(update.tracked.cameras, update.images, update.time_ns)
+    return described_frames(update.tracked, update.images, update.time_ns)
 
 
 def load_kernels() -> None:

@@ -275,7 +275,7 @@ def _blocks(frame: Frame) -> tuple[DescriptorBlock, ...] | None:
     first = np.concatenate([[0], np.flatnonzero(np.diff(size)) + 1])
     counts = np.diff(np.append(first, len(size)))
     return tuple(
-        DescriptorBlock(count, width)
+        DescriptorBlock(count, width, frame.depth, frame.feature_type)
         for count, width in zip(counts.tolist(), size[first].tolist(), strict=True)
     )
 

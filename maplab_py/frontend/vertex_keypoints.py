@@ -4,27 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from maplab_py.array_types import U8
+from maplab_py.array_types import U8, Mask
 from maplab_py.interop.recordings.protocol import TrackedFrame
 from maplab_py.vision.features.description import describe
-from maplab_py.vision.tracking.tracks import CameraTracks
+from maplab_py.vision.features.extractors import KINDS
+from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 
 
 def described_frames(
-    cameras: tuple[CameraTracks, ...], images: tuple[U8, ...], stamp_ns: int
+    tracked: TrackedImages, images: tuple[U8, ...], stamp_ns: int
 ) -> tuple[TrackedFrame, ...]:
     """Return the tracks of each camera with the descriptors of their image patches.
 
     Keypoints so near to the border that they have no descriptor are left out.
+
+    Raises:
+        UserError: The descriptors are those of a network that is not installed.
     """
     return tuple(
-        _described(row, tracks, image, stamp_ns)
-        for row, (tracks, image) in enumerate(zip(cameras, images, strict=True))
+        _described(row, tracks, image, stamp_ns, tracked.descriptor_type)
+        for row, (tracks, image) in enumerate(zip(tracked.cameras, images, strict=True))
     )
 
 
-def _described(camera: int, tracks: CameraTracks, image: U8, stamp_ns: int) -> TrackedFrame:
-    descriptors, is_described = describe(image, tracks.uv_px, tracks.scale)
+def _described(
+    camera: int, tracks: CameraTracks, image: U8, stamp_ns: int, descriptor_type: str
+) -> TrackedFrame:
+    kind = KINDS[descriptor_type]
+    if descriptor_type == "xfeat":
+        from maplab_py.vision.learned.xfeat import installed_xfeat
+
+        descriptors: U8 = installed_xfeat().describe(image, tracks.uv_px).view(np.uint8)
+        is_described: Mask = np.ones(len(tracks), dtype=np.bool_)
+    else:
+        descriptors, is_described = describe(image, tracks.uv_px, tracks.scale)
     kept = tracks[is_described]
     return TrackedFrame(
         camera=camera,
@@ -34,5 +47,7 @@ def _described(camera: int, tracks: CameraTracks, image: U8, stamp_ns: int) -> T
         scale=kept.scale,
         track_id=kept.track_id.astype(np.int32),
         descriptor=descriptors[is_described],
-        descriptor_size=np.full(len(kept), descriptors.shape[1], dtype=np.int32),
+        descriptor_size=np.full(len(kept), kind.size, dtype=np.int32),
+        feature_type=kind.feature_type,
+        depth=kind.depth,
     )

@@ -19,13 +19,14 @@ NO_DESCRIPTOR = -1
 
 
 class FeatureType(IntEnum):
-    """Kinds of features that maplab knows (proto values); maps may hold others."""
+    """Kinds of features: proto values of maplab, and XFEAT, which it reads as a type without a name."""
 
     BINARY = 0
     SUPERPOINT = 1
     R2D2 = 2
     SIFT = 3
     LIDAR_SUPERPOINT = 21
+    XFEAT = 40
 
 
 class DescriptorDepth(IntEnum):
@@ -132,6 +133,7 @@ _NAMES: dict[int, str] = {
     FeatureType.R2D2: "R2D2",
     FeatureType.SIFT: "SIFT",
     FeatureType.LIDAR_SUPERPOINT: "LIDARSuperPoint",
+    FeatureType.XFEAT: "XFeat",
 }
 TYPE_NAMES = tuple(_NAMES.values())
 """Names of the feature types in maplab's flags."""

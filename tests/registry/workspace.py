@@ -30,6 +30,7 @@ from tests.frontend.simulated import REST_FIRST, replayed
 from tests.interop.recordings.written import make_content, write_bag, write_folder
 from tests.registry.resources import save_with_resources, write_stamped_files
 from tests.simulation.small import simulated
+from tests.support.small_xfeat import checkpoint, random_arrays
 from tests.support.stereo_room import StereoRoom, quarter_size
 
 ROUND = Scenario(
@@ -151,10 +152,11 @@ PREPARED["get_dense_map_in_range"] = (
 )
 
 OTHER_EXAMPLES = {
+    "install_features": "install_features xfeat --weights=weights.pt",
     "save_view": "save_view --file=map.png --width_px=320 --height_px=200",
     "simulate_robots": "simulate_robots --spool=spool --scenario=walk.yaml --robots_rate=0",
 }
-"""Lines that take the place of examples which take long."""
+"""Lines that take the place of examples which take long, or need a connection."""
 _WALK = """
 name: walk
 world: {landmarks_per_room: 600}
@@ -212,6 +214,7 @@ def write_workspace(folder: Path, first: VIMap, second: VIMap) -> None:
         save_map(vi_map, folder / place)
     save_with_resources(first, folder / "with_resources" / "office")
     (folder / "walk.yaml").write_text(_WALK)
+    (folder / "weights.pt").write_bytes(checkpoint(random_arrays()))
     _write_closures(first, second, folder / "closures.yaml")
     _write_fixes(first, folder / "track.csv")
     _write_wheels(first, folder / "wheels.csv")

@@ -106,7 +106,7 @@ def _extractor(options: ExtractionOptions) -> tuple[_Extract, DescriptorKind | N
         return (
             lambda image: (extract(name, image, options.max_features), kind),
             kind,
-            os.cpu_count() or 1,
+            1 if name == "xfeat" else os.cpu_count() or 1,  # the network has threads of its own
         )
     plugin = plugin_extractor(name.removeprefix(PLUGIN))
     model = Path(options.feature_model) if options.feature_model else None

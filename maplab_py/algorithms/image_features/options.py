@@ -20,7 +20,7 @@ class ExtractionOptions(Options):
 
     feature_type: str = "sift"
     """Detector and descriptor: sift (SIFT, 128 bytes), orb (Binary, 32 bytes), brisk (Binary, 64), akaze
-    (Binary, 61), or plugin:NAME, a feature extractor of a plugin"""
+    (Binary, 61), xfeat (XFeat, 64 numbers, a network: install_features), or plugin:NAME, of a plugin"""
     feature_model: str = ""
     """File of a plugin's extractor, such as a network in the ONNX format"""
     max_features: int = option(1000, ge=1, le=100_000)
@@ -48,8 +48,8 @@ class FeatureTrackOptions(Options, prefix="track_"):
     """Links between keypoints of neighbouring frames."""
 
     feature_type: str = option("sift", flag="feature_type")
-    """Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, plugin:NAME) or by their
-    type (Binary, SuperPoint, R2D2, SIFT or a number)"""
+    """Keypoints to link, by the name of their extractor (sift, orb, brisk, akaze, xfeat, plugin:NAME) or by
+    their type (Binary, SuperPoint, R2D2, SIFT, XFeat or a number)"""
     neighbors: int = option(2, ge=1, le=100)
     """Following frames of the camera that a frame is matched with"""
     epipolar_gate_px: float = option(4.0, gt=0)
@@ -61,7 +61,7 @@ class FeatureTrackOptions(Options, prefix="track_"):
     max_bit_fraction: float = option(0.25, gt=0)
     """Largest fraction of bits in which matched Binary descriptors differ"""
     max_descriptor_distance: float = option(0.45, gt=0)
-    """Largest distance of other matched descriptors, scaled to unit length"""
+    """Largest distance of other matched descriptors, scaled to unit length; a third more for XFeat"""
 
     def wanted(self) -> tuple[int, tuple[int, ...]]:
         """Return the feature type and the sizes [bytes] of the descriptors, empty = any.

@@ -18,8 +18,8 @@ class LocalizationOptions(Options, prefix="localization_"):
     max_bit_fraction: float = 0.26
     """Largest fraction of descriptor bits in which a match may differ; full maps only."""
     max_descriptor_distance: float = option(0.45, gt=0)
-    """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length; full
-    maps only."""
+    """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length, a
+    third more for XFeat; full maps only."""
     max_projected_distance: float = option(40.0, gt=0)
     """Largest squared distance of projected descriptors of a match; summary maps."""
     places: int = option(6, ge=1)

@@ -59,7 +59,8 @@ class LoopClosureOptions(FeatureTypeOptions):
     max_bit_fraction: float = 0.26
     """Largest fraction of descriptor bits in which a match may differ"""
     max_descriptor_distance: float = 0.45
-    """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length"""
+    """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length; a third
+    more for XFeat"""
     fraction_best_scores: float = 0.25
     """Smallest ratio of the votes of a place to those of the query's best place in the mission"""
     min_image_time_seconds: float = 10.0

@@ -14,6 +14,7 @@ from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.vertex_keypoints import described_frames
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
+from maplab_py.vimap.descriptors import FeatureType
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,6 +28,7 @@ class FrameKeypoints:
     origin_I: F64  # (N, 3) camera centres in the body frame [m]
     ray_I: F64  # (N, 3) unit rays in the body frame
     rad_per_px: F64  # (N,) angle that a pixel covers
+    feature_type: int = FeatureType.BINARY
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -51,7 +53,7 @@ def frame_keypoints(update: OdometryUpdate, device: RecordedSensors) -> FrameKey
     if update.tracks is not None:
         frames: Sequence[TrackedFrame | None] = update.tracks.frames
     elif update.images:
-        frames = described_frames(update.tracked.cameras, update.images, update.time_ns)
+        frames = described_frames(update.tracked, update.images, update.time_ns)
     else:
         frames = ()
     given = [frame for frame in frames if frame is not None]
@@ -61,7 +63,8 @@ def frame_keypoints(update: OdometryUpdate, device: RecordedSensors) -> FrameKey
     parts = [_of_camera(frame, device, size) for frame in given]
     parts = parts or [_nothing(size)]
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return FrameKeypoints(update.time_ns, *columns)
+    feature_type = given[0].feature_type if given else FeatureType.BINARY
+    return FrameKeypoints(update.time_ns, *columns, feature_type=feature_type)
 
 
 _Columns = tuple[I64, I32, U8, F64, F64, F64]

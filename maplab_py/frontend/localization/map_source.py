@@ -24,6 +24,8 @@ from maplab_py.storage.native import is_map_folder, load_map
 from maplab_py.storage.summary_map import SummaryMap, read_summary_map, summary_map_file
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import FeatureType, type_name, types_of
+from maplab_py.vision.features.extractors import KINDS
+from maplab_py.vision.features.options import DESCRIPTORS
 
 _FLAG = "--vio_localization_map_folder"
 _SMALLEST_SIGMA_M = 1e-3
@@ -39,12 +41,15 @@ class SearchedMap:
     sensors: SensorSet | None = None  # of those who made the map
 
 
-def open_map(path: Path, *, with_covariances: bool = False) -> SearchedMap:
+def open_map(
+    path: Path, *, with_covariances: bool = False, feature_type: int = FeatureType.BINARY
+) -> SearchedMap:
     """Read a map folder or a summary map.
 
     Args:
         path: Folder of a map, or a summary map or its folder.
         with_covariances: The landmarks' covariances are wanted.
+        feature_type: Type of the recording's descriptors.
 
     Raises:
         UserError: There is no map, it cannot be searched, or it has no covariances.
@@ -52,26 +57,36 @@ def open_map(path: Path, *, with_covariances: bool = False) -> SearchedMap:
     """
     if is_map_folder(path):
         vi_map, _ = load_map(path)
-        return of_map(vi_map, str(path), with_covariances=with_covariances)
+        return of_map(
+            vi_map, str(path), with_covariances=with_covariances, feature_type=feature_type
+        )
     if summary_map_file(path) is not None:
         return of_summary(read_summary_map(path), str(path), with_covariances=with_covariances)
     raise UserError(f"{_FLAG}={path} is neither a map folder nor a summary map")
 
 
-def of_map(vi_map: VIMap, name: str, *, with_covariances: bool = False) -> SearchedMap:
+def of_map(
+    vi_map: VIMap,
+    name: str,
+    *,
+    with_covariances: bool = False,
+    feature_type: int = FeatureType.BINARY,
+) -> SearchedMap:
     """Take a map in memory; see `open_map`."""
     types = types_of(vi_map.frames)
-    if types and FeatureType.BINARY not in types:
-        raise UserError(_wrong_type(name, ", ".join(type_name(kind) for kind in sorted(types))))
+    if types and feature_type not in types:
+        raise UserError(_wrong_type(name, sorted(types), feature_type))
     try:
-        database = database_of_map(vi_map)
+        database = database_of_map(vi_map, feature_type=feature_type)
     except MaplabError as error:
         raise UserError(f"{name}: {error}") from error
     covariance = None
     if with_covariances:
         judged, _ = evaluate_unknown_quality(vi_map)
         missions = np.arange(len(judged.missions))
-        features, _ = map_features(judged, missions, projection=database.projection)
+        features, _ = map_features(
+            judged, missions, projection=database.projection, feature_type=feature_type
+        )
         rows = features_of_good_landmarks(judged, features)
         landmarks = np.unique(features.descriptors.label[rows])
         covariance = landmark_covariances(judged, features)[landmarks]
@@ -94,23 +109,27 @@ def of_summary(summary: SummaryMap, name: str, *, with_covariances: bool = False
     return _checked(SearchedMap(name, database, covariance, summary.sensors))
 
 
-def _wrong_type(name: str, types: str) -> str:
-    return (
-        f"{name}: its descriptors are {types}, those of recordings are Binary: choose a map with Binary "
-        "descriptors"
-    )
+def _wrong_type(name: str, types: list[int], feature_type: int) -> str:
+    """Return why a map cannot be searched with descriptors of a type, and the remedy."""
+    wanted = type_name(feature_type)
+    remedy = f"choose a map with {wanted} descriptors"
+    for word in DESCRIPTORS:
+        if KINDS[word].feature_type in types:
+            remedy += f", or give --feature_tracking_descriptor_type={word}"
+    there = ", ".join(type_name(kind) for kind in types)
+    return f"{name}: its descriptors are {there}, those of the recording {wanted}: {remedy}"
 
 
-def check_descriptors(searched: SearchedMap, size: int) -> None:
-    """Check that descriptors of this many bytes can be matched.
+def check_descriptors(searched: SearchedMap, size: int, feature_type: int) -> None:
+    """Check that descriptors of this many bytes and this type can be matched.
 
     Raises:
-        UserError: The map has descriptors of another size.
+        UserError: The map has descriptors of another size or type.
     """
     kind = searched.database.projection.kind
     wanted = kind.size
-    if not kind.is_binary:
-        raise UserError(_wrong_type(searched.name, type_name(kind.feature_type)))
+    if kind.feature_type != feature_type:
+        raise UserError(_wrong_type(searched.name, [kind.feature_type], feature_type))
     if size != wanted:
         raise UserError(
             f"{searched.name}: its descriptors have {wanted} bytes, those of the recording {size}: "

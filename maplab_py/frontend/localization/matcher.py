@@ -134,7 +134,7 @@ class MapMatcher:
 
     def _check(self, seen: FrameKeypoints) -> None:
         if not self._has_checked:
-            check_descriptors(self._map, seen.descriptors.shape[1])
+            check_descriptors(self._map, seen.descriptors.shape[1], seen.feature_type)
             self._has_checked = True
 
     def _radius_px(self, variance: tuple[float, float], depth_m: F64, rad_per_px: F64) -> F64:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.frontend.localization.map_source import open_map
 from maplab_py.frontend.localization.online import OnlineLocalization
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.vision.features.extractors import KINDS
 
 
 def opened_localization(
-    options: OnlineLocalizationOptions, device: RecordedSensors, window: WindowOptions
+    options: OnlineLocalizationOptions, device: RecordedSensors, odometry: OdometryOptions
 ) -> OnlineLocalization | None:
     """Read and index the map; None when the options name no map.
 
@@ -20,5 +21,9 @@ def opened_localization(
     """
     if options.map_folder is None:
         return None
-    searched = open_map(options.map_folder, with_covariances=options.rule.estimates_landmarks)
-    return OnlineLocalization(searched, device, options, window)
+    searched = open_map(
+        options.map_folder,
+        with_covariances=options.rule.estimates_landmarks,
+        feature_type=KINDS[odometry.tracking.descriptor_type].feature_type,
+    )
+    return OnlineLocalization(searched, device, options, odometry.window)

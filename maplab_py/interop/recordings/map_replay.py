@@ -10,6 +10,7 @@ from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.interop.recordings import protocol
 from maplab_py.vimap import VIMap, mission_sensor_id, ragged_rows, to_hex
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, sizes_of_type, types_of
 from maplab_py.vimap.tables import MissionSensor
 
 
@@ -66,6 +67,10 @@ class MapRecording:
             mission_sample_rows(vi_map, mission) if imu_id else np.zeros(0, dtype=np.int64)
         )
         self._sample_times_ns = vi_map.imu_samples.timestamp_ns[self._samples]
+        self._feature_type, self._depth = FeatureType.BINARY, DescriptorDepth.UINT8
+        if types_of(vi_map.frames) == {FeatureType.XFEAT}:
+            self._feature_type, self._depth = FeatureType.XFEAT, DescriptorDepth.FLOAT32
+        self._descriptor_size = sizes_of_type(vi_map.frames, self._feature_type, self._depth)
 
     @property
     def start_ns(self) -> int:
@@ -129,5 +134,7 @@ class MapRecording:
             scale=table.scale[rows],
             track_id=table.track_id[rows],
             descriptor=table.descriptor[rows],
-            descriptor_size=vi_map.binary_descriptor_size[rows],
+            descriptor_size=self._descriptor_size[rows],
+            feature_type=self._feature_type,
+            depth=self._depth,
         )

@@ -14,6 +14,7 @@ from maplab_py.array_types import F64, I32, I64, U8, Mask
 from maplab_py.interop.device import RecordedSensors as RecordedSensors
 from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_grey
 from maplab_py.sensors import Imu
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,7 +113,9 @@ class TrackedFrame:
     scale: F64  # (K,)
     track_id: I32  # (K,) -1 = on no track
     descriptor: U8  # (K, width) as wide as the widest
-    descriptor_size: I32  # (K,) bytes of each binary descriptor, 0 where there is none
+    descriptor_size: I32  # (K,) bytes of each descriptor, 0 where there is none
+    feature_type: int = FeatureType.BINARY
+    depth: int = DescriptorDepth.UINT8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

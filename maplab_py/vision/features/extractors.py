@@ -1,4 +1,4 @@
-"""Detectors with descriptors of OpenCV, by name: SIFT, ORB, BRISK and AKAZE.
+"""Detectors with descriptors by name: SIFT, ORB, BRISK and AKAZE of OpenCV, and the network XFeat.
 
 SIFT descriptors (D. Lowe, IJCV 2004) are the square roots of their shares of the sum, 512 units long
 (R. Arandjelovic, A. Zisserman, CVPR 2012), as COLMAP stores them, so that the two match each other.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
-from maplab_py.vimap.descriptors import FeatureType
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures
 
@@ -21,6 +21,7 @@ KINDS = {
     "orb": DescriptorKind(32),
     "brisk": DescriptorKind(64),
     "akaze": DescriptorKind(61),
+    "xfeat": DescriptorKind(256, FeatureType.XFEAT, DescriptorDepth.FLOAT32),
 }
 """Descriptors of each extractor."""
 _SIFT_LENGTH = 512.0
@@ -36,7 +37,14 @@ def extract(name: str, image: U8, max_features: int) -> ExtractedFeatures:
         name: One of `KINDS`.
         image: Grey values (H, W).
         max_features: Largest number of features.
+
+    Raises:
+        UserError: It is a network that is not installed.
     """
+    if name == "xfeat":
+        from maplab_py.vision.learned.xfeat import installed_xfeat
+
+        return installed_xfeat().extract(image, max_features)
     keypoints, descriptors = _detector(name, max_features).detectAndCompute(
         np.ascontiguousarray(image), None
     )

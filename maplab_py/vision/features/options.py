@@ -6,7 +6,7 @@ from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 
 DETECTORS = ("fast", "agast")
-DESCRIPTORS = ("brisk",)
+DESCRIPTORS = ("brisk", "xfeat")
 
 
 class FeatureOptions(Options, prefix="feature_tracking_"):
@@ -30,8 +30,9 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
         20, ge=4, le=1000, flag="min_tracking_distance_to_image_border_px"
     )
     """Smallest distance of a keypoint to the image border; descriptors need 20"""
-    descriptor_type: str = "brisk"
-    """Descriptor: brisk (of 64 bytes)"""
+    descriptor_type: str = option("brisk", choices=DESCRIPTORS)
+    """Descriptor of tracked keypoints: brisk (Binary, 64 bytes), or xfeat (XFeat, 64 numbers, a network:
+    install_features), which other light and other directions change less"""
     descriptor_size_px: float = option(12.0, ge=1, le=1000)
     """Diameter of what a descriptor sees, OpenCV's keypoint size"""
     apply_clahe: bool = option(False, flag="rovioli_image_apply_clahe_histogram_equalization")
@@ -64,5 +65,5 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
             )
         if self.descriptor_type not in DESCRIPTORS:
             raise FlagError(
-                f"--{self.flag_prefix}descriptor_type={self.descriptor_type}: wants brisk"
+                f"--{self.flag_prefix}descriptor_type={self.descriptor_type}: wants brisk or xfeat"
             )

@@ -145,7 +145,14 @@ class FrameTracker:
             _CameraState(image, tracks) for image, tracks in zip(prepared, live, strict=True)
         )
         disparity_px, is_turn_only = summarise(motions)
-        return TrackedImages(time_ns, tuple(output), disparity_px, is_turn_only, watch.stage_ms)
+        return TrackedImages(
+            time_ns,
+            tuple(output),
+            disparity_px,
+            is_turn_only,
+            watch.stage_ms,
+            self._options.descriptor_type,
+        )
 
     def _detector(self, row: int) -> GridDetector:
         view, leader = self._views[row], self._leaders[row]

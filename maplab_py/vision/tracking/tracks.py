@@ -42,3 +42,4 @@ class TrackedImages:
     disparity_px: float  # median, turn removed, against the previous set; NaN: nothing was tracked
     is_turn_only: bool  # the tracks agree with a turn without translation
     stage_ms: dict[str, float]  # elapsed time of each stage
+    descriptor_type: str = "brisk"  # that the keypoints are to get

@@ -17,12 +17,12 @@ from tests.support.float_features import with_numbers
 def test_maps_without_binary_descriptors_are_refused_by_their_types() -> None:
     vi_map, _ = evaluate_unknown_quality(make_map([Walk(room=1, vertices=12)])[0])
     numbers = with_numbers(vi_map, FeatureType.R2D2)
-    message = "office: its descriptors are R2D2, those of recordings are Binary: choose"
+    message = "office: its descriptors are R2D2, those of the recording Binary: choose"
     with pytest.raises(UserError, match=message):
         of_map(numbers, "office")
     summary = make_summary_map(numbers, SummaryMapOptions(), feature_type=FeatureType.R2D2)
     with pytest.raises(UserError, match=message):
-        check_descriptors(of_summary(summary, "office"), 48)
-    check_descriptors(of_map(vi_map, "office"), 48)
+        check_descriptors(of_summary(summary, "office"), 48, FeatureType.BINARY)
+    check_descriptors(of_map(vi_map, "office"), 48, FeatureType.BINARY)
     with pytest.raises(UserError, match="its descriptors have 48 bytes, those of the recording 64"):
-        check_descriptors(of_map(vi_map, "office"), 64)
+        check_descriptors(of_map(vi_map, "office"), 64, FeatureType.BINARY)

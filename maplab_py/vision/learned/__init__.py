@@ -1,0 +1,1 @@
+"""Networks whose weights the user installs: XFeat features and the LighterGlue matcher."""

@@ -1,0 +1,175 @@
+"""XFeat descriptors of corners of images, by onnxruntime.
+
+The network sees the image at sides of multiples of 32 pixels. Descriptors are sampled where
+its authors sample them: the centres of its cells lie half a pixel off towards the borders of the image.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.array_types import F32, F64, U8
+from maplab_py.errors import UserError
+from maplab_py.input_files import read_bytes
+from maplab_py.vision.features.detection import strongest_places
+from maplab_py.vision.features.extension import ExtractedFeatures
+from maplab_py.vision.learned.xfeat_graph import CELL_PX, DIMENSIONS, SIZE_STEP_PX
+
+_MAX_BYTES = 1 << 28
+_THREADS = 2
+_APART_PX = 5.0
+_MIN_SHARE = 1e-3
+"""Strength of the weakest corner relative to the strongest one, so that less light keeps them."""
+_CUBIC = -0.75
+"""Slope of the interpolating cubic, that of PyTorch."""
+_lock = threading.Lock()
+_opened: dict[Path, XFeat] = {}
+
+
+def network_file(name: str) -> Path:
+    """Return the file of an installed network ($XDG_DATA_HOME/maplab/networks/NAME.onnx)."""
+    base = os.environ.get("XDG_DATA_HOME", "")
+    folder = Path(base) if base else Path.home() / ".local" / "share"
+    return folder / "maplab" / "networks" / f"{name}.onnx"
+
+
+def installed_xfeat() -> XFeat:
+    """Return the network that `install_features xfeat` has installed; opened once.
+
+    Raises:
+        UserError: It is not installed or damaged, or onnxruntime is missing.
+    """
+    file = network_file("xfeat")
+    with _lock:
+        if file not in _opened:
+            try:
+                network = read_bytes(file, _MAX_BYTES, remedy="run install_features xfeat again")
+            except OSError:
+                raise UserError(
+                    "XFeat is not installed on this computer: run install_features xfeat"
+                ) from None
+            _opened[file] = XFeat(network, str(file))
+        return _opened[file]
+
+
+class XFeat:
+    """The network, ready to run; threads may use it at the same time."""
+
+    def __init__(self, network: bytes, name: str) -> None:
+        """Open the network.
+
+        Args:
+            network: Content of the file, as `xfeat_graph` makes it.
+            name: Name of the file, for messages.
+
+        Raises:
+            UserError: onnxruntime cannot open it, or is not installed.
+        """
+        self._session = open_network(network, name)
+
+    def descriptor_map(self, image: U8 | F32) -> F32:
+        """Return descriptors (H / 8, W / 8, 64) of an image (H, W) with sides of multiples of 32."""
+        pixels = image[None, None].astype(np.float32)
+        return np.asarray(self._session.run(["descriptors"], {"image": pixels})[0][0])
+
+    def extract(self, image: U8, max_features: int) -> ExtractedFeatures:
+        """Return the strongest corners of an image (H, W) with their descriptors, the strongest first."""
+        uv_px = _corners(image, max_features)
+        by_rank = np.arange(len(uv_px), 0.0, -1.0)
+        return ExtractedFeatures(uv_px, by_rank, self.describe(image, uv_px))
+
+    def describe(self, image: U8, uv_px: F64) -> F32:
+        """Return the descriptors (K, 64) of keypoints (K, 2) of an image (H, W)."""
+        if not len(uv_px):
+            return np.zeros((0, DIMENSIONS), dtype=np.float32)
+        prepared, scale = _prepare(image)
+        return _bicubic(
+            self.descriptor_map(prepared), _cells((uv_px + 0.5) / scale - 0.5, prepared.shape)
+        )
+
+
+def open_network(network: bytes, name: str) -> Any:
+    """Return a session of onnxruntime on two threads.
+
+    Raises:
+        UserError: It cannot open the network, or is not installed.
+    """
+    try:
+        import onnxruntime
+        from onnxruntime.capi import onnxruntime_pybind11_state as errors
+    except ImportError:
+        raise UserError("onnxruntime is not installed: pip install 'maplab-py[learned]'") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = _THREADS, 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    refusals = (errors.Fail, errors.InvalidArgument, errors.InvalidGraph, errors.InvalidProtobuf,
+                errors.NotImplemented, errors.RuntimeException)  # fmt: skip
+    try:
+        return onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
+    except refusals:
+        raise UserError(f"{name}: is no network: run install_features again") from None
+
+
+def _prepare(image: U8) -> tuple[F32, F64]:
+    """Return an image with sides that are multiples of 32, and its pixels (2,) per pixel of those."""
+    import cv2
+
+    size = np.array(image.shape[::-1])
+    wanted = np.maximum(size // SIZE_STEP_PX, 1) * SIZE_STEP_PX
+    prepared = np.asarray(image, dtype=np.float32)
+    if (wanted != size).any():
+        prepared = np.asarray(
+            cv2.resize(prepared, wanted.tolist(), interpolation=cv2.INTER_LINEAR), dtype=np.float32
+        )
+    return prepared, size / wanted
+
+
+def _corners(image: U8, most: int) -> F64:
+    """Return corners (K, 2), the strongest first, to a fraction of a pixel."""
+    import cv2
+
+    found = cv2.goodFeaturesToTrack(np.ascontiguousarray(image), most, _MIN_SHARE, _APART_PX)
+    if found is None:
+        return np.zeros((0, 2))
+    return strongest_places(image, found.reshape(-1, 2).astype(np.int64))
+
+
+def _cells(uv: F64, shape: tuple[int, ...]) -> F64:
+    """Return where pixels (K, 2) of an image (H, W) lie among its cells, as the network was trained."""
+    sides = np.array(shape[::-1])
+    return np.asarray(uv * (sides / CELL_PX) / (sides - 1) - 0.5)
+
+
+def _bicubic(values: F32, where: F64) -> F32:
+    """Return vectors (h, w, D) at places (K, 2), zero outside, scaled to unit length (K, D)."""
+    height, width, dimensions = values.shape
+    base = np.floor(where).astype(np.int64)
+    weight = _cubic_weights(where - base)  # (K, 2, 4)
+    taps = base[:, :, None] + np.arange(-1, 3)
+    inside = (taps >= 0) & (taps < np.array([[width], [height]]))
+    weight = np.where(inside, weight, 0.0).astype(np.float32)
+    taps = np.where(inside, taps, 0)
+    rows = taps[:, 1, :, None] * width + taps[:, 0, None, :]
+    near = values.reshape(-1, dimensions)[rows.reshape(len(where), 16)]
+    both = (weight[:, 1, :, None] * weight[:, 0, None, :]).reshape(len(where), 1, 16)
+    sampled = np.matmul(both, near)[:, 0]
+    length = np.sqrt(np.einsum("kd,kd->k", sampled, sampled))[:, None]
+    return np.asarray(sampled / np.maximum(length, 1e-12), dtype=np.float32)
+
+
+def _cubic_weights(share: F64) -> F64:
+    """Return the weights (..., 4) of the four neighbours of a place between the second and the third.
+
+    Source: R. Keys, Cubic convolution interpolation, 1981.
+    """
+    a = _CUBIC
+    near, far = np.stack([share, 1.0 - share]), np.stack([1.0 + share, 2.0 - share])
+    inner = ((a + 2.0) * near - (a + 3.0)) * near * near + 1.0
+    outer = ((a * far - 5.0 * a) * far + 8.0 * a) * far - 4.0 * a
+    return np.stack([outer[0], inner[0], inner[1], outer[1]], axis=-1)
