@@ -19,7 +19,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import bearings
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import F32, F64, I8, I64, U64, Mask
+from maplab_py.array_types import F32, F64, I8, I64, U8, U64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.geometry.triangulation import triangulate
@@ -73,8 +73,13 @@ class Result:
     peak_mb: float
 
 
-def measure(features: str, gates: tuple[float, ...], max_features: int) -> list[Result]:
-    """Measure one type of features with several gates of its descriptors."""
+def measure(
+    features: str, gates: tuple[float, ...], max_features: int, light: float
+) -> list[Result]:
+    """Measure one type of features with several gates of its descriptors.
+
+    With less light than 1 every other keyframe is darker, and its pairs with the others count.
+    """
     options = LoopClosureOptions()
     recording = open_recording(shared_data_folder() / "euroc_v101_keyframes")
     cameras, T_I_C = recording.device.cameras, recording.device.T_I_C
@@ -85,6 +90,9 @@ def measure(features: str, gates: tuple[float, ...], max_features: int) -> list[
     sets = [each for each, is_known in zip(sets, known.tolist(), strict=True) if is_known]
     T_G_I, times_ns = T_G_I[known], times_ns[known]
     images = [[image.grey() for image in each.images] for each in sets]
+    if light < 1.0:
+        rng = np.random.default_rng(0)
+        images[1::2] = [[_darken(image, light, rng) for image in pair] for pair in images[1::2]]
     extract(features, images[0][0], max_features)
     cpu_s, wall_s = time.process_time(), time.perf_counter()
     found = [[extract(features, image, max_features) for image in pair] for pair in images]
@@ -95,6 +103,8 @@ def measure(features: str, gates: tuple[float, ...], max_features: int) -> list[
     kind = KINDS[features]
     frames = [_keyframe(pair, features, cameras, T_I_C) for pair in found]
     pairs = _pairs(times_ns)
+    if light < 1.0:
+        pairs = pairs[(pairs[:, 0] % 2 == 1) & (pairs[:, 1] % 2 == 0)]
     is_near = _are_near(T_G_I, pairs)
     pairs = np.concatenate([pairs[is_near], pairs[~is_near][::_EVERY]])
     is_near = _are_near(T_G_I, pairs)
@@ -122,6 +132,12 @@ def measure(features: str, gates: tuple[float, ...], max_features: int) -> list[
             )
         )
     return results
+
+
+def _darken(image: U8, light: float, rng: np.random.Generator) -> U8:
+    """Return an image in less light, of more contrast, with the noise of a higher gain."""
+    values = 255.0 * light * (image / 255.0) ** 1.3 + rng.normal(8.0, 1.5, image.shape)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def _keyframe(
@@ -200,6 +216,8 @@ def _verify(
 def _match(query: Keyframe, place: Keyframe) -> tuple[I64, I64, I64]:
     """Return mutually best matches: keypoints of the query, features with points, differences."""
     rows = np.flatnonzero(place.has_point)
+    if not len(query.words) or not len(rows):
+        return (np.zeros(0, dtype=np.int64),) * 3
     a, b = _vectors(query.words), _vectors(place.words[rows])
     product = a @ b.T
     best = np.argmax(product, axis=1)
@@ -226,6 +244,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("features", nargs="*", default=list(_GATES), metavar="|".join(_GATES))
     parser.add_argument("--max_features", type=int, default=1000)
+    parser.add_argument("--light", type=float, default=1.0, help="of every other keyframe, 0 to 1")
     parser.add_argument("--json", type=Path, help="write all that was measured to this file")
     arguments = parser.parse_args()
     results = []
@@ -233,7 +252,7 @@ def main() -> None:
         "features  gate  near pairs  verified  from  lc count: right  wrong  inliers  cpu ms  wall ms  MB"
     )
     for name in arguments.features:
-        for r in measure(name, _GATES[name], arguments.max_features):
+        for r in measure(name, _GATES[name], arguments.max_features, arguments.light):
             results.append(dataclasses.asdict(r))
             print(
                 f"{r.features:8} {r.gate:5.2f} {r.near_pairs:11} {r.verified:9} {r.threshold:5} "

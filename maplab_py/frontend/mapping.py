@@ -23,7 +23,7 @@ from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import RunOptions
 from maplab_py.frontend.run_statistics import RunStatistics
 from maplab_py.frontend.starting import MakeStarter
-from maplab_py.frontend.vertex_keypoints import described_frames
+from maplab_py.frontend.vertex_keypoints import check_descriptors_exist, described_frames
 from maplab_py.interop.recordings.protocol import (
     Event,
     FrameSet,
@@ -91,12 +91,13 @@ class Mapping:
             keeps_states: Keep the state of every frame for `trajectory`; runs of hours need not.
 
         Raises:
-            UserError: The recording has no IMU, or a file cannot be used.
+            UserError: The recording has no IMU, a file cannot be used, or a network is not installed.
         """
         self.options = options or RunOptions()
         self._recording, self._observer, self._status = recording, observer, status
         self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization
+        check_descriptors_exist(self.options.odometry.tracking.descriptor_type)
         self.localization = opened_localization(localization, device, self.options.odometry)
         self.localized = LocalizationRecord()
         self.localized_frame: LocalizedFrame | None = None

@@ -27,12 +27,24 @@ def described_frames(
     )
 
 
+def check_descriptors_exist(descriptor_type: str) -> None:
+    """Check, before a run, that keypoints can be described.
+
+    Raises:
+        UserError: The descriptors are those of a network that is not installed.
+    """
+    if descriptor_type == "xfeat":
+        from maplab_py.vision.features.learned.xfeat import installed_xfeat
+
+        installed_xfeat()
+
+
 def _described(
     camera: int, tracks: CameraTracks, image: U8, stamp_ns: int, descriptor_type: str
 ) -> TrackedFrame:
     kind = KINDS[descriptor_type]
     if descriptor_type == "xfeat":
-        from maplab_py.vision.learned.xfeat import installed_xfeat
+        from maplab_py.vision.features.learned.xfeat import installed_xfeat
 
         descriptors: U8 = installed_xfeat().describe(image, tracks.uv_px).view(np.uint8)
         is_described: Mask = np.ones(len(tracks), dtype=np.bool_)

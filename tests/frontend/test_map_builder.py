@@ -23,8 +23,10 @@ from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.descriptors import FeatureType
 from maplab_py.vimap.nav_state import NavState
 from tests.interop.small_map import make_map
+from tests.support.float_features import with_numbers
 
 OFTEN = MapBuilderOptions(nframe_sync_max_output_frequency_hz=1000.0)
 
@@ -85,6 +87,16 @@ def test_a_replayed_mission_is_rebuilt(stereo: VIMap) -> None:
     first = result.imu_samples.take(result.sample_start[1:-1])
     last = result.imu_samples.take(result.sample_start[1:-1] - 1)
     assert is_same(first, last)
+
+
+def test_descriptors_of_numbers_are_replayed_and_rebuilt(stereo: VIMap) -> None:
+    numbers = with_numbers(stereo, FeatureType.XFEAT)
+    builder = MapBuilder(MapRecording(numbers, 0).device, OFTEN)
+    rebuilt(numbers, builder)
+    result = builder.make_map()
+    assert check_consistency(result).failure == ""
+    np.testing.assert_array_equal(result.keypoints.descriptor, numbers.keypoints.descriptor)
+    assert list(result.frames.descriptor_blocks) == list(numbers.frames.descriptor_blocks)
 
 
 def test_equal_input_gives_equal_maps_and_other_sessions_other_ids(stereo: VIMap) -> None:

@@ -241,6 +241,10 @@ def press_at_frame(monkeypatch: pytest.MonkeyPatch, *frames: int) -> None:
             {"datasource_folder": "images", "feature_tracking_descriptor_type": "freak"},
             "FREAK is not in the OpenCV",
         ),
+        (
+            {"datasource_folder": "images", "feature_tracking_descriptor_type": "xfeat"},
+            "XFeat is not installed on this computer: run install_features xfeat",
+        ),
         ({"datasource_folder": "images", "rovio_image_mask_path": "m.png"}, "cannot be read"),
         ({"datasource_folder": "images", "vio_num_keyframes": 1}, "vio_num_keyframes"),
         ({"datasource_folder": "WALK", "map_key": "a/b"}, "cannot be a map key"),
@@ -250,6 +254,7 @@ def test_wrong_requests_are_refused_in_one_line(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: dict[str, str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     (tmp_path / "empty").mkdir()
     write_folder(make_content(), tmp_path / "images")
     given: dict[str, object] = {

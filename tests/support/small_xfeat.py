@@ -14,7 +14,7 @@ from unittest import mock
 
 import numpy as np
 
-from maplab_py.vision.learned.checkpoint import Arrays
+from maplab_py.vision.features.learned.checkpoint import Arrays
 
 _WIDTHS = {
     "block1": (1, 4, 8, 8, 24),

@@ -22,13 +22,13 @@ class FrameKeypoints:
     """N keypoints with descriptors of all cameras of one frame."""
 
     time_ns: int
+    feature_type: int
     track_id: I64  # (N,) -1 = on no track
     camera: I32  # (N,)
     descriptors: U8  # (N, bytes)
     origin_I: F64  # (N, 3) camera centres in the body frame [m]
     ray_I: F64  # (N, 3) unit rays in the body frame
     rad_per_px: F64  # (N,) angle that a pixel covers
-    feature_type: int = FeatureType.BINARY
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -64,7 +64,7 @@ def frame_keypoints(update: OdometryUpdate, device: RecordedSensors) -> FrameKey
     parts = parts or [_nothing(size)]
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     feature_type = given[0].feature_type if given else FeatureType.BINARY
-    return FrameKeypoints(update.time_ns, *columns, feature_type=feature_type)
+    return FrameKeypoints(update.time_ns, feature_type, *columns)
 
 
 _Columns = tuple[I64, I32, U8, F64, F64, F64]

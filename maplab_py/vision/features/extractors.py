@@ -42,7 +42,7 @@ def extract(name: str, image: U8, max_features: int) -> ExtractedFeatures:
         UserError: It is a network that is not installed.
     """
     if name == "xfeat":
-        from maplab_py.vision.learned.xfeat import installed_xfeat
+        from maplab_py.vision.features.learned.xfeat import installed_xfeat
 
         return installed_xfeat().extract(image, max_features)
     keypoints, descriptors = _detector(name, max_features).detectAndCompute(

@@ -30,7 +30,7 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
         20, ge=4, le=1000, flag="min_tracking_distance_to_image_border_px"
     )
     """Smallest distance of a keypoint to the image border; descriptors need 20"""
-    descriptor_type: str = option("brisk", choices=DESCRIPTORS)
+    descriptor_type: str = "brisk"
     """Descriptor of tracked keypoints: brisk (Binary, 64 bytes), or xfeat (XFeat, 64 numbers, a network:
     install_features), which other light and other directions change less"""
     descriptor_size_px: float = option(12.0, ge=1, le=1000)

@@ -32,7 +32,7 @@ GOLDEN = Path(__file__).with_name("golden")
 NOT_RECORDED = {
     **dict.fromkeys((*SERVED, "get_dense_map_in_range"), "asks a server: tests/server"),
     **dict.fromkeys(WITH_ROBOT, "waits for a robot: tests/interop/live"),
-    "install_features": "writes into the user's data folder: tests/vision/learned",
+    "install_features": "writes into the user's data folder: tests/vision/features/learned",
     "recover": "loads what a failed script left: tests/console/scripts/test_typed_lines.py",
     "resource_cache_statistics": "counts what the whole process has read",
     "save_view": "needs a browser: tests/viewer",

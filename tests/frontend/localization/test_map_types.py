@@ -24,5 +24,14 @@ def test_maps_without_binary_descriptors_are_refused_by_their_types() -> None:
     with pytest.raises(UserError, match=message):
         check_descriptors(of_summary(summary, "office"), 48, FeatureType.BINARY)
     check_descriptors(of_map(vi_map, "office"), 48, FeatureType.BINARY)
+    learned = with_numbers(vi_map, FeatureType.XFEAT)
+    with pytest.raises(UserError, match="or give --feature_tracking_descriptor_type=xfeat"):
+        of_map(learned, "office")
+    kind = of_map(learned, "office", feature_type=FeatureType.XFEAT).database.projection.kind
+    assert kind.feature_type == FeatureType.XFEAT
+    with pytest.raises(
+        UserError, match=r"those of the recording XFeat: choose .*descriptor_type=brisk"
+    ):
+        of_map(vi_map, "office", feature_type=FeatureType.XFEAT)
     with pytest.raises(UserError, match="its descriptors have 48 bytes, those of the recording 64"):
         check_descriptors(of_map(vi_map, "office"), 64, FeatureType.BINARY)

@@ -14,7 +14,7 @@ import numpy as np
 
 from maplab_py.array_types import F32
 from maplab_py.errors import UserError
-from maplab_py.vision.learned.checkpoint import Arrays
+from maplab_py.vision.features.learned.checkpoint import Arrays
 
 CELL_PX = 8
 DIMENSIONS = 64

@@ -18,7 +18,7 @@ from maplab_py.errors import UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.vision.features.detection import strongest_places
 from maplab_py.vision.features.extension import ExtractedFeatures
-from maplab_py.vision.learned.xfeat_graph import CELL_PX, DIMENSIONS, SIZE_STEP_PX
+from maplab_py.vision.features.learned.xfeat_graph import CELL_PX, DIMENSIONS, SIZE_STEP_PX
 
 _MAX_BYTES = 1 << 28
 _THREADS = 2
@@ -134,10 +134,10 @@ def _corners(image: U8, most: int) -> F64:
     """Return corners (K, 2), the strongest first, to a fraction of a pixel."""
     import cv2
 
-    found = cv2.goodFeaturesToTrack(np.ascontiguousarray(image), most, _MIN_SHARE, _APART_PX)
-    if found is None:
+    corners = cv2.goodFeaturesToTrack(np.ascontiguousarray(image), most, _MIN_SHARE, _APART_PX)
+    if corners is None:
         return np.zeros((0, 2))
-    return strongest_places(image, found.reshape(-1, 2).astype(np.int64))
+    return strongest_places(image, corners.reshape(-1, 2).astype(np.int64))
 
 
 def _cells(uv: F64, shape: tuple[int, ...]) -> F64:

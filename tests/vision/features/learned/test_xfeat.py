@@ -9,10 +9,13 @@ import pytest
 
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
-from maplab_py.vision.learned.checkpoint import Arrays
-from maplab_py.vision.learned.installation import check_image
-from maplab_py.vision.learned.xfeat import XFeat, installed_xfeat
-from maplab_py.vision.learned.xfeat_graph import xfeat_graph
+from maplab_py.frontend.vertex_keypoints import described_frames
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
+from maplab_py.vision.features.learned.checkpoint import Arrays
+from maplab_py.vision.features.learned.installation import check_image
+from maplab_py.vision.features.learned.xfeat import XFeat, installed_xfeat
+from maplab_py.vision.features.learned.xfeat_graph import xfeat_graph
+from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 from tests.support.small_xfeat import random_arrays
 
 pytest.importorskip("onnx", reason="the extra [learned] is not installed")
@@ -127,3 +130,18 @@ def test_installed_weights_match_a_moved_image() -> None:
     is_right = np.linalg.norm(moved - [8.0, 16.0], axis=1) < 1.5
     assert np.count_nonzero(is_right) > 50
     assert np.mean(is_right) > 0.6
+
+
+def test_tracked_keypoints_get_descriptors_of_numbers(
+    network: XFeat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("maplab_py.vision.features.learned.xfeat.installed_xfeat", lambda: network)
+    image = np.random.default_rng(2).integers(0, 256, (96, 128), dtype=np.uint8)
+    uv_px = np.array([[20.0, 30.5], [100.25, 60.0], [1.0, 94.0]])
+    ids = np.arange(3)
+    tracks = CameraTracks(uv_px, ids, np.ones(3), np.full(3, 12.0), ids)
+    tracked = TrackedImages(0, (tracks,), 0.0, False, {}, "xfeat")
+    (frame,) = described_frames(tracked, (image,), 5)
+    assert (frame.feature_type, frame.depth) == (FeatureType.XFEAT, DescriptorDepth.FLOAT32)
+    assert (frame.descriptor_size == 256).all()
+    assert np.array_equal(frame.descriptor.view("<f4"), network.describe(image, uv_px))
