@@ -23,8 +23,8 @@ from maplab_py.array_types import F32, F64, I8, I64, U8, U64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.geometry.triangulation import triangulate
-from maplab_py.interop.recordings.opening import open_recording
 from maplab_py.interop.recordings.protocol import FrameSet
+from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera
