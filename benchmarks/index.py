@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 from tests.support.machine import slowness
 from tests.vision.synthetic import descriptor_set, nearest_by_bits, tracks
 

@@ -45,7 +45,7 @@ from maplab_py.vision import (
     absolute_pose,
     descriptors,
     epipolar_matching,
-    multi_index,
+    index,
     point_covariance,
     rays_and_points,
     track_union,
@@ -119,14 +119,14 @@ def _start_process() -> None:
 
 def _compile_numbers() -> None:
     """Compile the search of descriptors that are not binary, and the tracks of extracted features."""
-    multi_index.compile_kernels(DescriptorKind(8, FeatureType.SIFT))
+    index.compile_kernels(DescriptorKind(8, FeatureType.SIFT))
     descriptors.compile_kernels(np.int8)
     epipolar_matching.compile_kernels()
 
 
 def _compile_search() -> None:
     """Compile the descriptor indices, and what merging landmarks needs."""
-    for module in (multi_index, descriptors, track_union, point_covariance, rays_and_points):
+    for module in (index, descriptors, track_union, point_covariance, rays_and_points):
         module.compile_kernels()
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from maplab_py.vision.descriptors import differences, pack_words
-from maplab_py.vision.index import MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import InvertedMultiIndex, MatchRule
 from tests.vision.synthetic import descriptor_set, nearest_by_bits, tracks
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from maplab_py.errors import UserError
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.descriptors import STEPS_PER_UNIT, DescriptorKind, differences
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 from maplab_py.vision.projection import (
     DescriptorProjection,
     learn_projection,

@@ -18,8 +18,7 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
 from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 
 _CERTAIN = 2
 """The search stops at this multiple of the required inliers."""

@@ -23,8 +23,7 @@ from maplab_py.array_types import I32, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.memory import available_bytes
 from maplab_py.vision.descriptors import differences
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 
 _NEIGHBOURS = 3
 _QUERIES_AT_ONCE = 1 << 18

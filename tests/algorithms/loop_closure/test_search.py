@@ -26,8 +26,7 @@ from maplab_py.vimap import VIMap
 from maplab_py.vimap.excerpts import cut_by_time
 from maplab_py.vimap.vertex_removal import remove_vertices
 from maplab_py.vision.descriptors import DescriptorKind, pack_words
-from maplab_py.vision.index import DescriptorSet, MatchRule
-from maplab_py.vision.multi_index import InvertedMultiIndex
+from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 from maplab_py.vision.projection import learn_projection
 from tests.algorithms.loop_closure.rooms import POINTS, Walk, make_map, room_points
 from tests.simulation.small import simulated
