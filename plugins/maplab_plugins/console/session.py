@@ -124,19 +124,30 @@ def fix(context: CommandContext) -> Message:
     refusal = context.session.refusal
     if refusal is None:
         raise UserError("fix: no command was refused for a reason that another command mends")
-    remedies = [refusal.remedy]
+    done: list[str] = []
+    _run_mended(context, refusal.remedy, {refusal.remedy}, done)
+    _run_mended(context, refusal.line, {refusal.remedy}, done)
+    return Message(f"{refusal.line} has run after {', '.join(done[:-1])}")
+
+
+def _run_mended(context: CommandContext, line: str, remedies: set[str], done: list[str]) -> None:
+    """Run a line; where it is refused, its remedy first, each remedy once.
+
+    Raises:
+        MaplabError: A refusal has no remedy, or one that was tried.
+    """
     while True:
-        context.progress.line(f"> {remedies[-1]}")
-        context.session.run_line(remedies[-1], context.terminal)
-        context.progress.line(f"> {refusal.line}")
+        context.progress.line(f"> {line}")
         try:
-            context.session.run_line(refusal.line, context.terminal)
+            context.session.run_line(line, context.terminal)
         except MaplabError as error:
             if not error.remedy or error.remedy in remedies:
                 raise
-            remedies.append(error.remedy)
+            remedies.add(error.remedy)
+            _run_mended(context, error.remedy, remedies, done)
         else:
-            return Message(f"{refusal.line} has run after {', '.join(remedies)}")
+            done.append(line)
+            return
 
 
 def _sleep(context: CommandContext, seconds: float) -> None:

@@ -22,10 +22,12 @@ from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import UserError
+from maplab_py.interop.resources.images import import_images
 from maplab_py.plugin import CommandContext, Report, command
-from maplab_py.vimap import LandmarkQuality
+from maplab_py.vimap import LandmarkQuality, VIMap
 from tests.console.sample_plugin import make_session
 from tests.plugins.test_loopclosure import TWICE, session_of
+from tests.support.stereo_room import StereoRoom, quarter_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +136,38 @@ def test_a_refusal_without_a_remedy_is_not_repeated(
     drifted.session.set_flags(["--auto_fix"])
     assert drifted.run_text("landmark_sparsify") == Status.USER_ERROR
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def with_images(tmp_path_factory: pytest.TempPathFactory) -> VIMap:
+    room = StereoRoom.simulated(tmp_path_factory.mktemp("room"), quarter_size(frame_rate_hz=2.0))
+    return import_images(room.true_map, 0, room.recording)[0]
+
+
+def _with_bad_landmarks(vi_map: VIMap) -> VIMap:
+    bad = np.full_like(vi_map.landmarks.quality, LandmarkQuality.BAD)
+    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=bad))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "convert_all_depth_maps_to_point_clouds",  # stereo_dense_reconstruction
+        "create_mesh_from_tsdf_grid -o room.ply",  # create_tsdf_from_depth_resource, which needs the former
+        "generate_summary_map_and_save_to_disk -o summary",  # retriangulate_landmarks
+        "tsdf --update",
+    ],
+)
+def test_refused_commands_run_after_their_remedies(
+    line: str, with_images: VIMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runner = runner_of(Session())
+    runner.session.maps.add("room", _with_bad_landmarks(with_images))
+    assert runner.run_text(line) != Status.OK
+    assert runner.session.refusal is not None
+    assert runner.run_text("fix") == Status.OK
+    assert runner.session.refusal is None
 
 
 def remedies() -> Iterator[str]:
