@@ -10,7 +10,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import Drawing, make_drawing, spread_rows
+from maplab_py.viewer.drawing import Drawing, ImageOf, make_drawing, no_image, spread_rows
 from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.history import State
 from maplab_py.viewer.layers import (
@@ -54,6 +54,7 @@ class Subject:
     only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
     note: str = ""  # a line above the layers
     history: tuple[State, ...] = ()  # of the map, which is one of them
+    images: ImageOf = no_image  # of the vertices of the map
     state: int = -1  # place in the history of what is shown; -1 = the map
 
     @property
@@ -91,7 +92,10 @@ def make_checked_drawing(subject: Subject) -> Drawing:
         return _sensor_drawing(subject)
     if not len(subject.shown.vertices):
         raise UserError(f"map '{subject.title}' has no vertices: there is nothing to show")
-    return make_drawing(subject.shown, subject.options)
+    drawing = make_drawing(subject.shown, subject.options)
+    if subject.shown is not subject.vi_map:
+        return drawing  # its vertices may have other rows
+    return dataclasses.replace(drawing, images=subject.images)
 
 
 def scene_of(drawing: Drawing, subject: Subject) -> Scene:

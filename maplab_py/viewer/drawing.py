@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,15 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import Extent, Points, Scene, Segments
 from maplab_py.vimap import VIMap, mission_labels, to_hex_list
+
+ImageOf = Callable[[int], "U8 | None"]
+"""Gives the image (H, W, 3) of a vertex (row), if there is one."""
+
+
+def no_image(row: int) -> None:  # noqa: ARG001
+    """Say that a vertex has no image."""
+    return
+
 
 _OUTLINE_POINTS = 1500
 _FAR_M = 2000.0
@@ -29,6 +39,7 @@ class Drawing:
     options: VisualizationOptions
     origin_G: F64  # (3,)
     extent: Extent
+    images: ImageOf = no_image
 
     @cached_property
     def mission_ids(self) -> list[str]:

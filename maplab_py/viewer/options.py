@@ -19,6 +19,7 @@ COLOURINGS = (
     "time",
     "type",
     "camera",
+    "pixels",
     "grey",
 )
 
@@ -45,6 +46,8 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Colour landmarks by feature type."""
     color_landmarks_by_first_observer_frame: bool = False
     """Colour landmarks by the camera of the frame that observed them first."""
+    color_landmarks_by_pixels: bool = False
+    """Colour landmarks by the pixels of the images that the map keeps."""
     color_only_missions: str = ""
     """Colour the landmarks of these missions alone by the rule, the others by mission: ids or their
     beginnings, separated by commas; empty = all."""
@@ -126,6 +129,7 @@ class VisualizationOptions(Options, prefix="vis_"):
             (self.color_landmarks_by_time, "time"),
             (self.color_by_landmark_type, "type"),
             (self.color_landmarks_by_first_observer_frame, "camera"),
+            (self.color_landmarks_by_pixels, "pixels"),
             (self.color_by_mission, "mission"),
         )
         return next((name for is_wanted, name in rules if is_wanted), "grey")
@@ -142,6 +146,7 @@ class VisualizationOptions(Options, prefix="vis_"):
             color_landmarks_by_time=colouring == "time",
             color_by_landmark_type=colouring == "type",
             color_landmarks_by_first_observer_frame=colouring == "camera",
+            color_landmarks_by_pixels=colouring == "pixels",
             color_by_mission=colouring == "mission",
         )
 

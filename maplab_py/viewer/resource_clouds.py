@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64, U8, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
@@ -27,6 +27,8 @@ from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_
 
 _MM = 1e-3
 _MAX_DEPTH_PIXELS = 20_000
+_MAX_PIXEL_IMAGES = 150
+"""Images that are read to colour landmarks: half a second."""
 
 
 def type_number(name: str) -> int:
@@ -202,6 +204,7 @@ class VertexImages:
             name: Type; empty = the first type of images that the map has.
             with_depth: Show the depth map of a vertex below its image.
         """
+        self._vi_map, self._folder, self._name = vi_map, folder, name
         self._store = ResourceStore(vi_map, folder)
         self._row_of_vertex = _first_of_vertices(vi_map, (name,) if name else IMAGE_TYPES)
         self._frame_of_row = vi_map.resources.owner
@@ -230,6 +233,35 @@ class VertexImages:
         """Return the frame (row) that the image of a vertex (row) belongs to, -1 = it has none."""
         row = self._row_of_vertex.get(vertex)
         return -1 if row is None else int(self._frame_of_row[row])
+
+    def of_map(self, vi_map: VIMap) -> VertexImages:
+        """Return the images of another state of the map, whose vertices may have other rows."""
+        with_depth = bool(self._depth_of_vertex)
+        return VertexImages(vi_map, self._folder, self._name, with_depth=with_depth)
+
+    def pixels(self) -> tuple[U8, Mask]:
+        """Return colours (L, 3) of landmarks where images show them, and which landmarks (L,) have one.
+
+        Of many images every n-th is read: most landmarks are in several.
+        """
+        vi_map = self._vi_map
+        vertices = np.array(sorted(self._row_of_vertex), dtype=np.int64)
+        vertices = vertices[:: max(1, -(-len(vertices) // _MAX_PIXEL_IMAGES))]
+        colour = np.zeros((len(vi_map.landmarks), 3), dtype=np.uint8)
+        is_known = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
+        for vertex in vertices.tolist():
+            image, frame = self.image(vertex), self.frame(vertex)
+            if image is None:
+                continue
+            keypoints = np.arange(*vi_map.keypoint_start[frame : frame + 2])
+            landmark = vi_map.keypoints.landmark[keypoints]
+            new = (landmark >= 0) & ~is_known[landmark]
+            u, v = np.floor(vi_map.keypoints.uv_px[keypoints]).astype(np.int64).T
+            new &= (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+            u, v = u[new], v[new]
+            colour[landmark[new]] = image[v, u]
+            is_known[landmark[new]] = True
+        return colour, is_known
 
     def _load(self, row: int | None) -> U8 | None:
         if row is None:

@@ -326,7 +326,7 @@ def test_depth_maps_become_points(with_resources: Session) -> None:
 
 def test_images_are_those_of_the_vertex(with_resources: Session) -> None:
     with_resources.run("visualize_raw_images")
-    image_of = _viewer(with_resources)._image_of
+    image_of = _viewer(with_resources).drawing.images
     shown = image_of(2)
     assert shown is not None
     assert shown.shape == (24, 32, 3)

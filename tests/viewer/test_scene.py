@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,18 +15,22 @@ from maplab_py.sensors import Distortion, Projection
 from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import project
 from maplab_py.storage.mission_names import named
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.selection import with_keypoints
 from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.layers.cameras import frustum_points
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.landmarks import landmark_colours
 from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
+from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Axes, Mesh, Points, Scene, Segments
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap.selection import keep_rows
 from tests.support.scene import make_camera
 from tests.vimap.builders import walk_map
 
@@ -206,6 +211,41 @@ def test_every_colouring_colours_every_landmark(two_missions: VIMap, colouring: 
     if colouring == "quality":
         assert (colour == colours.QUALITY[2]).all()
     assert bool(scene.layer("landmarks").legend) == (colouring not in ("grey", "mission"))
+
+
+def test_landmarks_have_the_colours_of_their_pixels(tmp_path: Path) -> None:
+    vi_map = walk_map(vertices=6)
+    new = NewResources(tmp_path)
+    columns = np.tile(np.arange(300) % 251, (480, 1)).astype(np.uint8)  # a part of the image
+    frames = vi_map.frame_start[[1, 4]].tolist()
+    vi_map = new.attached(vi_map, [new.add_image(columns) for _ in frames], frames)
+    images = VertexImages(vi_map, Path())
+    options = VisualizationOptions().with_colouring("pixels")
+    _, colour, rows = _points(
+        build_scene(Subject(vi_map, "test", options, images=images)), "landmarks"
+    )
+    of_frame = np.isin(vi_map.keypoint_frame, frames) & (vi_map.keypoints.landmark >= 0)
+    of_frame &= vi_map.keypoints.uv_px[:, 0] < 300.0
+    seen = np.unique(vi_map.keypoints.landmark[of_frame])
+    is_seen = np.isin(rows, seen)
+    assert 0 < np.count_nonzero(is_seen) < len(rows)
+    assert (colour[~is_seen] == colours.REFERENCE).all()
+    first = np.flatnonzero(of_frame)
+    u_of = {int(vi_map.keypoints.landmark[k]): vi_map.keypoints.uv_px[k, 0] for k in first[::-1]}
+    expected = np.array([int(u_of[row]) % 251 for row in rows[is_seen].tolist()])
+    assert (colour[is_seen] == np.clip(expected, 40, 215)[:, None]).all()
+
+    kept = keep_rows(vi_map, vertices=np.arange(3, 6))  # the images keep their vertices
+    moved = images.of_map(kept)
+    assert images.image(4) is not None
+    assert [moved.image(row) is not None for row in range(3)] == [False, True, False]
+    black = np.zeros((480, 640, 3), dtype=np.uint8)
+    picture, words = with_keypoints(vi_map, black, frames[0])
+    count = np.count_nonzero(vi_map.keypoints.landmark[vi_map.keypoint_frame == frames[0]] >= 0)
+    assert f"{count} tracked keypoints" in words
+    drawn = picture[picture.any(axis=2)]
+    assert len(drawn) > 10 * count / 2
+    assert (drawn == colours.TRUST[-1]).all()  # they are where the map has them
 
 
 def test_height_colours_rise_and_repeat() -> None:

@@ -21,7 +21,6 @@ from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.camera import FREE, RIDES, ride
 from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.display.selection import ImageOf, no_image
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Signal, step_seconds, vertex_signals
@@ -71,7 +70,6 @@ class Playback:
         self.time_line = TimeLine(server, self, lock, say)
         self.player: Player | None = None
         self.options = PlaybackOptions()
-        self._image_of: ImageOf = no_image
         self._ride = FREE
         self._mission = -1  # row whose plots are shown, -1 = the first that is played
         self._signals: tuple[Signal, ...] = ()
@@ -81,10 +79,9 @@ class Playback:
         self._ticker = threading.Thread(target=self._tick, name="maplab playback", daemon=True)
         self._ticker.start()
 
-    def configure(self, options: PlaybackOptions, image_of: ImageOf) -> None:
-        """Play another way, with images from elsewhere."""
+    def configure(self, options: PlaybackOptions) -> None:
+        """Play another way."""
         self.options = options
-        self._image_of = image_of
         self._mission = -1
 
     def set_step(self, step: int) -> None:
@@ -176,7 +173,7 @@ class Playback:
     def _show(self, player: Player) -> None:
         """Show a step on the time line, and move the view if it rides along."""
         vertex = player.head(self._mission)
-        image = self._image_of(vertex) if vertex >= 0 else None
+        image = self._view.drawing.images(vertex) if vertex >= 0 else None
         rows = [
             (title, paths, value_text(signal, vertex) if vertex >= 0 else "")
             for signal, (title, paths) in zip(self._signals, self._curves, strict=True)

@@ -11,8 +11,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
+from maplab_py.errors import MapError
 from maplab_py.viewer import colours
 from maplab_py.viewer.display.camera import approach
 from maplab_py.viewer.display.panel import Panel
@@ -27,16 +29,8 @@ from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, ragged_rows
 from maplab_py.vimap.descriptors import binary_descriptor_sizes
 
-ImageOf = Callable[[int], "U8 | None"]
-"""Gives the image (H, W, 3) of a vertex (row), if there is one."""
-
 _MAX_FRUSTA = 16
 """More cameras of one landmark's observers would hide it."""
-
-
-def no_image(row: int) -> None:  # noqa: ARG001
-    """Say that a vertex has no image."""
-    return
 
 
 class Selection:
@@ -54,7 +48,7 @@ class Selection:
         self.distance_m: float | None = None
         self.on_pick: Callable[[str], None] = lambda _: None  # told the id of each pick
 
-    def pick(self, drawing: Drawing, picked: Pick, image_of: ImageOf) -> None:
+    def pick(self, drawing: Drawing, picked: Pick) -> None:
         """Mark what was clicked and show its facts."""
         previous, self.picked, self.distance_m = self.picked, picked, None
         self.on_pick(id_of(drawing.vi_map, picked))
@@ -68,20 +62,25 @@ class Selection:
         self._mark(drawing, picked)
         image = None
         if picked.entity is Entity.VERTEX:
-            image = image_of(picked.row)
-        elif self._ends and isinstance(image_of, VertexImages):
-            pair = closure_picture(drawing.vi_map, image_of, *self._ends)
+            image = drawing.images(picked.row)
+            if image is not None and isinstance(drawing.images, VertexImages):
+                image, words = with_keypoints(
+                    drawing.vi_map, image, drawing.images.frame(picked.row)
+                )
+                note = note or words
+        elif self._ends and isinstance(drawing.images, VertexImages):
+            pair = closure_picture(drawing.vi_map, drawing.images, *self._ends)
             image, note = pair or (None, note)
         self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
 
-    def jump(self, drawing: Drawing, text: str, image_of: ImageOf, clients: list[Any]) -> None:
+    def jump(self, drawing: Drawing, text: str, clients: list[Any]) -> None:
         """Pick what an id means, and move the cameras of pages there.
 
         Raises:
             UserError: Nothing has an id that starts so, or several have.
         """
         picked = find_by_id(drawing, text)
-        self.pick(drawing, picked, image_of)
+        self.pick(drawing, picked)
         for client in clients:
             with client.atomic():
                 approach(client.camera, picked.p, 0.25 * drawing.extent.radius_m)
@@ -167,6 +166,44 @@ class Selection:
 
     def _add(self, name: str, part: Part) -> None:
         self._handles += add_part(self._server, f"/pick/{name}", part)
+
+
+_LARGE_ERROR_PX = 3.0
+
+
+def with_keypoints(vi_map: VIMap, image: U8, frame: int) -> tuple[U8, str]:
+    """Return the image (H, W, 3) with its tracked keypoints as rings, and the meaning of their colours.
+
+    The keypoints are those of a frame (row), -1 = none.
+    """
+    keypoints = np.arange(*vi_map.keypoint_start[frame : frame + 2]) if frame >= 0 else np.arange(0)
+    keypoints = keypoints[vi_map.keypoints.landmark[keypoints] >= 0]
+    if not len(keypoints):
+        return image, ""
+    try:
+        p_G = vi_map.p_G[vi_map.keypoints.landmark[keypoints]]
+        error_px = residuals(vi_map, keypoints, p_G).error_px
+    except MapError:
+        return image, ""  # no calibrated camera
+    radius = max(2, round(image.shape[1] / 160))
+    width = max(1, round(image.shape[1] / 640))
+    y, x = np.mgrid[-radius - 1 : radius + 2, -radius - 1 : radius + 2]
+    ring = np.abs(np.hypot(x, y) - radius) <= 0.5 * width + 0.3
+    around = np.stack([x[ring], y[ring]], axis=1)
+    places = np.floor(vi_map.keypoints.uv_px[keypoints]).astype(np.int64)[:, None] + around
+    size = image.shape[1], image.shape[0]
+    is_inside = np.asarray((places >= 0) & (places < size)).all(axis=2)
+    part = np.minimum(error_px / _LARGE_ERROR_PX, 1.0)
+    colour = np.broadcast_to(
+        colours.ramp(1.0 - part, colours.TRUST)[:, None], (*is_inside.shape, 3)
+    )
+    drawn = image.copy()
+    u, v = places[is_inside].T
+    drawn[v, u] = colour[is_inside]
+    words = (
+        f"{len(keypoints)} tracked keypoints, green to red: 0 to {_LARGE_ERROR_PX:g} px of error"
+    )
+    return drawn, words
 
 
 _MAX_BIT_FRACTION = 0.2

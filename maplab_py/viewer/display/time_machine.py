@@ -39,6 +39,7 @@ class TimeMachine:
             )
             self.chart = server.gui.add_html("")
         self.slider.on_update(by_user(lock, lambda event: show_state(int(event.target.value)), say))
+        self._is_stopped = False
         self._subject: Subject | None = None
         self._curves: tuple[Curve, ...] = ()
         self._measured: Subject | None = None  # that the curves belong to
@@ -58,6 +59,10 @@ class TimeMachine:
         is_known = self._measured is not None and self._measured.history is states
         self.chart.content = history_chart(states, self._curves if is_known else (), subject.place)
 
+    def stop(self) -> None:
+        """Change nothing any more: the server is about to stop."""
+        self._is_stopped = True
+
     def measure(self) -> None:
         """Compute the curves of what is shown, unless they are known: this takes a moment in large maps."""
         subject = self._subject
@@ -67,6 +72,8 @@ class TimeMachine:
             return
         curves = error_curves(subject.history, subject.truth)
         with self._lock:
+            if self._is_stopped:
+                return
             self._curves, self._measured = curves, subject
             if self._subject is not None:
                 self.show(self._subject)

@@ -30,7 +30,7 @@ from maplab_py.viewer.display.picture import (
 )
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.display.selection import ImageOf, Selection, no_image
+from maplab_py.viewer.display.selection import Selection
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.display.time_machine import TimeMachine
 from maplab_py.viewer.drawing import Drawing
@@ -80,7 +80,6 @@ class Viewer:
         self._playback = Playback(self._server, self, self._lock, self._panel.say)
         self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
         self.court = Court(self._server, self, self._lock, self._panel.say)
-        self._image_of: ImageOf = no_image
         self._is_dark = is_dark
         self._drawing: Drawing | None = None
         self.scene: Scene | None = None
@@ -131,19 +130,12 @@ class Viewer:
         """The number of open pages."""
         return len(self._server.get_clients())
 
-    def show(
-        self,
-        subject: Subject,
-        *,
-        playback: PlaybackOptions | None = None,
-        image_of: ImageOf = no_image,
-    ) -> Scene:
+    def show(self, subject: Subject, *, playback: PlaybackOptions | None = None) -> Scene:
         """Show a subject now.
 
         Args:
             subject: What to show.
             playback: How the time slider plays it.
-            image_of: Where images of vertices come from.
 
         Raises:
             UserError: There is nothing to show.
@@ -151,8 +143,7 @@ class Viewer:
         drawing = make_checked_drawing(subject)
         scene = scene_of(drawing, subject)
         with self._lock:
-            self._playback.configure(playback or PlaybackOptions(), image_of)
-            self._image_of = image_of
+            self._playback.configure(playback or PlaybackOptions())
             self._choices = {}
             self._show(subject, drawing, scene)
         self._wake.set()  # measures the history
@@ -249,6 +240,7 @@ class Viewer:
             if self._is_stopped:
                 return
             self._is_stopped = True
+            self._time_machine.stop()
         self._playback.end()
         self._wake.set()
         self._idle.set()
@@ -409,7 +401,7 @@ class Viewer:
     def select(self, picked: Pick) -> None:
         """Mark a thing and show its facts, as if it had been clicked."""
         with self._lock:
-            self._selection.pick(self.drawing, picked, self._image_of)
+            self._selection.pick(self.drawing, picked)
 
     def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
         """Select what an id means, and move the cameras of pages there, None = of all.
@@ -419,7 +411,7 @@ class Viewer:
         """
         with self._lock:
             pages = list(self._server.get_clients().values()) if clients is None else clients
-            self._selection.jump(self.drawing, text, self._image_of, pages)
+            self._selection.jump(self.drawing, text, pages)
 
     def _click(self, event: Any) -> None:
         if self.scene is None:

@@ -15,6 +15,8 @@ from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
 from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, LegendEntry
 
 ACCEPTED, REFUSED = "accepted_closures", "refused_closures"
+_MAX_SHOWN = 2000
+"""Accepted closures that are shown at first; software draws more wide lines slowly."""
 _REFUSED_WIDTH_PX = 1.0
 _REFUSED_COLOUR = colours.from_hex("#a9adb6")[0]
 
@@ -40,7 +42,7 @@ def recorded_closures(drawing: Drawing) -> tuple[list[Layer], list[str]]:
         part = make_segments(ends[0][rows], ends[1][rows], colour[rows], rows, 1.5)
         return Layer(
             name, title, {WHOLE_MAP: part}, len(rows), Entity.CLOSURE,
-            legend=legends, is_visible=False,
+            legend=legends, is_visible=len(rows) <= _MAX_SHOWN,
         )  # fmt: skip
 
     refused = np.flatnonzero(~is_accepted)

@@ -159,6 +159,8 @@ def _rule_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
         return palette[place], tuple(LegendEntry(f"type {kind}", (c,)) for kind, c in names)
     if rule == "camera":
         return _camera_colours(drawing.vi_map)
+    if rule == "pixels":
+        return _pixel_colours(drawing)
     if rule == "grey":
         grey = np.full(3, drawing.options.landmark_gray_level, dtype=np.uint8)
         return np.tile(grey, (len(drawing.vi_map.landmarks), 1)), ()
@@ -179,6 +181,23 @@ def _camera_colours(vi_map: VIMap) -> tuple[U8, tuple[LegendEntry, ...]]:
     if not seen.all():
         legend.append(LegendEntry("not observed", (colours.to_hex(colours.REFERENCE),)))
     return every, tuple(legend)
+
+
+_VISIBLE = 40, 215
+"""Range of pixels that can be seen on a light and on a dark ground."""
+
+
+def _pixel_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Colour by the pixels of the images that the map keeps; the others stay in the neutral grey."""
+    from maplab_py.viewer.resource_clouds import VertexImages
+
+    code = colours.to_hex(colours.REFERENCE)
+    every = np.tile(colours.REFERENCE, (len(drawing.vi_map.landmarks), 1))
+    if not isinstance(drawing.images, VertexImages):
+        return every, (LegendEntry("the map keeps no images", (code,)),)
+    colour, is_known = drawing.images.pixels()
+    every[is_known] = np.clip(colour[is_known], *_VISIBLE)
+    return every, (LegendEntry("pixels (this grey: unknown)", (code,)),)
 
 
 def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, ...]]:

@@ -19,8 +19,8 @@ from maplab_py.plugin import Cancelled, CommandContext, Report, UserError
 if TYPE_CHECKING:
     from maplab_py.console.session.maps import MapEntry, MapManager
     from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.display.selection import ImageOf
     from maplab_py.viewer.display.viewer import Viewer
+    from maplab_py.viewer.drawing import ImageOf
     from maplab_py.viewer.history import State
     from maplab_py.viewer.options import PlaybackOptions
     from maplab_py.vimap import VIMap
@@ -73,6 +73,7 @@ class Following:
     def after_command(self, maps: MapManager) -> None:
         """Show the selected map when it is another value than the one that is shown."""
         from maplab_py.viewer.building import Subject
+        from maplab_py.viewer.resource_clouds import VertexImages
 
         subject = self.viewer.wanted
         if subject is None or self.viewer.is_stopped or not maps.selected_key:
@@ -82,8 +83,15 @@ class Following:
             return
         if entry.key == subject.title:
             following = subject.replace(vi_map=entry.vi_map, note="", state=-1)
+            if isinstance(subject.images, VertexImages):
+                following = following.replace(images=subject.images.of_map(entry.vi_map))
         else:
-            following = Subject(entry.vi_map, entry.key, subject.options)
+            following = Subject(
+                entry.vi_map,
+                entry.key,
+                subject.options,
+                images=images_of(entry.vi_map, entry.folder),
+            )
         self.viewer.follow(following.replace(history=states_of(entry)))
 
     def during_command(self, make_map: Callable[[], VIMap]) -> None:
@@ -112,6 +120,17 @@ def _with_history(context: CommandContext, subject: Subject) -> Subject:
     if entry is None or entry.vi_map is not subject.vi_map:
         return subject
     return subject.replace(history=states_of(entry))
+
+
+def _in_colours(subject: Subject) -> Subject:
+    """Return the subject with landmarks in the colours of its images, if nothing else is told apart."""
+    from maplab_py.viewer.resource_clouds import VertexImages
+
+    if len(subject.vi_map.missions) != 1 or not isinstance(subject.images, VertexImages):
+        return subject
+    if subject.options.landmark_colouring != "mission":
+        return subject
+    return subject.replace(options=subject.options.with_colouring("pixels"))
 
 
 def verdicts_of_page(context: CommandContext) -> list[list[str]]:
@@ -162,7 +181,9 @@ def viewer_for_output(context: CommandContext) -> Iterator[Viewer]:
 
     viewer = Viewer(0)
     try:
-        viewer.show(_with_history(context, Subject(context.vi_map, context.map_key)))
+        images = images_of(context.vi_map, context.map_folder)
+        subject = Subject(context.vi_map, context.map_key, images=images)
+        viewer.show(_with_history(context, _in_colours(subject)))
         yield viewer
     finally:
         viewer.stop()
@@ -211,7 +232,7 @@ def show(
         plays: Start to play at once.
     """
     began = time.perf_counter()
-    images = image_of or images_of_map(context, subject.vi_map)
+    images = image_of or images_of(subject.vi_map, context.map_folder)
     if viewer_options.program == "rerun":
         return _show_in_rerun(subject, viewer_options, images)
     if viewer_options.file is not None:
@@ -220,8 +241,8 @@ def show(
         )
     viewer = ensure_viewer(context, viewer_options)
     check_cancelled()
-    subject = _with_history(context, subject)
-    viewer.show(subject, playback=playback, image_of=images)
+    subject = _with_history(context, _in_colours(subject.replace(images=images)))
+    viewer.show(subject, playback=playback)
     if plays:
         viewer.open_time_line()
         viewer.set_playing(True)
@@ -251,14 +272,14 @@ def _show_in_rerun(subject: Subject, options: ViewerOptions, images: ImageOf) ->
     return ViewReport(place, subject.title, lines, scene.notes, time.perf_counter() - began)
 
 
-def images_of_map(context: CommandContext, vi_map: VIMap) -> ImageOf:
-    """Return the images and depth maps that the map keeps as resources; none when it was never loaded."""
-    from maplab_py.viewer.display.selection import no_image
+def images_of(vi_map: VIMap, folder: Path | None) -> ImageOf:
+    """Return the images and depth maps that a map keeps as resources; none when it was never loaded."""
+    from maplab_py.viewer.drawing import no_image
     from maplab_py.viewer.resource_clouds import VertexImages
 
-    if context.map_folder is None or not len(vi_map.resources):
+    if folder is None or not len(vi_map.resources):
         return no_image
-    images = VertexImages(vi_map, context.map_folder, with_depth=True)
+    images = VertexImages(vi_map, folder, with_depth=True)
     return images if len(images) else no_image
 
 

@@ -83,7 +83,7 @@ def test_a_picked_vertex_shows_its_image_and_its_depth(
     frame = int(MAP.frame_start[7])
     vi_map = new.attached(MAP, rows, [frame, frame])
     images = VertexImages(vi_map, Path(), with_depth=True)
-    viewer.show(dataclasses.replace(SUBJECT, vi_map=vi_map), image_of=images)
+    viewer.show(dataclasses.replace(SUBJECT, vi_map=vi_map, images=images))
     viewer.set_layer("loop_closures", False)
     viewer.look_at_everything()
     page.settle(1200)

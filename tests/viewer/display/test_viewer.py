@@ -280,8 +280,8 @@ def test_clouds_and_images_come_with_their_vertices(two_missions: VIMap) -> None
 
     clouds = tuple(Cloud("scan", np.full((5, 3), float(v)), vertex=v) for v in (0, 6, 11))
     try:
-        subject = Subject(two_missions, "test", clouds=clouds)
-        viewer.show(subject, playback=PlaybackOptions(steps=11), image_of=image_of)
+        subject = Subject(two_missions, "test", clouds=clouds, images=image_of)
+        viewer.show(subject, playback=PlaybackOptions(steps=11))
         viewer.set_step(3)
         player = viewer.player
         assert player is not None

@@ -78,7 +78,7 @@ def test_accepted_and_refused_closures_are_layers_of_their_own(closed: VIMap) ->
         for end, ids in ((0, record.query), (1, record.place)):
             p = closed.T_G_I[closed.vertex_index.rows(ids[part.rows]), 4:]
             np.testing.assert_allclose(part.ends[:, end], p, atol=1e-5)
-        assert not build_scene(Subject(closed)).layer(layer).is_visible
+        assert build_scene(Subject(closed)).layer(layer).is_visible == accepted
     colour = _segments(closed, ACCEPTED).colours
     np.testing.assert_array_equal(colour[:3], colours.TRUST[[0, 1, 2]])
 
