@@ -23,6 +23,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Set
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
@@ -74,7 +75,7 @@ from numba.core.dispatcher import Dispatcher  # noqa: E402
 from numba.core.extending import _Intrinsic  # noqa: E402
 from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.sigutils import normalize_signature  # noqa: E402
-from numba.core.targetconfig import ConfigStack, TargetConfig  # noqa: E402
+from numba.core.targetconfig import ConfigStack  # noqa: E402
 
 __all__ = ["TARGET", "compiled", "numba", "prange", "target_processor"]
 
@@ -125,6 +126,13 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
             self.overloads.pop(types, None)
         return super().compile(sig)
 
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Take numbers in the code of the caller for any numbers, so that one function serves all."""
+        try:
+            return super().get_call_template(tuple(map(numba.types.unliteral, args)), kws)
+        except numba.core.errors.TypingError:  # e.g. an index of a tuple
+            return super().get_call_template(args, kws)
+
     def add_overload(self, cres: Any) -> None:
         """Let Python find what has a wrapper."""
         types = tuple(cres.signature.args)
@@ -150,10 +158,12 @@ def _remember_types() -> None:
     """Let numba resolve the type of `a + b` or `a[i]` once for each set of types, not at each place.
 
     It is a third of the time that numba needs for a function. Flags are a part of what is remembered, since
-    functions of numba itself are compiled with those of their caller; numba compares flags slowly.
+    functions of numba itself are compiled with some of those of their caller; the others do not count,
+    and none of these functions is called through a pointer.
     """
-    function = numba.types.Function
+    function, flags_type = numba.types.Function, numba.core.compiler.Flags
     resolve = function.get_call_type
+    inherited = attrgetter("nrt", "fastmath", "error_model", "forceinline")
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         known = self.__dict__.setdefault("_known_calls", {})
@@ -168,14 +178,17 @@ def _remember_types() -> None:
         self._impl_keys[signature.args] = implementation
         return signature
 
-    def equal(self: Any, other: Any) -> Any:
-        if not isinstance(other, TargetConfig):
-            return NotImplemented
-        return self._values == other._values or self.values() == other.values()
+    def equal(self: Any, other: Any) -> bool:
+        return isinstance(other, flags_type) and inherited(self) == inherited(other)
+
+    def customize_flags(self: Any, flags: Any) -> Any:
+        flags.no_cfunc_wrapper |= self.py_func.__module__.startswith("numba.")
+        return flags
 
     function.get_call_type = get_call_type
-    TargetConfig.__eq__ = equal
-    TargetConfig.__hash__ = lambda _: hash(TargetConfig)
+    flags_type.__eq__ = equal
+    flags_type.__hash__ = lambda _: hash(flags_type)
+    numba.core.dispatcher._FunctionCompiler._customize_flags = customize_flags
 
 
 _remember_types()
