@@ -38,6 +38,8 @@ from maplab_py.vimap import ResourceOwner, VIMap, as_keys, resources_of, to_hex,
 
 GRID_TYPE = 18
 """Number of the resource type of grids of truncated signed distances."""
+_LOOKED_AT, _COARSE, _FINE = 5, 20.0, 40.0
+"""Depth maps that tell the depth; voxels in it below which they are coarse, and how many fit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,9 +120,23 @@ def fuse_depth(
         new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
         owners.append(group[0])
         reports.append(_report(vi_map, group, grid, len(resources), len(resources), 0))
+        notes += _notes_on_voxels(depth, resources, options.voxel_size_m)
     kept = without_resources(vi_map, former)
     result = new.attached(kept, np.arange(len(new)), owners, ResourceOwner.MISSION)
     return result, FusionReport(resource_type(kind).name, tuple(reports), tuple(notes))
+
+
+def _notes_on_voxels(depth: DepthViews, resources: I64, voxel_size_m: float) -> list[str]:
+    """Return a note where voxels are coarse for the depth of the surfaces, as in a near scene."""
+    some = resources[:: max(1, len(resources) // _LOOKED_AT)].tolist()
+    maps = [depth.view(row)[0] for row in some]
+    depth_m = float(np.median(np.concatenate([view[view > 0.0] for view in maps])))
+    if not voxel_size_m > depth_m / _COARSE:
+        return []
+    return [
+        f"surfaces are at {depth_m:.2f} m at the median, for which voxels of {voxel_size_m:g} m are "
+        f"coarse: --dense_tsdf_voxel_size_m={max(0.01, depth_m / _FINE):.2f} --overwrite shows more"
+    ]
 
 
 def update_grids(

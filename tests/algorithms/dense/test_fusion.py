@@ -71,6 +71,17 @@ def test_true_depth_gives_the_true_surfaces(room: StereoRoom, with_depth: VIMap)
     assert np.mean(off_m > 0.1) < 0.001
 
 
+def test_voxels_that_are_coarse_for_a_near_scene_are_told(
+    room: StereoRoom, with_depth: VIMap
+) -> None:
+    for voxel_m, is_told in ((0.05, False), (0.5, True)):
+        options = FusionOptions(voxel_size_m=voxel_m, integrate_every_nth=10)
+        _, report = fuse_depth(with_depth, room.map_folder, options=options)
+        assert (
+            any(f"voxels of {voxel_m:g} m are coarse" in note for note in report.notes) == is_told
+        )
+
+
 def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) -> None:
     fused, _ = fuse_depth(with_depth, Path(), None, OPTIONS)
     before, _ = map_mesh(fused, Path(), None, 0.1)
