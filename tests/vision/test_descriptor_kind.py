@@ -61,6 +61,9 @@ def test_what_has_no_length_matches_nothing() -> None:
 def test_limits_are_in_the_unit_of_differences() -> None:
     assert DescriptorKind(48).largest(0.25, 9.0) == 96.0
     assert SIFT.largest(0.25, 0.5) == (0.5 * STEPS_PER_UNIT) ** 2
+    xfeat = DescriptorKind(256, FeatureType.XFEAT, DescriptorDepth.FLOAT32)
+    assert xfeat.largest(0.25, 0.45) == pytest.approx((0.6 * STEPS_PER_UNIT) ** 2)
+    assert (SIFT.largest_projected(40.0), xfeat.largest_projected(40.0)) == (40.0, 30.0)
     assert (DescriptorKind(48).dimensions, SIFT.dimensions, FLOAT.dimensions) == (384, 128, 64)
     assert SIFT.words == "SIFT of 128 bytes"
 
