@@ -67,6 +67,8 @@ def _described(vi_map: VIMap, features: str) -> VIMap:
 
 def _count(database: LocalizationMap, queries: VIMap) -> str:
     """Return right, wrong and all queries in words; their poses are true."""
+    if not len(queries.keypoints):
+        return "no keypoint"
     result = localize_missions(database, queries, LocalizationOptions())
     error = se3.relative(queries.T_G_I[result.vertex], result.T_G_I)
     distance = np.linalg.norm(error[:, 4:], axis=1)
