@@ -216,6 +216,10 @@ class MapBuilder:
         vi_map = mission_map(self._device, part, self._images)
         return init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)[0]
 
+    def recorded(self, mission: int) -> RecordedMission:
+        """Return what was recorded of a mission; it may grow."""
+        return self._missions[mission]
+
     def forget_before(self, mission: int, first: int) -> None:
         """Remove the vertices of a mission before a row; they are elsewhere."""
         self._missions[mission].forget_before(first)

@@ -149,12 +149,17 @@ class RecordedMission:
         del self.edges[:first]
         self._row_of_time = {int(s.time_ns[0]): row for row, s in enumerate(self.states)}
 
-    def part(self, first: int) -> RecordedMission:
-        """Return the vertices from a row on, with the samples between them."""
-        result = RecordedMission()
-        result.states, result.frames = self.states[first:], self.frames[first:]
-        result.image_rows, result.edges = self.image_rows[first:], self.edges[first:]
+    def part(self, first: int, end: int | None = None) -> RecordedMission:
+        """Return the vertices from a row on, before an end, with the samples between them."""
+        result, rows = RecordedMission(), slice(first, end)
+        result.states, result.frames = self.states[rows], self.frames[rows]
+        result.image_rows = self.image_rows[rows]
+        result.edges = self.edges[first : None if end is None else end - 1]
         return result
+
+    def row_at(self, time_ns: int) -> int | None:
+        """Return the vertex of a time, None if there is none."""
+        return self._row_of_time.get(time_ns)
 
     def refine(self, states: NavState) -> None:
         """Replace the states of vertices that have one of these times."""

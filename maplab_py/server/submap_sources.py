@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import collections.abc
 import dataclasses
-import hashlib
 import tempfile
 import time
 from pathlib import Path
-
-import numpy as np
 
 from maplab_py.errors import UserError
 from maplab_py.frontend.mapping import Mapping
@@ -20,8 +17,8 @@ from maplab_py.server.spool import Spool, push
 from maplab_py.storage.mission_names import with_folder_names
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.resources.store import existing_files, in_map_folder
-from maplab_py.vimap import IdArray, VIMap
-from maplab_py.vimap.excerpts import cut_by_time, mission_maps
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.excerpts import cut_by_time, mission_maps, with_ids_of_times
 
 
 class SubmapWriter:
@@ -88,53 +85,6 @@ class SubmapWriter:
             push(self._spool, self._output.robot_name, Path(folder) / name)
         self.pushed += 1
         self._first = builder.count(self._mission) - 1
-
-
-def with_ids_of_times(vi_map: VIMap, mission: str) -> VIMap:
-    """Return a map of one mission whose ids follow from its name and the times of vertices and frames.
-
-    So the copies of a vertex in two submaps have one id, and all submaps have the mission's. Landmarks get
-    ids of their own in every submap; those of a shared vertex are united when submaps are joined.
-    """
-    v, frames, edges = vi_map.vertices, vi_map.frames, vi_map.imu_edges
-    of_edges = v.timestamp_ns[edges.from_vertex]
-    present = (frames.id != 0).any(axis=1)[:, None]
-    camera = frames.camera_index.astype(np.int64)
-    vertices = v.replace(
-        id=_ids(f"vertex {mission}", v.timestamp_ns),
-        nframe_id=_ids(f"nframe {mission}", v.timestamp_ns),
-    )
-    frame_ids = _ids(f"frame {mission}", v.timestamp_ns[frames.vertex], camera)
-    first = v.timestamp_ns[:1]
-    landmarks = vi_map.landmarks
-    count = np.arange(len(landmarks), dtype=np.int64)
-    landmark_ids = _ids(f"landmark {mission} {int(first[0])}", count)
-    zero = np.zeros(1, dtype=np.int64)
-    return vi_map.replace(
-        missions=vi_map.missions.replace(id=_ids(f"mission {mission}", zero)),
-        baseframes=vi_map.baseframes.replace(id=_ids(f"baseframe {mission}", zero)),
-        vertices=vertices,
-        frames=frames.replace(id=np.where(present, frame_ids, frames.id)),
-        imu_edges=edges.replace(id=_ids(f"edge {mission}", of_edges)),
-        landmarks=landmarks.replace(id=landmark_ids),
-    )
-
-
-def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> IdArray:
-    """Return ids (N, 2) that follow from a text and some numbers (N,) each."""
-    seed = np.frombuffer(hashlib.blake2b(purpose.encode(), digest_size=16).digest(), dtype="<u8")
-    with np.errstate(over="ignore"):
-        words = np.tile(seed.astype(np.uint64), (len(numbers[0]), 1))
-        for column in numbers:
-            words = _mix(words + column.astype(np.uint64)[:, None])
-    return np.asarray(words | (words == 0).astype(np.uint64))
-
-
-def _mix(words: IdArray) -> IdArray:
-    """Return words whose every bit depends on all bits (the finaliser of splitmix64)."""
-    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(words ^ (words >> np.uint64(31)))
 
 
 _LONGEST_SLEEP_S = 0.1

@@ -60,6 +60,7 @@ def record(
     device: Device,
     appearance: SessionAppearance,
     seeds: SessionSeeds,
+    spline: PoseSpline | None = None,
 ) -> Recording:
     """Move the device through the world and record its measurements.
 
@@ -70,13 +71,15 @@ def record(
         device: The recording device.
         appearance: Appearance of the world in this session.
         seeds: Generators of this session.
+        spline: The motion; None = that of the session's options.
 
     Raises:
         UserError: The motion leads out of the world or through a wall.
     """
     options = scenario.sessions[number]
-    together = tuple(s for s in scenario.sessions if s.keep_frame) if options.keep_frame else ()
-    spline = motion_spline(options, scenario.world, seeds.motion, together)
+    if spline is None:
+        together = tuple(s for s in scenario.sessions if s.keep_frame) if options.keep_frame else ()
+        spline = motion_spline(options, scenario.world, seeds.motion, together)
     check_free_way(spline, world, f"sessions[{number}]")
     lead_s = _lead_s(scenario)
     samples = recorded_samples(options, lead_s)

@@ -13,6 +13,7 @@ from maplab_py.cancellation import ending_early
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
 from maplab_py.interop.live.options import TRANSPORTS, LiveOptions, NetworkOptions
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.plugin import (
     CommandContext,
     EstimationError,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from maplab_py.frontend.reports import MappingReport
     from maplab_py.frontend.run_options import OutputOptions
     from maplab_py.interop.recordings.protocol import Recording
+    from maplab_py.online_calibration.beside import CalibrationBeside
     from maplab_py.server.submap_sources import SubmapWriter
     from maplab_py.viewer.display.viewer import Viewer
 
@@ -64,6 +66,7 @@ def rovioli(
     submaps: SubmapOutput = SubmapOutput(),
     network: NetworkOptions = NetworkOptions(),
     live: LiveOptions = LiveOptions(),
+    calibration: OnlineCalibrationOptions = OnlineCalibrationOptions(),
     map_key: str = "",
     rovioli_visualize_map: bool = False,
     map_publish_interval_s: float = 2.0,
@@ -88,21 +91,22 @@ def rovioli(
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping, load_kernels
+    from maplab_py.online_calibration.beside import recalibrated
     from maplab_py.server.submap_sources import SubmapWriter
 
     _check_output(run.output)
     folder = run.output.save_map_folder
-    key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
-    context.maps.check_new_key(key)
+    key = _new_key(context, map_key, folder)
     pictures = _pictures(context, key, map_publish_interval_s) if rovioli_visualize_map else None
     is_live, writer = data.type in TRANSPORTS, None
     if submaps.submap_spool is not None:
         # runs of hours: the map is at the server, and what is there need not stay in memory
         writer = SubmapWriter(submaps, forgets=is_live and folder is None)
-    observers: list[Observer] = [each for each in (pictures, writer) if each is not None]
+    beside = _calibration_beside(run, calibration)
+    observers: list[Observer] = [each for each in (pictures, writer, beside) if each is not None]
+    recording: Recording
     with contextlib.ExitStack() as stack:
         is_to_end = stack.enter_context(ending_early())
-        recording: Recording
         on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None
         if is_live:
             _check_live(datasource_folder, data, run)
@@ -114,6 +118,9 @@ def rovioli(
             on_estimate = live_source.publish
         else:
             recording, status = open_source(datasource_folder, data, source), str
+        if beside is not None:
+            stack.callback(beside.close)
+            recording, status = recalibrated(recording, calibration), beside.with_status(status)
         keeps_states = not is_live or run.output.export_estimated_poses_to_csv is not None
         make = functools.partial(
             Mapping, options=run, observer=_Several(observers), on_estimate=on_estimate,
@@ -124,6 +131,8 @@ def rovioli(
         if writer is not None:
             writer.finish(mapping)
         name, progress = recording.name, context.progress
+        if beside is not None:
+            beside.finish(mapping, progress, is_to_end)
         finished = finish(mapping, name, map_key=key, progress=progress, is_to_end=is_to_end)
     if mapping.is_ended_early:
         _tell_end(context, finished, mapping.statistics.elapsed_s)
@@ -132,6 +141,30 @@ def rovioli(
     if pictures is not None:
         pictures.after_run(finished)
     return finished.report
+
+
+def _new_key(context: CommandContext, map_key: str, folder: Path | None) -> str:
+    """Return the key of the new map; raises UserError where there is a map of that key."""
+    key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
+    context.maps.check_new_key(key)
+    return key
+
+
+def _calibration_beside(
+    run: RunOptions, options: OnlineCalibrationOptions
+) -> CalibrationBeside | None:
+    """Return what calibrates beside the odometry, None unless it is wanted.
+
+    Raises:
+        UserError: There is no map to take segments from.
+    """
+    from maplab_py.online_calibration.beside import CalibrationBeside
+
+    if not options.is_on:
+        return None
+    if not run.output.run_map_builder:
+        raise UserError("--self_calibrate needs a map: leave --rovioli_run_map_builder=false out")
+    return CalibrationBeside(options)
 
 
 def _tell_pushed(context: CommandContext, writer: SubmapWriter, submaps: SubmapOutput) -> bool:

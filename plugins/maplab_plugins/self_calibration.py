@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.input_files import SizeOptions
+from maplab_py.online_calibration.options import WantedSigmas
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         SelfCalibrationReport,
     )
     from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
+    from maplab_py.online_calibration.suggestions import SuggestionReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,24 +92,28 @@ def self_calibrate(
         return filtered.report()
 
     from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
-    from maplab_py.algorithms.self_calibration.segments.database import save_database
+    from maplab_py.algorithms.self_calibration.segments.database import (
+        locked_database,
+        save_database,
+    )
     from maplab_py.research.information_gain import select_by_gain
 
-    sensors, collected, report = calibrate_with_checks(
-        context.vi_map,
-        options,
-        max_camera_shift_m=max_camera_shift_m,
-        parts=parts,
-        database=_existing(database, size),
-        missions=missions,
-        batch=batch,
-        selector=select_by_gain if options.selection == "information_gain" else None,
-        progress=context.progress,
-    )
-    context.progress.check()
-    context.commit(context.vi_map.replace(sensors=sensors))
-    if database is not None and collected is not None:
-        save_database(collected, database)
+    with locked_database(database):
+        sensors, collected, report = calibrate_with_checks(
+            context.vi_map,
+            options,
+            max_camera_shift_m=max_camera_shift_m,
+            parts=parts,
+            database=_existing(database, size),
+            missions=missions,
+            batch=batch,
+            selector=select_by_gain if options.selection == "information_gain" else None,
+            progress=context.progress,
+        )
+        context.progress.check()
+        context.commit(context.vi_map.replace(sensors=sensors))
+        if database is not None and collected is not None:
+            save_database(collected, database)
     return report
 
 
@@ -130,17 +136,21 @@ def collect_segments(
     Args:
         database: Segment database.
     """
-    from maplab_py.algorithms.self_calibration.segments.database import save_database
+    from maplab_py.algorithms.self_calibration.segments.database import (
+        locked_database,
+        save_database,
+    )
     from maplab_py.algorithms.self_calibration.segments.selection import collect
 
-    collected, report = collect(
-        context.vi_map,
-        options,
-        _existing(database, size),
-        missions=chosen.rows(context.vi_map),
-        progress=context.progress,
-    )
-    save_database(collected, database)
+    with locked_database(database):
+        collected, report = collect(
+            context.vi_map,
+            options,
+            _existing(database, size),
+            missions=chosen.rows(context.vi_map),
+            progress=context.progress,
+        )
+        save_database(collected, database)
     return report
 
 
@@ -201,26 +211,67 @@ def prune_segments(
     from maplab_py.algorithms.self_calibration.pruning import prune
     from maplab_py.algorithms.self_calibration.segments.database import (
         load_database,
+        locked_database,
         read_calibration,
         save_database,
     )
 
     if not 0.0 < probability < 1.0:
         raise UserError(f"--probability={probability:g}: must be between 0 and 1")
-    result, report = prune(
+    with locked_database(database):
+        result, report = prune(
+            load_database(database, size.max_bytes),
+            options,
+            missions=[part.strip() for part in missions.split(",") if part.strip()],
+            outdated=outdated,
+            calibration=read_calibration(calibration, size.max_bytes)
+            if outdated and calibration
+            else None,
+            probability=probability,
+            capacity=segments_per_group,
+            progress=context.progress,
+        )
+        save_database(result, database)
+    return report
+
+
+@command(
+    "suggest_motion",
+    example="suggest_motion --database=device.segments",
+    needs_map=False,
+    see_also=("self_calibrate", "segment_database_stats"),
+    reads=("database",),
+)
+def suggest_motion(
+    context: CommandContext,
+    *,
+    database: Path,
+    suggestions: int = 3,
+    wanted: WantedSigmas = WantedSigmas(),
+    options: SelfCalibrationOptions = SelfCalibrationOptions(),
+    size: SizeOptions = SizeOptions(),
+) -> SuggestionReport:
+    """Suggest the motions that would teach most about a device, by what its segments leave unknown.
+
+    Motions of one segment each are simulated with the sensors of the database; each suggestion follows
+    on those before.
+
+    Args:
+        database: Segment database.
+        suggestions: Number of motions.
+    """
+    from maplab_py.algorithms.self_calibration.segments.database import load_database
+    from maplab_py.online_calibration.suggestions import suggest_motion as suggest
+
+    if suggestions < 1:
+        raise UserError(f"--suggestions={suggestions}: must be 1 or more")
+    return suggest(
         load_database(database, size.max_bytes),
         options,
-        missions=[part.strip() for part in missions.split(",") if part.strip()],
-        outdated=outdated,
-        calibration=read_calibration(calibration, size.max_bytes)
-        if outdated and calibration
-        else None,
-        probability=probability,
-        capacity=segments_per_group,
+        wanted,
+        count=suggestions,
         progress=context.progress,
     )
-    save_database(result, database)
-    return report
 
 
 @command(

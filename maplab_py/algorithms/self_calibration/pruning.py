@@ -178,6 +178,31 @@ def test_segment(
     """
     from scipy.stats import chi2
 
+    estimate = estimate_segment(segment, options)
+    distance, freedom = squared_distance(
+        estimate.change, estimate.formal, estimate.actual, estimate.parameters
+    )
+    limit = float(chi2.ppf(probability, max(freedom, 1)))
+    return SegmentTest(distance, limit, estimate.fit, bool(freedom and distance > limit))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SegmentEstimate:
+    """Calibration of a segment alone, from the calibration in its sensors."""
+
+    parameters: Parameters
+    change: F64  # (k,)
+    formal: F64  # (k, k) posterior covariance, by which the prior is weighted against the data
+    actual: F64  # (k, k) as large as the formal one, scaled by the fit, and the cluster-robust one
+    fit: float  # chi-square per degree of freedom
+
+
+def estimate_segment(segment: VIMap, options: SelfCalibrationOptions) -> SegmentEstimate:
+    """Calibrate a segment alone.
+
+    Raises:
+        EstimationError: It has no information.
+    """
     if options.imu_curvature:
         segment = correct_interpolation_bias(segment)
     problem = build_segment_problem(segment, options)
@@ -191,9 +216,7 @@ def test_segment(
     )
     uncertainty = Uncertainty(parameters.prior_sigma, formal, robust)
     actual = uncertainty.covariance(formal_scale=max(fit, 1.0))
-    distance, freedom = squared_distance(change, formal, actual, parameters)
-    limit = float(chi2.ppf(probability, max(freedom, 1)))
-    return SegmentTest(distance, limit, fit, bool(freedom and distance > limit))
+    return SegmentEstimate(parameters, change, formal, actual, fit)
 
 
 def squared_distance(

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import Collection, Mapping, Sequence
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.device import with_device_of
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.array_types import F64, I64
+from maplab_py.atomic.system import opened_locked
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, RAISE_THE_BOUND, read_npz
 from maplab_py.output_files import write_bytes
 from maplab_py.sensors import SensorSet
 from maplab_py.sensors.sensors_yaml import parse_sensors, read_sensors, write_sensors
-from maplab_py.vimap import IdIndex, VIMap, from_hex
+from maplab_py.vimap import IdIndex, VIMap, from_hex, to_hex
 from maplab_py.vimap.merge import stack
 from maplab_py.vimap.selection import sorted_by_time
 from maplab_py.vimap.table import Table
+from maplab_py.vimap.tables import ImuSamples
 
 Key = tuple[str, str]
 """First and last vertex of a segment."""
@@ -124,9 +130,28 @@ class SegmentDatabase:
             added = sorted_by_time(stack(self.vi_map, with_device_of(added, self.vi_map)))
         return dataclasses.replace(self, vi_map=added, records=(*self.records, *records))
 
+    def missions_recorded_in(self, vi_map: VIMap) -> set[str]:
+        """Return the missions, by any id, whose segments have IMU samples of a map: the same recording."""
+        samples, edges = self.vi_map.imu_samples, self.vi_map.imu_edges
+        is_shared = np.isin(_as_words(samples), _as_words(vi_map.imu_samples))
+        mission = self.vi_map.vertices.mission[np.repeat(edges.from_vertex, edges.sample_count)]
+        shared = np.bincount(mission[is_shared], minlength=len(self.vi_map.missions))
+        rows = np.flatnonzero(shared >= _SHARED_SAMPLES)
+        return {to_hex(self.vi_map.missions.id[row]) for row in rows}
+
     def map_of(self, record: SegmentRecord) -> VIMap:
         """Return the map of one segment."""
         return extract_submap(self.vi_map, rows_of(self.vi_map, [record]))
+
+
+_SHARED_SAMPLES = 3
+"""Segments that adjoin share the sample at their common vertex, and its copies."""
+
+
+def _as_words(samples: ImuSamples) -> NDArray[np.void]:
+    """Return the samples (N,), time and values, as one value each."""
+    columns = np.column_stack([samples.timestamp_ns, samples.accel_gyro.view(np.int64)])
+    return np.ascontiguousarray(columns).view(f"V{columns.shape[1] * 8}")[:, 0]
 
 
 def rows_of(vi_map: VIMap, records: Sequence[SegmentRecord]) -> I64:
@@ -162,6 +187,35 @@ _TABLES = (
 )
 _ADDED_LATER = ("frames/descriptor_layout",)
 """Columns that databases of before do not have; they get their fill values."""
+
+
+_SECONDS_BETWEEN_TRIES, _SECONDS_TO_WAIT = 0.1, 600.0
+
+
+@contextlib.contextmanager
+def locked_database(path: Path | None) -> Iterator[None]:
+    """Hold a database from reading to writing it, so that nobody's segments are lost; None = nothing.
+
+    Raises:
+        UserError: Another process holds it for minutes, or its folder cannot be written.
+    """
+    if path is None or not path.parent.is_dir():
+        yield
+        return
+    lock, until_s = path.with_name(path.name + ".lock"), time.monotonic() + _SECONDS_TO_WAIT
+    try:
+        while (descriptor := opened_locked(lock)) is None:
+            if time.monotonic() > until_s:
+                raise UserError(f"{path}: another process has worked on it for minutes; stop that")
+            time.sleep(_SECONDS_BETWEEN_TRIES)
+    except OSError as error:
+        raise UserError(f"{lock}: cannot be locked ({error.strerror})") from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            lock.unlink()  # who waits for it sees that, and makes another
+        os.close(descriptor)
 
 
 def save_database(database: SegmentDatabase, path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -215,38 +216,60 @@ def collect(
         source = with_device_of(source, database.vi_map)
     evaluation = evaluate(source, options, progress=progress)
     if database is None or not len(database):
-        database = _empty(evaluation, options)
-    _check_options(database, options, evaluation.parameters)
+        database = empty_database(
+            evaluation.vi_map, evaluation.parameters, evaluation.sigma_ref(), options
+        )
     records = evaluation.records(options, database.sigma_ref)
-    before = database.without_missions({record.mission for record in records})
-    best = _best(before, records, options)
-    added = before.with_segments(
-        evaluation.vi_map, [record for record in records if record.key in best]
-    )
-    kept = added.with_only(best)
+    kept, dropped = keep_best(database, evaluation.vi_map, evaluation.parameters, records, options)
     new = {record.key for record in records}
     report = reports.CollectionReport(
         segments_evaluated=len(records),
         segments_kept=len(kept),
         from_this_map=sum(record.key in new for record in kept.records),
-        dropped=sum(record.key not in best for record in before.records),
+        dropped=dropped,
         seconds_per_segment=evaluation.seconds_each,
         segments=kept_segments(kept),
     )
     return kept, report
 
 
-def _empty(evaluation: Evaluation, options: SelfCalibrationOptions) -> SegmentDatabase:
+def empty_database(
+    vi_map: VIMap, parameters: Parameters, sigma_ref: F64, options: SelfCalibrationOptions
+) -> SegmentDatabase:
+    """Return a database without segments for the device of a map and reference deviations (k,)."""
     return SegmentDatabase(
-        vi_map=VIMap(sensors=evaluation.vi_map.sensors),
+        vi_map=VIMap(sensors=vi_map.sensors),
         records=(),
         tables=options.grouping(),
         metric=options.metric,
         capacity=options.segments_per_group,
-        parameter_names=evaluation.parameters.names,
-        sigma_ref=evaluation.sigma_ref(),
+        parameter_names=parameters.names,
+        sigma_ref=sigma_ref,
         selection=options.selection,
     )
+
+
+def keep_best(
+    database: SegmentDatabase,
+    vi_map: VIMap,
+    parameters: Parameters,
+    records: Sequence[SegmentRecord],
+    options: SelfCalibrationOptions,
+) -> tuple[SegmentDatabase, int]:
+    """Return the best segments of a database and of a map, and how many of the former were dropped.
+
+    Segments of the same missions, or of the same recordings, are replaced.
+
+    Raises:
+        UserError: The database was made for other parameters, tables or cameras.
+    """
+    _check_options(database, options, parameters)
+    repeated = database.missions_recorded_in(vi_map) | {record.mission for record in records}
+    before = database.without_missions(repeated)
+    best = _best(before, records, options)
+    added = before.with_segments(vi_map, [record for record in records if record.key in best])
+    dropped = sum(record.key not in best for record in before.records)
+    return added.with_only(best), dropped
 
 
 def _check_options(
@@ -268,7 +291,7 @@ def _check_options(
 
 
 def _best(
-    before: SegmentDatabase, records: list[SegmentRecord], options: SelfCalibrationOptions
+    before: SegmentDatabase, records: Sequence[SegmentRecord], options: SelfCalibrationOptions
 ) -> set[Key]:
     """Return the keys of the segments to keep, of those in the database and the new ones."""
     every = dataclasses.replace(before, records=(*before.records, *records))

@@ -1,0 +1,288 @@
+"""Self-calibration beside a run: segments whose states are final go to a process of low priority."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+
+import numpy as np
+
+from maplab_py.algorithms.self_calibration.segments.database import read_calibration
+from maplab_py.child_processes import Service, ServiceEnded
+from maplab_py.errors import Cancelled
+from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.recorded_mission import RecordedMission
+from maplab_py.interop.device import RecordedSensors
+from maplab_py.interop.recordings.protocol import Item, PartSpan, Recording, TrackedFrame
+from maplab_py.online_calibration.options import OnlineCalibrationOptions
+from maplab_py.online_calibration.process import OPTIONS, Finish, Opening, Piece, Status, words
+from maplab_py.progress import Progress
+from maplab_py.sensors.calibration_transfer import (
+    Device,
+    corresponding_device,
+    with_calibration_of,
+)
+
+_MODULE = "maplab_py.online_calibration.child"
+_SIGNIFICANT_SIGMAS = 3.0
+_TIMES_TO_START = 2
+
+
+class CalibrationBeside:
+    """Observes a run, and hands the segments of its map on; frames never wait for it.
+
+    A segment is complete when all its vertices have left the window.
+    """
+
+    def __init__(self, options: OnlineCalibrationOptions) -> None:
+        """Prepare; the process starts with the first segment."""
+        self._options = options
+        self._mapping: Mapping | None = None
+        self._mission, self._begin_ns, self._session = -1, 0, ""
+        self._worker: _Worker | None = None
+
+    def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Hand a segment on when one is complete."""
+        if mapping is not self._mapping:  # the first run, or the same recording once more
+            self.close()
+            self._mapping, self._mission = mapping, -1
+        builder = mapping.builder
+        if builder is None or update.released is None or not len(update.released):
+            return
+        if builder.missions - 1 != self._mission:
+            self._mission, self._begin_ns = builder.missions - 1, 0
+        recorded = builder.recorded(self._mission)
+        if not self._begin_ns and len(recorded) > 1:
+            self._begin_ns = int(recorded.states[0].times_ns[0])
+            # clocks may start anew with every recording; samples do not repeat
+            samples = hashlib.blake2b(recorded.edges[0][1].tobytes(), digest_size=8)
+            self._session = f"{self._begin_ns} {samples.hexdigest()}"
+        self._cut(recorded, int(update.released.times_ns[-1]), OPTIONS.segment_keyframes)
+
+    def _cut(self, recorded: RecordedMission, until_ns: int, fewest: int) -> None:
+        """Hand on the next segment if it has enough vertices up to a time."""
+        first = recorded.row_at(self._begin_ns)
+        if first is None:  # it was given up after a divergence
+            self._begin_ns = 0
+            return
+        end = min(first + OPTIONS.segment_keyframes, len(recorded))
+        if end - first < fewest or int(recorded.states[end - 1].times_ns[0]) > until_ns:
+            return
+        part = _without_descriptors(recorded.part(first, end))
+        assert self._mapping is not None
+        if self._worker is None:
+            opening = Opening(self._options, self._mapping.odometry.device)
+            self._worker = _Worker(opening, self._options.processor_share)
+        self._worker.put(Piece(self._session, part))
+        self._begin_ns = int(part.states[-1].times_ns[0])
+
+    @property
+    def evaluation(self) -> Status:
+        """The newest answer of the process."""
+        return Status() if self._worker is None else self._worker.newest
+
+    def with_status(self, status: Callable[[], str]) -> Callable[[], str]:
+        """Return the status line of others, and what the segments say."""
+
+        def joined() -> str:
+            newest = self.evaluation
+            return "  ".join(filter(None, (status(), contradicted(newest), newest.missing)))
+
+        return joined
+
+    def finish(
+        self, mapping: Mapping, progress: Progress, is_to_end: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Wait for what is left, unless the user wants the end; put notes into the run's report."""
+        progress.line("evaluate the last segments of the self-calibration")
+        if mapping.builder is not None and self._mapping is mapping and self._begin_ns:
+            recorded = mapping.builder.recorded(self._mission)
+            if recorded.last_ns is not None:
+                self._cut(recorded, recorded.last_ns, OPTIONS.segment_keyframes // 2 + 1)
+        notes = mapping.statistics.notes
+        if self._worker is None:
+            notes.append("self-calibration: no segment of the recording is long enough")
+            return
+        notes += _notes(self._worker.finish(is_to_end), self._options)
+        self.close()
+
+    def close(self) -> None:
+        """End the process; what it has written stays."""
+        if self._worker is not None:
+            self._worker.close()
+        self._worker = None
+
+
+class _Worker:
+    """A thread that asks the process, segment by segment, within its share of a processor."""
+
+    def __init__(self, opening: Opening, share: float) -> None:
+        self.newest = Status()
+        self._opening, self._share = opening, share
+        self._requests: queue.SimpleQueue[Piece | Finish | None] = queue.SimpleQueue()
+        self._service: Service | None = None
+        self._starts, self._is_closed = 0, False
+        self._hurry = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="self-calibration", daemon=True)
+        self._thread.start()
+
+    def put(self, request: Piece) -> None:
+        """Have a segment evaluated; do not wait."""
+        self._requests.put(request)
+
+    def finish(self, is_to_end: Callable[[], bool]) -> Status:
+        """Wait for all segments and the last words of the process."""
+        self._requests.put(Finish())
+        self._requests.put(None)
+        self._hurry.set()
+        while self._thread.is_alive() and not is_to_end():
+            self._thread.join(0.1)
+        return self.newest
+
+    def close(self) -> None:
+        """End thread and process."""
+        self._is_closed = True
+        self._requests.put(None)
+        self._hurry.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        try:
+            while (request := self._requests.get()) is not None and not self._is_closed:
+                before_s, began_s = self.newest.processor_s, time.monotonic()
+                self._ask(request)
+                spent_s = self.newest.processor_s - before_s
+                left_s = spent_s / self._share - (time.monotonic() - began_s)
+                if left_s > 0.0:
+                    self._hurry.wait(left_s)
+        finally:
+            if self._service is not None:
+                self._service.end()
+
+    def _ask(self, request: Piece | Finish) -> None:
+        """Ask the process; one that has died is started again, and the request is not repeated."""
+        try:
+            if self._service is None:
+                if self._starts >= _TIMES_TO_START:
+                    return
+                self._starts += 1
+                self._service = Service(_MODULE)
+                self.newest = self._service.ask(self._opening, lambda: self._is_closed)
+            self.newest = self._service.ask(request, lambda: self._is_closed)
+        except Cancelled:
+            self._service = None
+        except (ServiceEnded, OSError) as error:
+            self._service = None
+            problem = f"the process beside the odometry has {error}"
+            self.newest = dataclasses.replace(self.newest, problem=problem, processor_s=0.0)
+
+
+def _without_descriptors(recorded: RecordedMission) -> RecordedMission:
+    recorded.frames = [
+        tuple(None if frame is None else _bare(frame) for frame in frames)
+        for frames in recorded.frames
+    ]
+    recorded.image_rows = [[-1] * len(frames) for frames in recorded.frames]
+    return recorded
+
+
+def _bare(frame: TrackedFrame) -> TrackedFrame:
+    return dataclasses.replace(
+        frame,
+        descriptor=np.zeros((len(frame.uv_px), 0), dtype=np.uint8),
+        descriptor_size=np.zeros(0, dtype=np.int32),
+    )
+
+
+def contradicted(status: Status) -> str:
+    """Return what the data contradict, and since when."""
+    if status.contradiction is None:
+        return ""
+    since = datetime.fromtimestamp(1e-9 * status.contradiction.since_ns, UTC)
+    return (
+        f"{status.contradiction.family} contradicted since {since:%H:%M:%S} "
+        f"({status.contradiction.sigmas:.1f} sigma)"
+    )
+
+
+def _notes(status: Status, options: OnlineCalibrationOptions) -> Iterator[str]:
+    yield (
+        f"self-calibration: {status.evaluated} segments evaluated, {status.kept} in "
+        f"{options.database}, {status.processor_s:.1f} s of processor time"
+    )
+    if said := contradicted(status):
+        yield f"{said}; {status.missing}" if status.missing else said
+    if status.problem:
+        yield f"self-calibration: {status.problem}"
+    if status.proposal is not None:
+        changed = [
+            words(each)
+            for each in status.proposal.parameters
+            if abs(each.change_in_sigmas) > _SIGNIFICANT_SIGMAS
+        ]
+        use = (
+            "the next run with --self_calibrate begins with it"
+            if options.apply == "next_start"
+            else "apply_calibration or --sc_apply=next_start uses it"
+        )
+        yield f"proposed calibration in {options.proposal} ({use}): {'; '.join(changed)}"
+        for name in status.proposal.unobservable:
+            yield f"not observable, as it was: {name}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecalibratedRecording:
+    """A recording with the calibration that its device has now."""
+
+    plain: Recording
+    device: RecordedSensors
+
+    @property
+    def name(self) -> str:
+        """File or folder."""
+        return self.plain.name
+
+    @property
+    def kind(self) -> str:
+        """Kind of the recording."""
+        return self.plain.kind
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first item."""
+        return self.plain.start_ns
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the reader, and where the calibration is from."""
+        return (*self.plain.notes, "read with the calibration that --self_calibrate has found")
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return the parts between restarts of the clock."""
+        return self.plain.parts()
+
+    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+        """Yield the items of the recording."""
+        yield from self.plain.items(start_ns, end_ns)
+
+
+def recalibrated(recording: Recording, options: OnlineCalibrationOptions) -> Recording:
+    """Return the recording with the calibration that an earlier run has found, if it is to be used.
+
+    Raises:
+        UserError: The file is damaged, or of other cameras.
+    """
+    if options.apply != "next_start" or not options.proposal.is_file():
+        return recording
+    known, of_recording = read_calibration(options.proposal), recording.device
+    device = Device(of_recording.imu_id, of_recording.rig_id)
+    sensors = with_calibration_of(
+        of_recording.sensors, device, known, corresponding_device(known, device)
+    )
+    return RecalibratedRecording(recording, dataclasses.replace(of_recording, sensors=sensors))

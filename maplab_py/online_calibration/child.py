@@ -1,0 +1,46 @@
+"""A process of low priority that answers the requests of one odometry.
+
+`python -m maplab_py.online_calibration.child SOCKET`, as `child_processes.Service` starts it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+from maplab_py.child_processes import serve
+from maplab_py.errors import MaplabError
+from maplab_py.online_calibration.process import (
+    DeviceCalibration,
+    Finish,
+    Opening,
+    Piece,
+    Status,
+)
+
+_NICENESS = 10
+
+
+class Answerer:
+    """Answers requests; the first of them opens the database."""
+
+    def __init__(self) -> None:
+        """Wait for the first request."""
+        self._calibration: DeviceCalibration | None = None
+
+    def __call__(self, request: Opening | Piece | Finish) -> Status:
+        """Return the status after a request."""
+        try:
+            if isinstance(request, Opening):
+                self._calibration = DeviceCalibration(request)
+                return self._calibration.status()
+            assert self._calibration is not None
+            return self._calibration.answer(request)
+        except MaplabError as error:
+            return Status(problem=str(error))
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(OSError):
+        os.nice(_NICENESS)
+    serve(Answerer())
