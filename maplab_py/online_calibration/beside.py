@@ -87,6 +87,22 @@ class CalibrationBeside:
         """The newest answer of the process."""
         return Status() if self._worker is None else self._worker.newest
 
+    def recalibrated(self, recording: Recording) -> Recording:
+        """Return the recording with the calibration that an earlier run has found, if it is to be used.
+
+        Raises:
+            UserError: The file is damaged, or of other cameras.
+        """
+        options, of_recording = self._options, recording.device
+        if options.apply != "next_start" or not options.proposal.is_file():
+            return recording
+        known = read_calibration(options.proposal)
+        device = Device(of_recording.imu_id, of_recording.rig_id)
+        sensors = with_calibration_of(
+            of_recording.sensors, device, known, corresponding_device(known, device)
+        )
+        return RecalibratedRecording(recording, dataclasses.replace(of_recording, sensors=sensors))
+
     def with_status(self, status: Callable[[], str]) -> Callable[[], str]:
         """Return the status line of others, and what the segments say."""
 
@@ -270,19 +286,3 @@ class RecalibratedRecording:
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield the items of the recording."""
         yield from self.plain.items(start_ns, end_ns)
-
-
-def recalibrated(recording: Recording, options: OnlineCalibrationOptions) -> Recording:
-    """Return the recording with the calibration that an earlier run has found, if it is to be used.
-
-    Raises:
-        UserError: The file is damaged, or of other cameras.
-    """
-    if options.apply != "next_start" or not options.proposal.is_file():
-        return recording
-    known, of_recording = read_calibration(options.proposal), recording.device
-    device = Device(of_recording.imu_id, of_recording.rig_id)
-    sensors = with_calibration_of(
-        of_recording.sensors, device, known, corresponding_device(known, device)
-    )
-    return RecalibratedRecording(recording, dataclasses.replace(of_recording, sensors=sensors))

@@ -91,17 +91,14 @@ def rovioli(
     from maplab_py.frontend.data_source import open_source
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping, load_kernels
-    from maplab_py.online_calibration.beside import recalibrated
-    from maplab_py.server.submap_sources import SubmapWriter
 
     _check_output(run.output)
     folder = run.output.save_map_folder
     key = _new_key(context, map_key, folder)
     pictures = _pictures(context, key, map_publish_interval_s) if rovioli_visualize_map else None
-    is_live, writer = data.type in TRANSPORTS, None
-    if submaps.submap_spool is not None:
-        # runs of hours: the map is at the server, and what is there need not stay in memory
-        writer = SubmapWriter(submaps, forgets=is_live and folder is None)
+    is_live = data.type in TRANSPORTS
+    # runs of hours: the map is at the server, and what is there need not stay in memory
+    writer = _writer(submaps, forgets=is_live and folder is None)
     beside = _calibration_beside(run, calibration)
     observers: list[Observer] = [each for each in (pictures, writer, beside) if each is not None]
     recording: Recording
@@ -120,27 +117,31 @@ def rovioli(
             recording, status = open_source(datasource_folder, data, source), str
         if beside is not None:
             stack.callback(beside.close)
-            recording, status = recalibrated(recording, calibration), beside.with_status(status)
-        keeps_states = not is_live or run.output.export_estimated_poses_to_csv is not None
+            recording, status = beside.recalibrated(recording), beside.with_status(status)
         make = functools.partial(
-            Mapping, options=run, observer=_Several(observers), on_estimate=on_estimate,
-            status=status, keeps_states=keeps_states,
+            Mapping, options=run, observer=_Several(observers), on_estimate=on_estimate, status=status,
+            keeps_states=not is_live or run.output.export_estimated_poses_to_csv is not None,
         )  # fmt: skip
         is_repeatable = None if is_live else writer is None
         mapping = _run(context, make, recording, is_to_end, is_repeatable=is_repeatable)
+        name, progress = recording.name, context.progress
         if writer is not None:
             writer.finish(mapping)
-        name, progress = recording.name, context.progress
         if beside is not None:
             beside.finish(mapping, progress, is_to_end)
         finished = finish(mapping, name, map_key=key, progress=progress, is_to_end=is_to_end)
-    if mapping.is_ended_early:
-        _tell_end(context, finished, mapping.statistics.elapsed_s)
+    _tell_end(context, finished, mapping)
     is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
     _keep_map(context, key, finished, is_at_server=is_at_server)
     if pictures is not None:
         pictures.after_run(finished)
     return finished.report
+
+
+def _writer(submaps: SubmapOutput, *, forgets: bool) -> SubmapWriter | None:
+    from maplab_py.server.submap_sources import SubmapWriter
+
+    return None if submaps.submap_spool is None else SubmapWriter(submaps, forgets=forgets)
 
 
 def _new_key(context: CommandContext, map_key: str, folder: Path | None) -> str:
@@ -324,10 +325,12 @@ def _keep_map(
         )
 
 
-def _tell_end(context: CommandContext, finished: FinishedRun, elapsed_s: float) -> None:
-    """Say what has become of a recording that the user has ended."""
+def _tell_end(context: CommandContext, finished: FinishedRun, mapping: Mapping) -> None:
+    """Say what has become of a recording if the user has ended it."""
+    if not mapping.is_ended_early:
+        return
     report = finished.report
-    text = f"ended at {elapsed_s:.1f} s of the recording"
+    text = f"ended at {mapping.statistics.elapsed_s:.1f} s of the recording"
     if finished.vi_map is not None:
         text += f": the map of {report.vertices} vertices is in memory as '{report.map_key}'"
     if report.map_folder is not None:
