@@ -59,11 +59,11 @@ class CalibrationBeside:
             self._mission, self._begin_ns = builder.missions - 1, 0
         recorded = builder.recorded(self._mission)
         if not self._begin_ns and len(recorded) > 1:
-            self._begin_ns = int(recorded.states[0].times_ns[0])
+            self._begin_ns = int(recorded.states[0].time_ns[0])
             # clocks may start anew with every recording; samples do not repeat
             samples = hashlib.blake2b(recorded.edges[0][1].tobytes(), digest_size=8)
             self._session = f"{self._begin_ns} {samples.hexdigest()}"
-        self._cut(recorded, int(update.released.times_ns[-1]), OPTIONS.segment_keyframes)
+        self._cut(recorded, int(update.released.time_ns[-1]), OPTIONS.segment_keyframes)
 
     def _cut(self, recorded: RecordedMission, until_ns: int, fewest: int) -> None:
         """Hand on the next segment if it has enough vertices up to a time."""
@@ -72,7 +72,7 @@ class CalibrationBeside:
             self._begin_ns = 0
             return
         end = min(first + OPTIONS.segment_keyframes, len(recorded))
-        if end - first < fewest or int(recorded.states[end - 1].times_ns[0]) > until_ns:
+        if end - first < fewest or int(recorded.states[end - 1].time_ns[0]) > until_ns:
             return
         part = _without_descriptors(recorded.part(first, end))
         assert self._mapping is not None
@@ -80,7 +80,7 @@ class CalibrationBeside:
             opening = Opening(self._options, self._mapping.odometry.device)
             self._worker = _Worker(opening, self._options.processor_share)
         self._worker.put(Piece(self._session, part))
-        self._begin_ns = int(part.states[-1].times_ns[0])
+        self._begin_ns = int(part.states[-1].time_ns[0])
 
     @property
     def evaluation(self) -> Status:

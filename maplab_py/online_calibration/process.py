@@ -60,7 +60,7 @@ from maplab_py.sensors.calibration_transfer import Device, only_device, with_cal
 from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.vimap import VIMap, to_hex
 from maplab_py.vimap.excerpts import with_ids_of_times
-from maplab_py.vimap.stacking import stack
+from maplab_py.vimap.merge import stack
 
 OPTIONS = SelfCalibrationOptions(keep_unobservable_at_prior=True)
 _SEGMENTS_AT_ONCE = 5
@@ -363,7 +363,7 @@ class DeviceCalibration:
 
 
 def _begin_ns(segment: _Segment) -> int:
-    return int(segment.piece.recorded.states[0].times_ns[0])
+    return int(segment.piece.recorded.states[0].time_ns[0])
 
 
 def _mission_of(segment: _Segment) -> str:
@@ -380,7 +380,7 @@ def _map_of(pieces: list[Piece], device: RecordedSensors) -> VIMap:
         joined = RecordedMission()
         for piece in (piece for piece in pieces if piece.session == session):
             part = piece.recorded
-            if joined.states and joined.last_ns == int(part.states[0].times_ns[0]):
+            if joined.states and joined.last_ns == int(part.states[0].time_ns[0]):
                 part = part.part(1)
                 joined.edges += piece.recorded.edges[:1]
             elif joined.states:

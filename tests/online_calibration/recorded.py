@@ -7,7 +7,6 @@ import functools
 
 import numpy as np
 
-from maplab_py.frontend.body_states import BodyStates
 from maplab_py.frontend.recorded_mission import RecordedMission
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.interop.recordings.map_replay import MapRecording
@@ -18,6 +17,7 @@ from maplab_py.simulation.scenario import SessionOptions as Session
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.nav_state import NavState
 
 LIVELY = MotionOptions(
     kind="figure_8", duration_s=12.1, turns=0.3, height_m=1.4, shake_m=0.06, shake_rad=0.25
@@ -55,7 +55,7 @@ def recorded(vi_map: VIMap) -> tuple[RecordedSensors, RecordedMission]:
     """Return the device and what an odometry with the map's states would have recorded."""
     recording, mission = MapRecording(vi_map, 0), RecordedMission()
     v = vi_map.vertices
-    states = BodyStates(v.timestamp_ns, v.T_M_I, v.v_M, v.gyro_bias, v.accel_bias)
+    states = NavState(v.timestamp_ns, v.T_M_I, v.v_M, v.gyro_bias, v.accel_bias)
     batches = [item for item in recording.items() if isinstance(item, ImuBatch)]
     times_ns = np.concatenate([batch.times_ns for batch in batches])
     samples = np.concatenate([batch.accel_gyro for batch in batches])
