@@ -91,7 +91,7 @@ for _name in ("save_view", "export_view", "viewer_go_to", "viewer_keep", "viewer
     PREPARED[_name] = f"{MERGED}; visualize --viewer_port=0"
 for _name in ("print_summary_map", "localize"):
     PREPARED[_name] = f"{MERGED}; summary_map --summary_map_save_path=office_summary"
-for _name in ("segment_database_stats", "prune_segments", "export_segments"):
+for _name in ("segment_database_stats", "prune_segments", "export_segments", "suggest_motion"):
     PREPARED[_name] = f"{MERGED}; collect_segments --database=device.segments"
 # two short walks show no accelerometer scale, and are refused if that is asked of them
 PREPARED["self_calibrate"] = f"{MERGED}; set --sc_states=intrinsics,extrinsics_rotation"

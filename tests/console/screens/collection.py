@@ -55,6 +55,7 @@ LONG = {
     "register_point_clouds",
     "rovioli",
     "stereo_dense_reconstruction",
+    "suggest_motion",
     "track_features",
     "visualize_esdf",
     "visualize_mesh",

@@ -57,6 +57,7 @@ ESTIMATES = {
     "self_calibrate",
     "simulate_robots",
     "stereo_dense_reconstruction",
+    "suggest_motion",
     "timing",
     "track_features",
     "train_projection_matrix",
