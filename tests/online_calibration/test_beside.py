@@ -19,7 +19,7 @@ from tests.frontend.simulated import replayed
 
 
 def test_segments_of_a_run_reach_the_database(tmp_path: Path) -> None:
-    vi_map, truth = replayed()
+    vi_map, truth = replayed(cameras=1)
     options = OnlineCalibrationOptions(is_on=True, database=tmp_path / "device.segments")
     beside = CalibrationBeside(options)
     start = KnownStart(truth, with_biases=True)
