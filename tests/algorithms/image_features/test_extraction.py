@@ -181,7 +181,7 @@ def test_maps_without_images_and_bare_keypoints_are_refused(
 @pytest.mark.parametrize(
     ("flag", "value", "message"),
     [
-        ("feature_type", "surf", "wants sift, orb, brisk, akaze or plugin:NAME"),
+        ("feature_type", "surf", "wants sift, orb, brisk, akaze, xfeat or plugin:NAME"),
         ("max_features", 0, "must be at least 1"),
         ("feature_sigma_px", 0.0, "above 0"),
         ("feature_model", "net.onnx", "sift takes no file"),
