@@ -98,7 +98,7 @@ def self_calibrate(
     )
     from maplab_py.research.information_gain import select_by_gain
 
-    with locked_database(database):
+    with locked_database(None if context.is_trial else database):
         sensors, collected, report = calibrate_with_checks(
             context.vi_map,
             options,
@@ -142,7 +142,7 @@ def collect_segments(
     )
     from maplab_py.algorithms.self_calibration.segments.selection import collect
 
-    with locked_database(database):
+    with locked_database(None if context.is_trial else database):
         collected, report = collect(
             context.vi_map,
             options,
@@ -218,7 +218,7 @@ def prune_segments(
 
     if not 0.0 < probability < 1.0:
         raise UserError(f"--probability={probability:g}: must be between 0 and 1")
-    with locked_database(database):
+    with locked_database(None if context.is_trial else database):
         result, report = prune(
             load_database(database, size.max_bytes),
             options,

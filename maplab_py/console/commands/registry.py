@@ -48,8 +48,8 @@ class Plugin:
 class Registry:
     """Commands by name and alias, with the plugins that own them.
 
-    A built-in plugin is imported when one of its commands is looked for, others when no built-in one has
-    the name. What concerns all commands imports all plugins.
+    A built-in plugin is imported when one of its commands is looked for, others at once: they may bring
+    residuals, layers and importers, too. What concerns all commands imports all plugins.
     """
 
     def __init__(self, entries: Iterable[EntryPoint] = ()) -> None:
@@ -68,6 +68,9 @@ class Registry:
             name: entry for entry in self._pending.values() for name in _declared_names(entry)
         }
         self._lock = threading.RLock()
+        for entry in list(self._pending.values()):
+            if not entry.value.startswith(BUILT_IN):
+                self._load(entry)
 
     @property
     def plugins(self) -> list[Plugin]:
@@ -129,13 +132,13 @@ class Registry:
 
     def add(self, command: Command, plugin: Plugin) -> None:
         """Register a command; a name that is in use stays with its first owner."""
-        if self._provide_declared(command.name):
+        if self._provide(command.name):
             plugin.clashes.append(self._clash(command.name, plugin))
             return
         plugin.commands.append(command)
         self._owners[command.name] = plugin
         for name in command.names:
-            if self._provide_declared(name):
+            if self._provide(name):
                 plugin.clashes.append(self._clash(name, plugin))
             else:
                 self._commands[name] = command
@@ -151,14 +154,6 @@ class Registry:
                 self.add(command, plugin)
 
     def _provide(self, name: str) -> bool:
-        """Load what may have a command of this name; return whether there is one."""
-        if not self._provide_declared(name):
-            for entry in list(self._pending.values()):
-                if not entry.value.startswith(BUILT_IN):
-                    self._load(entry)
-        return name in self._commands
-
-    def _provide_declared(self, name: str) -> bool:
         """Load the built-in plugin that declares a name, if any; return whether the name is in use."""
         if name not in self._commands and name in self._declared:
             self._load(self._declared[name])
