@@ -47,7 +47,8 @@ class _Checker:
         self.problems: list[str] = []
         self.steps: list[tuple[str, Call | None]] = []
         self._registry = session.registry
-        self._variables = dict(session.variables)
+        # clicks in the viewer set it while the chain runs
+        self._variables = {"pick": "pick", **session.variables}
         self._aliases = dict(session.aliases)
         self._settings = session.settings.copy()
         self._written = written

@@ -396,6 +396,7 @@ SOUND = [
     "map_stats > stats.txt; map_stats | grep good",
     "help lc; lc --help",
     "simulate --map_folder=sim; load sim/session_1",
+    "visualize; why $pick",
 ]
 
 
