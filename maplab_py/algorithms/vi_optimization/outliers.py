@@ -18,6 +18,9 @@ _OUTLYING = 3.0
 """Minimum error of an outlier in multiples of the median, for states far from the optimum."""
 _USUAL_PX = 2.0
 """Error from which on observations count little where positions of a landmark are compared."""
+_CLEARLY_LESS = 0.9
+"""Share of the loss below which another position is taken: near the optimum both are the same but for
+rounding, and a choice between them would differ from processor to processor."""
 
 
 class OutlierRejection:
@@ -89,9 +92,8 @@ class OutlierRejection:
         largest_px = max(largest_px, _OUTLYING * float(np.median(errors[0])))
         loss = [np.log1p((np.minimum(e, largest_px) / _USUAL_PX) ** 2) for e in errors]
         now, new = (np.bincount(data.landmark, x, minlength=len(data.start) - 1) for x in loss)
-        return dataclasses.replace(
-            states, p_G=np.where((new < now)[:, None], others.p_G, states.p_G)
-        )
+        is_better = (new < _CLEARLY_LESS * now)[:, None]
+        return dataclasses.replace(states, p_G=np.where(is_better, others.p_G, states.p_G))
 
     def _agree(self, states: States, max_error_px: float) -> Mask:
         """Return which observations lie in front of the camera with an error below the limit."""
