@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.device import device_of
+from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem, runs_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
+from maplab_py.algorithms.self_calibration.reports import (
+    ParameterEstimate,
+    SelfCalibrationReport,
+)
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
@@ -30,6 +34,9 @@ from maplab_py.sensors.calibration_transfer import with_calibration_of, with_sen
 from maplab_py.vimap import VIMap
 
 _POSITION = "extrinsics_translation"
+_MAX_CHANGE_IN_SIGMAS = 3.0
+_MIN_SPAN_S = 30.0
+"""Shorter data may share one error of the models: they confirm no larger change by themselves."""
 
 Selector = Callable[
     [VIMap, SelfCalibrationOptions, NDArray[np.integer] | None, Progress], Sequence[I64]
@@ -127,7 +134,7 @@ def _with_spread(
     mean of n results has the standard deviation of their spread over sqrt(n).
     """
     if not parts:
-        return report
+        return doubt_large_changes(report, _span_s(result.solution.problem))
     problem = result.solution.problem
     vi_map = problem.vi_map.replace(sensors=result.sensors)
     lenient = dataclasses.replace(options, keep_unobservable_at_prior=True)
@@ -143,6 +150,28 @@ def _with_spread(
     uncertainty = dataclasses.replace(result.uncertainty, spread=spread)
     estimates = dataclasses.replace(result, uncertainty=uncertainty).estimates()
     return dataclasses.replace(report, parameters=estimates)
+
+
+def _span_s(problem: SegmentProblem) -> float:
+    """Return the time [s] that the runs of a problem's vertices last together."""
+    rows = np.sort(problem.selection.vertices)
+    run, time_ns = runs_of(problem.vi_map)[rows], problem.vi_map.vertices.timestamp_ns[rows]
+    return 1e-9 * float(np.diff(time_ns)[run[1:] == run[:-1]].sum())
+
+
+def doubt_large_changes(report: SelfCalibrationReport, span_s: float) -> SelfCalibrationReport:
+    """Return the report in which short data confirm no large change of a parameter."""
+    if span_s >= _MIN_SPAN_S:
+        return report
+    determined = (Verdict.WELL_DETERMINED.text(), Verdict.WEAKLY_DETERMINED.text())
+
+    def doubt(estimate: ParameterEstimate) -> ParameterEstimate:
+        change = abs(estimate.change_in_sigmas)
+        if change <= _MAX_CHANGE_IN_SIGMAS or estimate.verdict not in determined:
+            return estimate
+        return dataclasses.replace(estimate, verdict=Verdict.UNCONFIRMED.text(change, span_s))
+
+    return dataclasses.replace(report, parameters=tuple(map(doubt, report.parameters)))
 
 
 def _with_kept_positions(

@@ -14,10 +14,10 @@ class ParameterEstimate:
 
     parameter: str
     unit: str
-    before: float
-    after: float
-    sigma: float
-    change_in_sigmas: float
+    before: float = dataclasses.field(metadata={"deviation": "sigma"})
+    after: float = dataclasses.field(metadata={"deviation": "sigma"})
+    sigma: float = dataclasses.field(metadata={"deviation": "sigma"})
+    change_in_sigmas: float = dataclasses.field(metadata={"deviation": 1.0})
     verdict: str
 
 
@@ -44,6 +44,15 @@ class SelfCalibrationReport(Report):
     termination: str
     seconds_pose: float
     seconds_solve: float
+
+    @property
+    def advice(self) -> str:
+        """Tell how to confirm a doubtful change, or what uses the calibration."""
+        if any(row.verdict.startswith("not confirmed") for row in self.parameters):
+            return "changes are not confirmed: self_calibrate --parts=4, or record a longer session"
+        if any("disagree" in row.verdict for row in self.parameters):
+            return "parts of the data disagree: check_recording, or fewer --sc_states"
+        return "optvi adjusts the map to the calibration" if self.parameters else ""
 
 
 @dataclasses.dataclass(frozen=True)

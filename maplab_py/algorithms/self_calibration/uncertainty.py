@@ -130,10 +130,11 @@ class Verdict(Enum):
     PARTS_DISAGREE = "weakly determined: parts of the data disagree by {:.1f} sigma"
     NOT_EXCITED = "not excited, left at its prior"
     KEPT = "kept: the data would move the camera by {:.0f} mm"
+    UNCONFIRMED = "not confirmed: {:.1f} sigma on {:.0f} s of data"
 
-    def text(self, value: float = 0.0) -> str:
+    def text(self, *values: float) -> str:
         """Return the text of reports."""
-        return self.value.format(value)
+        return self.value.format(*values)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -104,7 +104,8 @@ def blocks_of(report: Any, title: str = "", error: str = "") -> list[Block]:
         error: Failure of the report around it, which is printed anyway.
 
     The metadata of a field can hold its `title` (empty: no title) and its `unit`; `is_prose` marks
-    a text that stands without a title, `are_entries` a list that explains terms.
+    a text that stands without a title, `are_entries` a list that explains terms, `deviation` the
+    standard deviation of a column's numbers, or the field that holds it.
     """
     failure = error or (report.failure if isinstance(report, Report) else "")
     for _ in range(2):  # what a report displays can be a sentence
@@ -281,7 +282,12 @@ def _tables(title: str, records: Sequence[Any], *, are_entries: bool = False) ->
     kept = [i for i, column in enumerate(columns) if not all(map(_is_absent, column))]
     if not kept:
         return []
-    cells = [format_column([_flat(value) for value in columns[i]]) for i in kept]
+    cells = [
+        _format_certain(columns[i], records, fields[i].metadata["deviation"])
+        if "deviation" in fields[i].metadata
+        else format_column([_flat(value) for value in columns[i]])
+        for i in kept
+    ]
     rows = [list(row) for row in zip(*cells, strict=True)]
     numeric = [all(isinstance(v, _NUMBER_TYPES) for v in columns[i]) for i in kept]
     return [Table(title, [heading(fields[i]) for i in kept], rows, numeric, are_entries)]
@@ -306,6 +312,7 @@ _SIGNIFICANT_DIGITS = 4
 _LEAST_SIGNIFICANT_DIGITS = 3
 _MORE_DECIMALS = 2
 _MAX_DECIMALS = 6
+_MAX_CERTAIN_DECIMALS = 9
 _FIXED_POINT_RANGE = (1e-4, 1e9)
 _ROUNDING_NOISE = 1e-12
 """Smaller numbers are shown as zeros."""
@@ -349,6 +356,21 @@ def format_column(values: Sequence[Any]) -> list[str]:
         _format_fixed(float(value), decimals) if _is_number(value) else _format_plain(value)
         for value in values
     ]
+
+
+def _format_certain(
+    values: Sequence[Any], records: Sequence[Any], deviation: str | float
+) -> list[str]:
+    """Format numbers to the second digit of their standard deviations."""
+    cells = []
+    for value, record in zip(values, records, strict=True):
+        sigma = getattr(record, deviation) if isinstance(deviation, str) else deviation
+        if _is_number(value) and _is_number(sigma) and sigma > 0.0:
+            decimals = 1 - math.floor(math.log10(sigma))
+            cells.append(_format_fixed(value, min(max(decimals, 0), _MAX_CERTAIN_DECIMALS)))
+        else:
+            cells.append(format_cell(value))
+    return cells
 
 
 def _format_fixed(value: float, decimals: int) -> str:

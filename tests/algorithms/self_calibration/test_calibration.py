@@ -102,6 +102,24 @@ def test_report_says_what_changed_and_how_certain_it_is() -> None:
     assert focal.change_in_sigmas == pytest.approx((focal.after - focal.before) / focal.sigma)
     assert 0.0 < focal.sigma < result.parameters.prior_sigma[list(named).index(focal.parameter)]
     assert report.cost_after < report.cost_before
+    assert "optvi" in report.advice
+
+
+def test_short_data_confirm_no_large_change() -> None:
+    _, report = calibrate(uncalibrated(scene_map(noise=1.0)), OPTIONS_ALL)
+    sure, unexcited = Verdict.WELL_DETERMINED.text(), Verdict.NOT_EXCITED.text()
+    changed = dataclasses.replace(
+        report,
+        parameters=tuple(
+            dataclasses.replace(report.parameters[0], change_in_sigmas=change, verdict=verdict)
+            for change, verdict in ((-8.9, sure), (2.9, sure), (8.9, unexcited))
+        ),
+    )
+    doubted = checks.doubt_large_changes(changed, 10.0)
+    verdicts = [one.verdict for one in doubted.parameters]
+    assert verdicts == ["not confirmed: 8.9 sigma on 10 s of data", sure, unexcited]
+    assert "--parts" in doubted.advice
+    assert checks.doubt_large_changes(changed, 31.0) == changed
 
 
 OPTIONS_ALL = dataclasses.replace(OPTIONS, keep_unobservable_at_prior=True)
@@ -184,6 +202,7 @@ def test_the_spread_of_parts_widens_deviations_and_never_narrows_them() -> None:
     assert min(ratio) >= 1.0 - 1e-9
     # the simulated device is what the model says: results scatter as announced
     assert float(np.median(ratio)) <= 2.0
+    assert not any(one.verdict.startswith("not confirmed") for one in widened.parameters)
     with pytest.raises(UserError, match="two parts"):
         calibrate_with_checks(start, CAMERA, batch=True, parts=1)
 

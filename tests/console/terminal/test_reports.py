@@ -366,3 +366,33 @@ def test_help_never_leaves_out_the_text_of_a_flag() -> None:
     text = shown(Page("optvi", (*PAGE.flags, long)), 100)
     assert "no room for" not in text
     assert "\n    Least number of inliers of a closure\n" in text
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    value: float = dataclasses.field(metadata={"deviation": "sigma"})
+    sigma: float = dataclasses.field(metadata={"deviation": "sigma"})
+    ratio: float = dataclasses.field(metadata={"deviation": 1.0})
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurements(Report):
+    values: tuple[Measured, ...]
+
+
+def test_numbers_are_printed_as_far_as_their_deviations_say() -> None:
+    rows = [
+        (461.4417, 0.7612, 3.66),
+        (0.00026, 3.2e-6, 0.0),
+        (1234.5, 17.0, -9.81),
+        (1.5, 0.0, 0.0),
+    ]
+    [table] = blocks_of(Measurements(tuple(Measured(*row) for row in rows)))
+    assert isinstance(table, Table)
+    assert table.is_number == [True, True, True]
+    assert table.rows[:3] == [
+        ["461.44", "0.76", "3.7"],
+        ["0.0002600", "0.0000032", "0.0"],
+        ["1234", "17", "-9.8"],
+    ]
+    assert table.rows[3][0] == "1.5000"  # nothing is known about it
