@@ -287,3 +287,25 @@
     return hasFailed ? getShaderInfoLog.call(this, shader) : "";
   };
 })();
+
+// Lets the server read and write the page's address: of the messages of one page that viser has, those
+// of local storage do both. Behind the # is a view that was shared (links.py).
+(() => {
+  const KEY = /maplab_link$/;
+  const { getItem, setItem } = Storage.prototype;
+  let link = location.hash.slice(1); // told once: a page that connects again keeps its view
+  // viser would take what is behind the # for a part of the server's address
+  if (link && location.protocol !== "file:") history.replaceState(null, "", location.href.split("#")[0]);
+  Storage.prototype.getItem = function (key) {
+    if (!KEY.test(key)) return getItem.call(this, key);
+    const told = link;
+    link = "";
+    return told;
+  };
+  Storage.prototype.setItem = function (key, value) {
+    if (!KEY.test(key)) return setItem.call(this, key, value);
+    history.replaceState(null, "", `#${value}`);
+    if (navigator.clipboard) navigator.clipboard.writeText(location.href).catch(() => {});
+  };
+  window.addEventListener("hashchange", () => location.reload());
+})();

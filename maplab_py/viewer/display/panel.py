@@ -166,7 +166,8 @@ class Panel:
                 self.show_hint(str(error))
 
     def _add_view(self) -> None:
-        with self._gui.add_folder("View", order=5, expand_by_default=False):
+        self.view = self._gui.add_folder("View", order=5, expand_by_default=False)
+        with self.view:
             self.views = self._gui.add_button_group("look", VIEWS)
             self.dark: Any = self._gui.add_checkbox("dark", False)
             self.ground = self._gui.add_checkbox("ground grid", True)

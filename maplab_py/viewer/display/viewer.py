@@ -20,6 +20,7 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.display.camera import Cameras, aim
 from maplab_py.viewer.display.court import Court
+from maplab_py.viewer.display.links import Links
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes, by_user
 from maplab_py.viewer.display.picture import (
@@ -56,6 +57,7 @@ class Viewer:
         subject: What it was made of.
         show_image: Shows an image (H, W, 3) in the panel, or none.
         court: Where closures are judged.
+        links: Makes and opens links to a view.
     """
 
     def __init__(self, port: int = 8080, *, is_dark: bool = False) -> None:
@@ -80,6 +82,7 @@ class Viewer:
         self._playback = Playback(self._server, self, self._lock, self._panel.say)
         self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
         self.court = Court(self._server, self, self._lock, self._panel.say)
+        self.links = Links(self._server, self, self._lock, self._panel.view, self._panel.say)
         self._is_dark = is_dark
         self._drawing: Drawing | None = None
         self.scene: Scene | None = None
@@ -289,12 +292,18 @@ class Viewer:
             self._choices[name] = is_visible
             self.redraw()
 
+    def set_layers(self, visible: set[str]) -> set[str]:
+        """Show these layers and no others; return those that the map has not."""
+        with self._lock:
+            names = set(self._shown().names)
+            self._choices |= {name: name in visible for name in names}
+            self.redraw()
+        return visible - names
+
     def set_missions(self, visible: set[str]) -> None:
         """Show these missions and no others."""
         with self._lock:
-            if self.scene is None:
-                return
-            self._hidden = {m.id for m in self.scene.missions} - visible
+            self._hidden = {mission.id for mission in self._shown().missions} - visible
             self._playback.stop()
             self.redraw()
 
@@ -347,8 +356,7 @@ class Viewer:
             self._nodes.set_ground_visible(is_visible)
 
     def _show_ground(self, scene: Scene) -> None:
-        ground = make_ground(scene.extent, scene.origin_G)
-        self._nodes.show_ground(ground, is_dark=self._is_dark)
+        self._nodes.show_ground(make_ground(scene.extent, scene.origin_G), is_dark=self._is_dark)
 
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""

@@ -1,0 +1,174 @@
+"""Links that open a view again: map, camera, layers and selection behind the # of the page's address."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import zlib
+from collections.abc import Callable
+from typing import Any, Protocol
+from urllib.parse import parse_qsl, urlencode
+
+import numpy as np
+import viser
+
+from maplab_py.array_types import F64
+from maplab_py.errors import UserError
+from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.display.selection import Selection
+from maplab_py.viewer.drawing import Drawing
+from maplab_py.viewer.picking import id_of
+
+KEY = "maplab_link"
+"""Item of local storage in whose place `page.js` reads and writes the page's address."""
+MAX_CHARACTERS = 1500
+_FARTHEST_M, _NEAREST_M = 1e8, 1e-3
+_ANSWER_S = 300.0
+"""Longest wait for a page that is opened to tell its address."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SharedView:
+    """View of a link."""
+
+    map_code: str
+    camera_G: F64  # (2, 3) position of the camera, and the point that it looks at
+    layers: tuple[str, ...]  # names of the visible ones
+    picked_id: str = ""  # empty = nothing is selected
+
+
+def link_text(view: SharedView) -> str:
+    """Return what comes behind the # of an address.
+
+    Raises:
+        UserError: The names of the layers are too long.
+    """
+    fields = {
+        "map": view.map_code,
+        "camera": ",".join(f"{x:.3f}" for x in view.camera_G.ravel().tolist()),
+        "layers": ",".join(view.layers),
+        "pick": view.picked_id,
+    }
+    text = urlencode(fields, safe=",")
+    if len(text) > MAX_CHARACTERS:
+        raise UserError(f"{len(view.layers)} layers are too many for a link: hide some")
+    return text
+
+
+def read_link(text: str) -> SharedView:
+    """Return the view of a link.
+
+    Raises:
+        UserError: It is damaged.
+    """
+    try:
+        if len(text) > MAX_CHARACTERS:
+            raise ValueError(text[:80])
+        pairs = parse_qsl(text, keep_blank_values=True, strict_parsing=True, max_num_fields=4)
+        fields = dict(pairs)
+        camera = np.array(fields["camera"].split(","), dtype=np.float64).reshape(2, 3)
+        is_near = bool((np.abs(camera) < _FARTHEST_M).all())  # NaN is not
+        if not is_near or np.linalg.norm(camera[1] - camera[0]) < _NEAREST_M:
+            raise ValueError(fields["camera"])
+        layers = tuple(filter(None, fields["layers"].split(",")))
+        return SharedView(fields["map"], camera, layers, fields["pick"])
+    except (KeyError, ValueError):
+        raise UserError("this link is damaged: the page opens as without it") from None
+
+
+def map_code(drawing: Drawing) -> str:
+    """Return eight digits that tell maps with other missions apart."""
+    return f"{zlib.crc32(''.join(sorted(drawing.mission_ids)).encode()):08x}"
+
+
+class View(Protocol):
+    """View that is shared."""
+
+    @property
+    def drawing(self) -> Drawing:
+        """The map as it is drawn; raises UserError while nothing is shown."""
+
+    @property
+    def visible_layers(self) -> set[str]:
+        """Names of the layers that are drawn."""
+
+    @property
+    def selection(self) -> Selection:
+        """Picked entities."""
+
+    def set_layers(self, visible: set[str]) -> set[str]:
+        """Show these layers and no others; return those that the map has not."""
+
+    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
+        """Select what an id means, and move the cameras of pages there; UserError if it means nothing."""
+
+
+class Links:
+    """The button that makes a link, and the pages that are opened by one."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        view: View,
+        lock: threading.RLock,
+        folder: Any,
+        say: Callable[[str], None],
+    ) -> None:
+        """Add the button to a folder of the panel."""
+        self._view = view
+        self._lock = lock
+        with folder:
+            button = server.gui.add_button(
+                "copy link", hint="a link that opens this map with this camera, layers, selection"
+            )
+        button.on_click(by_user(lock, lambda event: self.copy(event.client), say))
+        server.on_client_connect(self.restore)
+
+    def copy(self, client: Any) -> None:
+        """Turn a page's address into a link to what it shows, and copy it."""
+        try:
+            drawing = self._view.drawing
+            camera = np.stack([client.camera.position, client.camera.look_at]) + drawing.origin_G
+            layers = tuple(sorted(self._view.visible_layers))
+            picked = self._view.selection.picked
+            picked_id = "" if picked is None else id_of(drawing.vi_map, picked)
+            text = link_text(SharedView(map_code(drawing), camera, layers, picked_id))
+        except UserError as error:
+            _tell(client, str(error))
+            return
+        client.local_storage.set_item(KEY, text)
+        _tell(client, "copied: it is the address of this page, too")
+
+    def restore(self, client: Any) -> None:
+        """Show what the address of a page that is opened says; the page is told what is wrong with it."""
+        try:
+            text = client.local_storage.get_item(KEY, timeout=_ANSWER_S)
+        except (RuntimeError, TimeoutError):  # the page is gone
+            return
+        if not text:
+            return
+        try:
+            with self._lock:
+                self._show(client, read_link(text))
+        except UserError as error:
+            _tell(client, str(error))
+
+    def _show(self, client: Any, shared: SharedView) -> None:
+        drawing = self._view.drawing
+        if shared.map_code != map_code(drawing):
+            raise UserError(
+                "this link is of a map with other missions: load it, then reload the page"
+            )
+        position, target = shared.camera_G - drawing.origin_G
+        with client.atomic():
+            client.camera.position = position
+            client.camera.look_at = target
+        missing = self._view.set_layers(set(shared.layers))
+        if shared.picked_id:
+            self._view.fly_to(shared.picked_id, [])
+        if missing:
+            raise UserError(f"this map has no layer {', '.join(sorted(missing))[:200]}")
+
+
+def _tell(client: Any, message: str) -> None:
+    client.add_notification("Link", message, auto_close_seconds=15.0)
