@@ -11,6 +11,7 @@ import numpy as np
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome, Query
 from maplab_py.algorithms.localization.options import (
+    QUERY_PATH,
     Distribution,
     LocalizationOptions,
     LocalizationReport,
@@ -253,8 +254,8 @@ def trajectory_of_queries(
     known = np.ones(len(localizations.vertex), dtype=np.bool_)
     missions = np.unique(vi_map.vertices.mission[localizations.vertex])
     if vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]].all():
-        return Reference("the query's poses in G", T_G_I, known), se3.identity()
-    reference = Reference("the query's trajectory, aligned with the localised poses", T_G_I, known)
+        return Reference(f"{QUERY_PATH} in G", T_G_I, known), se3.identity()
+    reference = Reference(f"{QUERY_PATH}, aligned with the localised poses", T_G_I, known)
     return reference, _from_answers(reference, localizations, level=True)
 
 

@@ -86,3 +86,25 @@ class LocalizationReport(Report):
             return ""
         reasons = ", ".join(f"{why}: {count}" for why, count in self.refused.items())
         return f"none of {self.queries} queries was localised ({reasons})"
+
+    def display(self) -> LocalizationReport:
+        """Return the report with figures that are called differences where there is no truth."""
+        if not self.reference.startswith(QUERY_PATH):
+            return self
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return _DifferenceReport(**values)
+
+
+QUERY_PATH = "the query's own path"
+
+
+@dataclasses.dataclass(frozen=True)
+class _DifferenceReport(LocalizationReport):
+    """Result compared with the query's own path, which has errors too."""
+
+    position_error_m: Distribution | None = dataclasses.field(
+        metadata={"title": "difference", "unit": "m"}
+    )
+    orientation_error_deg: Distribution | None = dataclasses.field(
+        metadata={"title": "difference", "unit": "deg"}
+    )

@@ -41,6 +41,7 @@ from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.array_types import F64, I64
+from maplab_py.console.terminal.layout import Table, blocks_of
 from maplab_py.errors import EstimationError, FlagError, UserError
 from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keypoints
 from maplab_py.frontend.odometry import Odometry
@@ -310,6 +311,12 @@ def test_errors_are_empty_in_the_table_where_the_frames_are_not_aligned():
     answers = localize_missions(database("full"), query, OPTIONS)
     reference, T_R_G = trajectory_of_queries(query, answers)
     assert T_R_G is not None
+    report = describe(database("full"), answers, reference=reference, T_R_G=T_R_G)
+    [heads] = [block.heads for block in blocks_of(report) if isinstance(block, Table)]
+    assert heads[1:3] == ["difference [m]", "difference [deg]"]
+    of_truth = dataclasses.replace(report, reference="truth")
+    [heads] = [block.heads for block in blocks_of(of_truth) if isinstance(block, Table)]
+    assert heads[1:3] == ["position error [m]", "orientation error [deg]"]
     header, *lines = csv_lines(query, answers, reference, T_R_G)
     columns = header.strip().split(",")
     error = columns.index("position_error_m")
