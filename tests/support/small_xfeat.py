@@ -13,8 +13,11 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import pytest
 
+from maplab_py.errors import UserError
 from maplab_py.vision.features.learned.checkpoint import Arrays
+from maplab_py.vision.features.learned.xfeat import XFeat, installed_xfeat
 
 _WIDTHS = {
     "block1": (1, 4, 8, 8, 24),
@@ -25,6 +28,14 @@ _WIDTHS = {
     "block_fusion": (64, 64, 64),
 }
 _LAST = {"skip1.1": (24, 1), "block_fusion.2": (64, 64)}
+
+
+def xfeat_or_skip() -> XFeat:
+    """Return the installed network; the test is skipped where there is none."""
+    try:
+        return installed_xfeat()
+    except UserError as error:
+        pytest.skip(f"needs the weights: {error}")
 
 
 def random_arrays(seed: int = 0) -> Arrays:

@@ -24,6 +24,7 @@ from maplab_py.vimap.table import object_column
 from maplab_py.vision.features import extension
 from maplab_py.vision.features.extension import ExtractedFeatures, feature_extractor
 from maplab_py.vision.features.extractors import KINDS
+from tests.support.small_xfeat import xfeat_or_skip
 from tests.support.stereo_room import StereoRoom, quarter_size
 
 SIFT = ExtractionOptions(max_features=250)
@@ -88,6 +89,8 @@ def test_a_map_with_features_is_saved_and_loaded(sift: VIMap, tmp_path: Path) ->
 def test_the_features_do_not_depend_on_threads(
     with_images: VIMap, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if name == "xfeat":
+        xfeat_or_skip()
     options = ExtractionOptions(feature_type=name, max_features=60)
     several, report = extract_features(with_images, Path(), options)
     monkeypatch.setattr(extraction.os, "cpu_count", lambda: 1)

@@ -47,7 +47,7 @@ def test_neighbouring_recorded_images_agree(name: str) -> None:
     assert np.median(counts) >= MIN_INLIERS[name]
 
 
-@pytest.mark.parametrize("name", sorted(KINDS))
+@pytest.mark.parametrize("name", sorted(KINDS.keys() - {"xfeat"}))
 def test_an_image_without_contrast_has_no_features(name: str) -> None:
     features = extract(name, np.full((240, 320), 90, dtype=np.uint8), 100)
     assert features.keypoints_px.shape == (0, 2)

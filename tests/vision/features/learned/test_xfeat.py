@@ -13,10 +13,10 @@ from maplab_py.frontend.vertex_keypoints import described_frames
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.features.learned.checkpoint import Arrays
 from maplab_py.vision.features.learned.installation import check_image
-from maplab_py.vision.features.learned.xfeat import XFeat, installed_xfeat
+from maplab_py.vision.features.learned.xfeat import XFeat
 from maplab_py.vision.features.learned.xfeat_graph import xfeat_graph
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
-from tests.support.small_xfeat import random_arrays
+from tests.support.small_xfeat import random_arrays, xfeat_or_skip
 
 pytest.importorskip("onnx", reason="the extra [learned] is not installed")
 pytest.importorskip("onnxruntime", reason="the extra [learned] is not installed")
@@ -101,6 +101,7 @@ def test_features_lie_in_images_of_any_size(network: XFeat) -> None:
     described = network.describe(image, features.keypoints_px)
     assert np.allclose(described, features.descriptors, atol=1e-5)
     assert network.describe(image, np.zeros((0, 2))).shape == (0, 64)
+    assert network.extract(np.full((97, 131), 90, dtype=np.uint8), 40).descriptors.shape == (0, 64)
 
 
 def test_missing_arrays_and_damaged_networks_are_refused() -> None:
@@ -115,10 +116,7 @@ def test_missing_arrays_and_damaged_networks_are_refused() -> None:
 
 
 def test_installed_weights_match_a_moved_image() -> None:
-    try:
-        network = installed_xfeat()
-    except UserError as error:
-        pytest.skip(f"needs the weights: {error}")
+    network = xfeat_or_skip()
     rng = np.random.default_rng(3)
     rough = np.kron(rng.integers(30, 220, (24, 32)), np.ones((10, 10))).astype(np.uint8)
     first, second = rough[:192, :256], rough[16:208, 8:264]
