@@ -214,7 +214,7 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def terminations_as_interrupts() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP as Ctrl-C, so that what a script has made is kept."""
+    """Treat SIGTERM, and SIGHUP where there is one, as Ctrl-C, so that what a script has made is kept."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -222,7 +222,8 @@ def terminations_as_interrupts() -> Iterator[None]:
     def handle(signal_number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         signal.raise_signal(signal.SIGINT)
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    numbers = (getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP"))
+    before = {number: signal.getsignal(number) for number in numbers if number is not None}
     for number, handler in before.items():
         if handler == signal.SIG_DFL:
             signal.signal(number, handle)

@@ -182,17 +182,11 @@ def test_a_command_is_found_without_importing_other_plugins(
 ) -> None:
     """Every name and alias of the built-in plugins is declared where it is found without an import."""
     loaded: list[str] = []
-    load, here = EntryPoint.load, threading.get_ident()
-
-    def note(entry: EntryPoint) -> Any:
-        if threading.get_ident() == here:  # an abandoned command of another test may still run
-            loaded.append(entry.name)
-        return load(entry)
-
-    monkeypatch.setattr(EntryPoint, "load", note)
-    full = load_registry()
-    for plugin in [p for p in full.plugins if p.module.startswith(BUILT_IN)]:
-        registry = load_registry()
+    load = EntryPoint.load
+    monkeypatch.setattr(EntryPoint, "load", lambda self: loaded.append(self.name) or load(self))
+    entries = [e for e in entry_points(group=ENTRY_POINT_GROUP) if e.value.startswith(BUILT_IN)]
+    for plugin in load_registry(entries).plugins:
+        registry = load_registry(entries)
         loaded.clear()
         names = {name: command.name for command in plugin.commands for name in command.names}
         assert {name: registry.find(name).name for name in names} == names
