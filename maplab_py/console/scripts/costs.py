@@ -166,8 +166,10 @@ def _disk_mb(path: Path) -> float:
 
 
 def _peak_bytes() -> float:
-    """Return the largest memory that the process has held."""
-    import resource
-
+    """Return the largest memory that the process has held, or that it holds where that is not known."""
+    try:
+        import resource
+    except ImportError:  # not a POSIX system
+        return resident_bytes()
     unit = 1 if sys.platform == "darwin" else 1024
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
