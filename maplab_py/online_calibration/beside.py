@@ -12,14 +12,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from maplab_py.algorithms.recording_check.mending import RecalibratedRecording
 from maplab_py.algorithms.self_calibration.segments.database import read_calibration
 from maplab_py.child_processes import Service, ServiceEnded
 from maplab_py.errors import Cancelled
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.recorded_mission import RecordedMission
-from maplab_py.interop.device import RecordedSensors
-from maplab_py.interop.recordings.protocol import Item, PartSpan, Recording, TrackedFrame
+from maplab_py.interop.recordings.protocol import Recording, TrackedFrame
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.process import OPTIONS, Finish, Opening, Piece, Status, words
 from maplab_py.progress import Progress
@@ -101,7 +101,11 @@ class CalibrationBeside:
         sensors = with_calibration_of(
             of_recording.sensors, device, known, corresponding_device(known, device)
         )
-        return RecalibratedRecording(recording, dataclasses.replace(of_recording, sensors=sensors))
+        return RecalibratedRecording(
+            recording,
+            dataclasses.replace(of_recording, sensors=sensors),
+            "read with the calibration that --self_calibrate has found",
+        )
 
     def with_status(self, status: Callable[[], str]) -> Callable[[], str]:
         """Return the status line of others, and what the segments say."""
@@ -250,39 +254,3 @@ def _notes(status: Status, options: OnlineCalibrationOptions) -> Iterator[str]:
         yield f"proposed calibration in {options.proposal} ({use}): {'; '.join(changed)}"
         for name in status.proposal.unobservable:
             yield f"not observable, as it was: {name}"
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RecalibratedRecording:
-    """A recording with the calibration that its device has now."""
-
-    plain: Recording
-    device: RecordedSensors
-
-    @property
-    def name(self) -> str:
-        """File or folder."""
-        return self.plain.name
-
-    @property
-    def kind(self) -> str:
-        """Kind of the recording."""
-        return self.plain.kind
-
-    @property
-    def start_ns(self) -> int:
-        """Time of the first item."""
-        return self.plain.start_ns
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes of the reader, and where the calibration is from."""
-        return (*self.plain.notes, "read with the calibration that --self_calibrate has found")
-
-    def parts(self) -> tuple[PartSpan, ...]:
-        """Return the parts between restarts of the clock."""
-        return self.plain.parts()
-
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
-        """Yield the items of the recording."""
-        yield from self.plain.items(start_ns, end_ns)

@@ -29,14 +29,12 @@ from maplab_py.interop.recordings.protocol import (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MendedRecording:
-    """A recording with another calibration, and samples in the units and axes that it expects."""
+class RecalibratedRecording:
+    """A recording with another calibration."""
 
     plain: Recording
     device: RecordedSensors
-    accel: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times accelerations
-    gyro: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times rates
-    words: tuple[str, ...] = ()  # what is mended
+    note: str = ""  # where the calibration is from
 
     @property
     def name(self) -> str:
@@ -55,16 +53,34 @@ class MendedRecording:
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """Notes of the reader, and where the calibration is from."""
+        return (*self.plain.notes, self.note)
+
+    def parts(self) -> tuple[PartSpan, ...]:
+        """Return the parts between restarts of the clock."""
+        return self.plain.parts()
+
+    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+        """Yield the items of the recording."""
+        yield from self.plain.items(start_ns, end_ns)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MendedRecording(RecalibratedRecording):
+    """A recording with another calibration, and samples in the units and axes that it expects."""
+
+    accel: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times accelerations
+    gyro: F64 = dataclasses.field(default_factory=lambda: np.eye(3))  # (3, 3) times rates
+    words: tuple[str, ...] = ()  # what is mended
+
+    @property
+    def notes(self) -> tuple[str, ...]:
         """Notes of the reader, and what is mended."""
         note = (
             f"does not fit its calibration; read with what check_recording finds: {', '.join(self.words)} "
             "(--vio_apply_calibration=false does not do so)"
         )
         return (*self.plain.notes, note)
-
-    def parts(self) -> tuple[PartSpan, ...]:
-        """Return the parts between restarts of the clock."""
-        return self.plain.parts()
 
     def mend(self, accel_gyro: F64) -> F64:
         """Return samples (S, 6) in the units and axes of the calibration."""
@@ -131,4 +147,4 @@ def _with_samples(recording: Recording, diagnosis: Diagnosis) -> MendedRecording
     if "sign of the accelerometer" in wrong:
         accel = -accel
         words.append("accelerations times -1")
-    return MendedRecording(recording, recording.device, accel, gyro, tuple(words))
+    return MendedRecording(recording, recording.device, accel=accel, gyro=gyro, words=tuple(words))
