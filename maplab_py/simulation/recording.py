@@ -94,7 +94,8 @@ def record(
     states = drift(scenario.drift, motion, clock.sample_s[clock.frame_row], seeds.measurement)
     detections = _detect_all(scenario, world, device, spline, clock, appearance, seeds)
     kept, stamp_ns = _stamps(scenario, clock, seeds.other)
-    begin_ns = _EPOCH_NS + number * _SESSION_GAP_NS
+    gap_ns = round(scenario.changes.days_between_sessions * 86_400e9) or _SESSION_GAP_NS
+    begin_ns = _EPOCH_NS + number * gap_ns
     return Recording(
         begin_ns + stamp_ns[clock.frame_row],
         motion,

@@ -131,6 +131,27 @@ class AppearanceOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class ChangeOptions:
+    """Changes between sessions of a world of furnished rooms; none by default."""
+
+    days_between_sessions: float = option(0.0, ge=0)  # 0 = an hour
+    moved_share: float = option(0.0, ge=0, le=1)  # of the furniture, before each session
+    replaced_posters: int = option(0, ge=0)  # round patches of walls per room and session
+    refurbished_session: int = option(0, ge=0)  # before which much changes; 0 = none
+    refurbished_share: float = option(0.5, ge=0, le=1)  # of the furniture: replaced by other pieces
+    refurbished_posters: int = option(6, ge=0)  # per room
+    one_light_share: float = option(0.0, ge=0, le=1)  # of landmarks: seen in one of two lights
+    light_change: float = option(0.0, ge=0)  # of activations, between the lights
+
+    @property
+    def are_any(self) -> bool:
+        """Return whether the world differs between sessions."""
+        return max(self.moved_share, self.one_light_share) > 0.0 or (
+            max(self.replaced_posters, self.refurbished_session) > 0
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class DriftOptions:
     """Drift of the visual-inertial odometry."""
 
@@ -269,6 +290,7 @@ class SessionOptions(MotionOptions):
     keep_frame: bool = False  # trajectories that do are placed together, not each by itself
     recorded_imu: str = ""  # EuRoC file with the IMU samples of the trajectory; empty = simulated
     device: int = option(0, ge=0)  # devices of other numbers have other deviations and ids
+    light: int = option(0, ge=0, le=1)  # of two conditions; see `changes`
     images: SessionImages = SessionImages()
 
     @property
@@ -296,6 +318,7 @@ class Scenario:
     other_sensors: OtherSensorOptions = OtherSensorOptions()
     lidar: LidarOptions = LidarOptions()
     images: ImageOptions = ImageOptions()
+    changes: ChangeOptions = ChangeOptions()
     sessions: tuple[SessionOptions, ...] = (SessionOptions(),)
 
     def with_seed(self, seed: int) -> Scenario:

@@ -12,10 +12,16 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
+from maplab_py.simulation.changes import visible_in_light, with_changes
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.recording import Recording, SessionSeeds, record
 from maplab_py.simulation.scenario import ImageOptions, LidarOptions, Scenario
-from maplab_py.simulation.scene import make_appearance, make_scene, make_session_appearance
+from maplab_py.simulation.scene import (
+    SessionAppearance,
+    make_appearance,
+    make_scene,
+    make_session_appearance,
+)
 from maplab_py.simulation.sensors import Device, make_device
 from maplab_py.simulation.session import session_map
 from maplab_py.simulation.truth import Truth
@@ -23,7 +29,7 @@ from maplab_py.simulation.world import World, make_world
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, random_ids, to_hex
 
-_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR = range(7)
+_WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR, _CHANGES, _LIGHT = range(9)
 """Streams of random numbers; a session's number selects within a stream."""
 
 
@@ -70,6 +76,14 @@ class SessionSimulator:
         seeds = scenario.seeds
         self._scenario = scenario
         self.world = make_world(scenario.world, _generator(seeds.world, _WORLD))
+        if scenario.changes.are_any:
+            self.world = with_changes(
+                self.world,
+                scenario.world,
+                scenario.changes,
+                len(scenario.sessions),
+                _generator(seeds.world, _CHANGES),
+            )
         self._appearance = make_appearance(
             scenario.appearance, self.world.look, _generator(seeds.appearance, _APPEARANCE)
         )
@@ -84,7 +98,8 @@ class SessionSimulator:
         Raises:
             UserError: The session cannot be simulated.
         """
-        scenario, seeds, world = self._scenario, self._scenario.seeds, self.world
+        scenario, seeds = self._scenario, self._scenario.seeds
+        world = self.world.in_session(number)
         of_session = SessionSeeds(
             motion=_generator(seeds.motion, _MOTION, number),
             measurement=_generator(seeds.measurement, _MEASUREMENT, number),
@@ -94,7 +109,7 @@ class SessionSimulator:
                 [_IDS, number, *(int(seed) for seed in dataclasses.astuple(seeds))]
             ),
         )
-        look = make_session_appearance(self._appearance, of_session.appearance)
+        look = self._session_appearance(number, of_session.appearance)
         device = make_device(scenario, scenario.sessions[number].device, number)
         recording = record(scenario, number, world, device, look, of_session)
         vi_map, truth = session_map(scenario, world, device, recording, of_session)
@@ -102,6 +117,20 @@ class SessionSimulator:
             noise = _generator(seeds.measurement, _LIDAR, number)
             vi_map = with_lidar_clouds(vi_map, device.imu_id, recording, self._lidar, noise)
         return SimulatedSession(vi_map, truth, RecordedSession(device, recording))
+
+    def _session_appearance(self, number: int, rng: np.random.Generator) -> SessionAppearance:
+        """Return what can be seen in a session, and what it looks like in its light."""
+        look, light = (
+            make_session_appearance(self._appearance, rng),
+            self._scenario.sessions[number].light,
+        )
+        if self.world.exists is None:
+            return look
+        of_light = _generator(self._scenario.seeds.appearance, _LIGHT, light)
+        change = of_light.standard_normal(look.change.shape, dtype=np.float32)
+        is_there = look.is_there & self.world.exists[number] & visible_in_light(self.world, light)
+        change *= np.float32(self._scenario.changes.light_change)
+        return dataclasses.replace(look, change=look.change + change, is_there=is_there)
 
 
 def simulate(scenario: Scenario, *, progress: Progress = SILENT) -> SimulatedData:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.simulation.scenario import WorldOptions
 from maplab_py.simulation.surfaces import Surfaces, box_surfaces, join, scatter
 
@@ -28,6 +28,15 @@ class World:
     bounds: F64  # (2, 3) lower and upper corner of everything
     moving: I64  # (L,) number of the object that carries the landmark, -1 = none
     objects: tuple[MovingObject, ...] = ()
+    exists: Mask | None = None  # (sessions, L) where the world changes
+    has_box: Mask | None = None  # (sessions, B)
+    light: I64 | None = None  # (L,) the only light in which the landmark is seen, -1 = any
+
+    def in_session(self, number: int) -> World:
+        """Return the world with the boxes of a session; landmarks keep their rows."""
+        if self.has_box is None:
+            return self
+        return dataclasses.replace(self, boxes=self.boxes[self.has_box[number]])
 
 
 def make_world(options: WorldOptions, rng: np.random.Generator) -> World:

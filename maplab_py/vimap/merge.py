@@ -58,7 +58,7 @@ def merge_maps(
     """
     if assign_new_ids:
         other = with_new_ids(other, content_rng(base, "merge", other))
-    _check_disjoint(base, other)
+    check_disjoint(base, other)
     other, shared, renamed = with_compatible_sensors(base, other)
     merged = stack(base, other)
     report = MergeReport(
@@ -93,7 +93,12 @@ def with_compatible_sensors(
     return with_renamed_sensors(other, dict(renamed)), shared, renamed
 
 
-def _check_disjoint(base: VIMap, other: VIMap) -> None:
+def check_disjoint(base: VIMap, other: VIMap) -> None:
+    """Check that two maps have no ids in common.
+
+    Raises:
+        MapError: They have.
+    """
     for name, noun in _UNIQUE_TABLES.items():
         mine, theirs = getattr(base, name).id, getattr(other, name).id
         clash = np.flatnonzero(np.isin(as_keys(theirs), as_keys(mine)) & is_valid(theirs))

@@ -84,18 +84,26 @@ def compare_maps(context: CommandContext, other_map: str) -> reports.MapComparis
         other_map: Key of a map in memory, or folder of a map.
     """
     from maplab_py.algorithms.evaluation import map_comparison
+
+    return map_comparison.compare_maps(context.vi_map, map_of_key_or_folder(context, other_map))
+
+
+def map_of_key_or_folder(context: CommandContext, name: str) -> VIMap:
+    """Return another map: of a key in memory, or of a folder.
+
+    Raises:
+        UserError: There is none.
+    """
     from maplab_py.storage.native import is_map_folder, load_map
 
-    if other_map in context.maps:
-        other = context.maps.get(other_map).vi_map
-    elif is_map_folder(Path(other_map)):
-        other, _ = load_map(Path(other_map), progress=context.progress)
-    else:
-        known = ", ".join(context.maps.keys)
-        raise UserError(
-            f"'{other_map}' is neither a map in memory ({known}) nor the folder of a map: name one of them"
-        )
-    return map_comparison.compare_maps(context.vi_map, other)
+    if name in context.maps:
+        return context.maps.get(name).vi_map
+    if is_map_folder(Path(name)):
+        return load_map(Path(name), progress=context.progress)[0]
+    known = ", ".join(context.maps.keys)
+    raise UserError(
+        f"'{name}' is neither a map in memory ({known}) nor the folder of a map: name one of them"
+    )
 
 
 @command(

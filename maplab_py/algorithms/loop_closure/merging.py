@@ -14,6 +14,12 @@ from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
+from maplab_py.algorithms.map_update.evidence import (
+    has_evidence,
+    inherit,
+    read_evidence,
+    with_evidence,
+)
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
@@ -116,7 +122,7 @@ def _merge(
     counts = {FEW_OBSERVATIONS: united.too_few, SAME_IMAGE: united.seen_together}
     refused |= {reason: count for reason, count in counts.items() if count}
     absorbed, survivor = _into_best(vi_map, united.first, united.second)
-    merged = merge_landmarks(vi_map, absorbed, survivor)
+    merged = merge_landmarks(_with_both_histories(vi_map, absorbed, survivor), absorbed, survivor)
     ids = vi_map.landmarks.id[np.unique(survivor)]
     return _triangulate(merged, merged.landmark_index.rows(ids)), MergeResult(
         landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
@@ -127,6 +133,13 @@ def _merge(
         closure=closure[rows[united.vote]],
         wanted=united.wanted,
     )
+
+
+def _with_both_histories(vi_map: VIMap, absorbed: I64, survivor: I64) -> VIMap:
+    """Return the map in which survivors (N,) have the evidence of absorbed landmarks (N,), too."""
+    if len(absorbed) == 0 or not has_evidence(vi_map):
+        return vi_map
+    return with_evidence(vi_map, inherit(read_evidence(vi_map), absorbed, survivor))
 
 
 def _triangulate(vi_map: VIMap, landmarks: I64) -> VIMap:

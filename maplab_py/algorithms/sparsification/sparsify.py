@@ -7,6 +7,13 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
+from maplab_py.algorithms.map_update.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.map_update.persistence import (
+    PersistenceOptions,
+    existence,
+    learn_detection,
+    match_rates,
+)
 from maplab_py.algorithms.sparsification import selection
 from maplab_py.algorithms.sparsification.options import (
     CoverageOfMission,
@@ -80,6 +87,8 @@ def sparsify(
             remedy="retriangulate_landmarks",
         )
     problem, vertex = coverage_problem(judged, good, min(keep, len(good)), options)
+    if has_evidence(judged):
+        problem = with_weights_of_evidence(problem, judged, good)
     if keep >= len(good):
         everything = np.ones(len(good), dtype=np.bool_)
         value = problem.objective(everything)
@@ -141,6 +150,23 @@ def coverage_problem(
         keep=keep,
     )
     return problem, vertices
+
+
+def with_weights_of_evidence(
+    problem: CoverageProblem, vi_map: VIMap, landmarks: I64
+) -> CoverageProblem:
+    """Return a problem that weights landmarks (L,) by the probability that a session matches them.
+
+    It is the probability that the landmark exists, times that of a match if it does.
+    """
+    evidence, options = read_evidence(vi_map)[landmarks], PersistenceOptions()
+    detection = learn_detection(evidence, options)
+    exists = existence(evidence, options, detection=detection)
+    chance = np.clip(exists * match_rates(evidence, options, detection), 1e-3, 1.0)
+    weight = chance if problem.weight.min(initial=1.0) < 1.0 else problem.weight
+    available = np.bincount(problem.keyframe, weight[problem.landmark], minlength=problem.keyframes)
+    wanted = np.minimum(available, problem.full)
+    return dataclasses.replace(problem, score=chance, weight=weight, wanted=wanted)
 
 
 def _coverage(

@@ -1,0 +1,220 @@
+"""Maps that live: recall, size and time over a year of sessions in a place that changes.
+
+python -m benchmarks.living_maps [SEED ...] [--sessions=30] [--results=FILE]
+
+Every session updates four maps: one that keeps everything, and three within the budget of session 3 (its
+landmarks and vertices), by evidence, by observer counts, and by keeping the newest sessions. The next session
+is localised in each of them. A line of JSON is written per session and map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maplab_py.algorithms.localization.database import database_of_map
+from maplab_py.algorithms.localization.localization import align_robustly, localize_missions
+from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.map_update.evidence import read_evidence, with_evidence
+from maplab_py.algorithms.map_update.options import UpdateOptions
+from maplab_py.algorithms.map_update.persistence import PersistenceOptions, existence
+from maplab_py.algorithms.map_update.thinning import choose_vertices, size_mb, thin
+from maplab_py.algorithms.map_update.update import gather, merge_session, prepare_session
+from maplab_py.algorithms.sparsification.options import SparsificationOptions
+from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.errors import EstimationError
+from maplab_py.geometry import se3
+from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation.simulate import SessionSimulator
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.edits import remove_missions
+from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap.vertex_removal import remove_vertices
+
+BUDGET_SESSIONS = 3
+NEAR_M = 0.5
+QUERY_EVERY = 3
+"""Every third image of a session is a query."""
+BINS = 10
+_PERSISTENCE = PersistenceOptions()
+
+
+@dataclasses.dataclass
+class Truth:
+    """True poses and points of the sessions so far, by id."""
+
+    vertex_id: Any
+    T_G_I: Any
+    landmark_id: Any
+    point: Any
+    exists: Any  # (sessions, P)
+
+    def extended(self, truth: Any) -> Truth:
+        """Return the truth with one more session."""
+        return Truth(
+            np.concatenate([self.vertex_id, truth.vertex_id]),
+            np.concatenate([self.T_G_I, truth.T_G_I]),
+            np.concatenate([self.landmark_id, truth.landmark_id]),
+            np.concatenate([self.point, truth.landmark_point]),
+            self.exists,
+        )
+
+
+def recall(vi_map: VIMap, query: VIMap, truth: Truth) -> dict[str, float]:
+    """Localise the vertices of a session in a map and compare with the truth."""
+    database = database_of_map(vi_map)
+    begin = time.process_time()
+    query = remove_vertices(query, np.arange(len(query.vertices)) % QUERY_EVERY > 0)
+    found = localize_missions(database, query, LocalizationOptions())
+    seconds = time.process_time() - begin
+    index = IdIndex(truth.vertex_id)
+    observers = index.rows(database.observer_id)
+    known = observers >= 0
+    T_R_G = align_robustly(
+        truth.T_G_I[observers[known], 4:], database.p_G_observer[known], level=True
+    )
+    true_p = truth.T_G_I[index.rows(query.vertices.id[found.vertex]), 4:]
+    error = np.linalg.norm(se3.transform(T_R_G, found.T_G_I[:, 4:]) - true_p, axis=1)
+    good = found.is_localized & (error < NEAR_M)
+    return {
+        "queries": len(error),
+        "recall": float(good.mean()),
+        "wrong": int(np.count_nonzero(found.is_localized & ~good)),
+        "median_m": float(np.median(error[good])) if good.any() else float("nan"),
+        "query_ms": 1e3 * seconds / max(len(error), 1),
+    }
+
+
+def calibration(vi_map: VIMap, truth: Truth, session: int) -> list[list[float]]:
+    """Return number, mean probability and true share of landmarks by probability, in ten bins."""
+    evidence = read_evidence(vi_map)
+    row = IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)
+    used = (row >= 0) & (evidence["recent"]["time_s"][:, -1] > 0)
+    probability = existence(evidence[used], _PERSISTENCE)
+    exists = truth.exists[session][truth.point[row[used]]]
+    bins = np.minimum((probability * BINS).astype(np.int64), BINS - 1)
+    count = np.bincount(bins, minlength=BINS)
+    sums = [np.bincount(bins, values, minlength=BINS) for values in (probability, exists)]
+    return [[float(n), float(p), float(e)] for n, p, e in zip(count, *sums, strict=True)]
+
+
+def mean_deviation(bins: list[list[float]]) -> float:
+    """Return the mean deviation of a calibration curve, weighted by the number of landmarks."""
+    table = np.array(bins)
+    return float(np.abs(table[:, 1] - table[:, 2]).sum() / max(table[:, 0].sum(), 1.0))
+
+
+def keep_newest(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+    """Return the map with the newest missions that fit, and their most useful landmarks."""
+    counts = np.diff(vi_map.vertex_start)
+    order = np.argsort(-vi_map.vertices.timestamp_ns[vi_map.vertex_start[:-1]], kind="stable")
+    dropped = np.zeros(len(counts), dtype=np.bool_)
+    dropped[order[np.cumsum(counts[order]) > vertices]] = True
+    return by_counts(remove_missions(vi_map, dropped), landmarks, vertices)
+
+
+def by_counts(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+    """Return the map with landmarks chosen by observer counts, and vertices that cover them."""
+    vi_map = with_evidence(vi_map, None)
+    if len(vi_map.landmarks) > landmarks:
+        vi_map, _, _ = sparsify(vi_map, landmarks, SparsificationOptions())
+    if len(vi_map.vertices) > vertices:
+        kept = choose_vertices(vi_map, vertices, UpdateOptions().observers_kept)
+        emptied = np.bincount(vi_map.vertices.mission[kept], minlength=len(vi_map.missions)) == 0
+        ids = vi_map.vertices.id[kept]
+        vi_map = remove_missions(vi_map, emptied)
+        removed = np.ones(len(vi_map.vertices), dtype=np.bool_)
+        removed[vi_map.vertex_index.rows(ids)] = False
+        vi_map = remove_vertices(vi_map, removed)
+    return vi_map
+
+
+def by_evidence(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+    """Return the map within the budget by the evidence of its sessions."""
+    is_new = np.zeros(len(vi_map.missions), dtype=np.bool_)
+    is_new[-1] = True
+    options = UpdateOptions(max_landmarks=landmarks, max_vertices=vertices)
+    return thin(vi_map, is_new, options, _PERSISTENCE)[0]
+
+
+METHODS: dict[str, Callable[[VIMap, int, int], VIMap]] = {
+    "evidence": by_evidence,
+    "everything": lambda vi_map, *_: vi_map,
+    "counts": by_counts,
+    "newest": keep_newest,
+}
+
+
+def run(
+    seed: int, sessions: int, methods: list[str], write: Callable[[dict[str, Any]], None]
+) -> None:
+    """Update the maps with session after session of one seed."""
+    simulator = SessionSimulator(load_scenario("office_year").with_seed(seed))
+    first = simulator.session(0)
+    none = Truth(*(np.zeros((0, n), t) for n, t in ((2, "u8"), (7, "f8"), (2, "u8"))), None, None)
+    none = dataclasses.replace(none, point=np.zeros(0, np.int64), exists=simulator.world.exists)
+    truth = none.extended(first.truth)
+    base = prepare_session(first.vi_map)
+    base = base.replace(baseframes=base.baseframes.replace(is_known=np.ones(1, dtype=np.bool_)))
+    maps, budget = dict.fromkeys(methods, base), (0, 0)
+    for number in range(1, sessions):
+        simulated = simulator.session(number)
+        truth = truth.extended(simulated.truth)
+        session = prepare_session(simulated.vi_map)
+        for name in methods:
+            line = {"seed": seed, "session": number, "map": name}
+            if number >= BUDGET_SESSIONS:
+                line |= recall(maps[name], simulated.vi_map, truth)
+            begin = time.process_time()
+            try:
+                whole, _ = merge_session(maps[name], session)
+            except EstimationError as error:
+                write(line | {"refused": str(error)})
+                continue
+            if name in ("evidence", "everything"):
+                whole, report = gather(whole, len(whole.missions) - 1)
+                line |= {"false_match": report.false_match, "detection": report.detection}
+                line["calibration"] = calibration(whole, truth, number)
+            if number >= BUDGET_SESSIONS:
+                whole = METHODS[name](whole, *budget)
+            line["update_s"] = time.process_time() - begin
+            maps[name] = whole
+            write(line | {
+                "mb": size_mb(whole), "landmarks": len(whole.landmarks),
+                "vertices": len(whole.vertices), "missions": len(whole.missions),
+            })  # fmt: skip
+        if number == BUDGET_SESSIONS - 1:
+            largest = maps[methods[0]]
+            good = int(np.count_nonzero(largest.landmarks.quality == 2))
+            budget = good, len(largest.vertices)
+
+
+def main() -> None:
+    """Run the seeds that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("seeds", nargs="*", type=int, default=[1])
+    parser.add_argument("--sessions", type=int, default=30)
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--results", type=Path)
+    arguments = parser.parse_args()
+
+    def write(line: dict[str, Any]) -> None:
+        text = json.dumps(line)
+        print(text, flush=True)
+        if arguments.results:
+            with arguments.results.open("a") as file:
+                file.write(text + "\n")
+
+    for seed in arguments.seeds:
+        run(seed, arguments.sessions, arguments.methods.split(","), write)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Update of a map with new sessions: evidence, existence of landmarks, budgets."""

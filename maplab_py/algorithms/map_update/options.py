@@ -1,0 +1,75 @@
+"""Options and reports of map updates."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from maplab_py.options import Options, option
+from maplab_py.report import Report
+
+
+class UpdateOptions(Options, prefix=""):
+    """Budget of a map, and when landmarks count as gone."""
+
+    max_landmarks: int = option(0, ge=0)
+    """Largest number of landmarks after the update; 0 = no limit"""
+    max_vertices: int = option(0, ge=0)
+    """Largest number of vertices after the update; 0 = no limit"""
+    max_map_mb: float = option(0.0, ge=0, unit="MB")
+    """Largest size of the map in memory after the update; 0 = no limit"""
+    gone_below: float = option(0.05, ge=0, le=1)
+    """Landmarks that exist with less than this probability are removed, never after a single miss"""
+    observers_kept: int = option(3, ge=1, le=8)
+    """Number of vertices that a landmark should keep as observers when vertices are removed"""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvidenceReport(Report):
+    """Outcome of one session for the landmarks of others."""
+
+    session: str  # beginning of the mission's id
+    date: str
+    predicted: int  # landmarks that it should have seen
+    matched: int
+    false_match: float  # probability that a random landmark would have been matched
+    detection: float  # mean probability that an existing landmark is matched
+    probably_gone: int  # landmarks that now exist with a probability below one half
+
+
+@dataclasses.dataclass(frozen=True)
+class GatheringReport(Report):
+    """Evidence of the sessions of a map, and how probable it is that landmarks exist."""
+
+    sessions: tuple[EvidenceReport, ...]
+    landmarks: int
+    with_evidence: int
+    detection: float  # mean probability that an existing landmark is matched
+    date: str  # of the probabilities
+    # landmarks with evidence by the probability that they exist at the date
+    certain: int  # above 0.9
+    likely: int  # 0.5 to 0.9
+    unlikely: int  # 0.1 to 0.5
+    gone: int  # below 0.1
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class MapUpdateReport(Report):
+    """Contents of the map before and after an update."""
+
+    sessions: tuple[EvidenceReport, ...]
+    vertices_before: int
+    vertices_added: int
+    vertices_removed: int
+    vertices_after: int
+    landmarks_before: int
+    landmarks_added: int
+    landmarks_merged: int
+    landmarks_gone: int  # removed because they hardly exist any more
+    landmarks_thinned: int  # removed because others are more useful
+    landmarks_after: int
+    missions_removed: int  # none of their vertices stayed
+    missions_without_imu: int  # thinned: their poses are joined by odometry edges
+    megabytes_before: float
+    megabytes_after: float
+    notes: tuple[str, ...] = ()

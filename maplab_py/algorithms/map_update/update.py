@@ -1,0 +1,284 @@
+"""Update a map with a session: anchor, merge, optimise, gather evidence, keep the budget."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+from maplab_py.algorithms.anchoring.anchoring import anchor_missions
+from maplab_py.algorithms.keyframing.heuristic import keyframe
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.landmarks.tracks import init_tracks
+from maplab_py.algorithms.landmarks.triangulation import retriangulate
+from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.workflow import close_loops
+from maplab_py.algorithms.map_update.evidence import (
+    add_session,
+    birth_times_s,
+    read_evidence,
+    session_times_s,
+    with_evidence,
+)
+from maplab_py.algorithms.map_update.options import (
+    EvidenceReport,
+    GatheringReport,
+    MapUpdateReport,
+    UpdateOptions,
+)
+from maplab_py.algorithms.map_update.persistence import (
+    PersistenceOptions,
+    existence,
+    learn_detection,
+    summarise_oldest,
+)
+from maplab_py.algorithms.map_update.thinning import size_mb, thin
+from maplab_py.algorithms.map_update.visibility import outcome, predict
+from maplab_py.algorithms.vi_optimization.local import optimize_around
+from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.array_types import I64
+from maplab_py.errors import EstimationError, UserError
+from maplab_py.progress import SILENT, Progress
+from maplab_py.vimap import IdArray, VIMap, to_hex
+from maplab_py.vimap.edits import content_rng, with_new_ids
+from maplab_py.vimap.merge import check_disjoint, merge_maps
+
+_FIRST_ITERATIONS, _LOCAL_ITERATIONS = 10, 8
+_FREE, _FIXED = 150, 150
+"""Vertices beside the new ones that are optimised with them, and held fixed around them."""
+_MIN_OBSERVERS = 2
+"""After keyframing, which removes most observations."""
+_LIKELY = 0.5
+_BUDGET, _PERSISTENCE = UpdateOptions(), PersistenceOptions()
+_LOOPS, _KEYFRAMING = LoopClosureOptions(), KeyframingOptions()
+
+
+def prepare_session(
+    session: VIMap,
+    keyframing: KeyframingOptions = _KEYFRAMING,
+    *,
+    progress: Progress = SILENT,
+) -> VIMap:
+    """Return a session with landmarks, keyframed and optimised by itself.
+
+    Raises:
+        EstimationError: Nothing can be optimised.
+    """
+    steps = (
+        lambda m: init_tracks(m, LandmarkQualityOptions()),
+        lambda m: retriangulate(m, LandmarkQualityOptions()),
+        lambda m: keyframe(m, keyframing),
+        lambda m: evaluate_quality(m, LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)),
+        lambda m: optimize(
+            m, VIOptimizationOptions(num_iterations=_FIRST_ITERATIONS), progress=progress
+        ),
+    )
+    for step in steps:
+        progress.check()
+        session, _ = step(session)
+    return session
+
+
+def update_map(
+    vi_map: VIMap,
+    session: VIMap,
+    options: UpdateOptions = _BUDGET,
+    persistence: PersistenceOptions = _PERSISTENCE,
+    loops: LoopClosureOptions = _LOOPS,
+    keyframing: KeyframingOptions = _KEYFRAMING,
+    *,
+    assign_new_ids: bool = False,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, MapUpdateReport]:
+    """Update a map with the missions of a session.
+
+    Args:
+        vi_map: The map; a mission of it is anchored.
+        session: One or several missions that are not in the map.
+        options: The budget.
+        persistence: Priors of existence.
+        loops: How places are recognised.
+        keyframing: Of the session.
+        assign_new_ids: Whether the session may be in the map already; it is added once more.
+        progress: May cancel.
+
+    Raises:
+        UserError: No mission of the map is anchored.
+        MapError: The session does not fit the map, or is in it already.
+        EstimationError: The session cannot be anchored in the map, or not be optimised.
+    """
+    if not vi_map.baseframes.is_known[vi_map.missions.baseframe].any():
+        raise UserError(
+            "no mission of the map is anchored: run set_mission_baseframe_to_known first",
+            remedy="set_mission_baseframe_to_known",
+        )
+    if assign_new_ids:
+        session = with_new_ids(session, content_rng(vi_map, "update", session))
+    check_disjoint(vi_map, session)
+    prepared = prepare_session(session, keyframing, progress=progress)
+    whole, merged = merge_session(vi_map, prepared, loops, progress=progress)
+    lines = []
+    new_ids = prepared.missions.id
+    for mission in whole.mission_index.rows(new_ids).tolist():
+        whole, line = gather(whole, mission, persistence, progress=progress)
+        lines.append(line)
+    is_new = np.zeros(len(whole.missions), dtype=np.bool_)
+    is_new[whole.mission_index.rows(new_ids)] = True
+    result, thinned = thin(whole, is_new, options, persistence, progress)
+    return result, MapUpdateReport(
+        sessions=tuple(lines),
+        vertices_before=len(vi_map.vertices),
+        vertices_added=len(prepared.vertices),
+        vertices_removed=thinned.vertices,
+        vertices_after=len(result.vertices),
+        landmarks_before=len(vi_map.landmarks),
+        landmarks_added=len(prepared.landmarks),
+        landmarks_merged=merged,
+        landmarks_gone=thinned.landmarks_gone,
+        landmarks_thinned=thinned.landmarks_thinned,
+        landmarks_after=len(result.landmarks),
+        missions_removed=thinned.missions,
+        missions_without_imu=thinned.missions_without_imu,
+        megabytes_before=size_mb(vi_map),
+        megabytes_after=size_mb(result),
+    )
+
+
+def merge_session(
+    vi_map: VIMap,
+    session: VIMap,
+    loops: LoopClosureOptions = _LOOPS,
+    *,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, int]:
+    """Return the map with a prepared session anchored, merged and optimised, and the landmarks merged.
+
+    Raises:
+        MapError: The session does not fit the map, or is in it already.
+        EstimationError: The session cannot be anchored in the map, or not be optimised.
+    """
+    unknown = session.baseframes.replace(is_known=np.zeros(len(session.baseframes), dtype=np.bool_))
+    whole, _ = merge_maps(vi_map, session.replace(baseframes=unknown))
+    whole, report = anchor_missions(whole, loop_options=loops, progress=progress)
+    ids = session.missions.id
+    known = whole.baseframes.is_known[whole.missions.baseframe]
+    missing = whole.mission_index.rows(ids)[~known[whole.mission_index.rows(ids)]]
+    if len(missing):
+        raise EstimationError(
+            f"mission {to_hex(whole.missions.id[missing[0]])[:8]} of the session cannot be anchored "
+            f"in the map: {report.failure or 'too few places are recognised'}"
+        )
+    merged = 0
+    is_new = np.isin(whole.vertices.mission, whole.mission_index.rows(ids))
+    scope = SearchScope(is_new, ProjectionMemory())  # loops of the others were closed before
+    for _ in range(2):
+        whole, closed = close_loops(whole, loops, scope=scope, progress=progress)
+        merged += closed.landmarks_merged
+        whole = _optimized(whole, ids, progress)
+    quality = LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)
+    rows = whole.mission_index.rows(ids)
+    return evaluate_quality(whole, quality, missions=rows, progress=progress)[0], merged
+
+
+def _optimized(whole: VIMap, missions: IdArray, progress: Progress) -> VIMap:
+    rows: I64 = np.flatnonzero(np.isin(whole.vertices.mission, whole.mission_index.rows(missions)))
+    options = VIOptimizationOptions(
+        num_iterations=_LOCAL_ITERATIONS,
+        hide_iterations_console_output=True,
+        include_6dof_odometry=True,
+    )
+    return optimize_around(
+        whole, rows, options, max_free=_FREE, max_fixed=_FIXED, progress=progress
+    )[0]
+
+
+def gather(
+    vi_map: VIMap,
+    mission: int,
+    persistence: PersistenceOptions = _PERSISTENCE,
+    *,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, EvidenceReport]:
+    """Add the evidence of a mission (row) for the landmarks of earlier ones to the map.
+
+    Evidence of the mission that the map has already is not counted twice.
+
+    Raises:
+        EstimationError: The map has no descriptors.
+        MapError: The evidence in the map is damaged.
+    """
+    before, born = read_evidence(vi_map), birth_times_s(vi_map)
+    before["born_s"] = np.where(before["born_s"] > 0, before["born_s"], born)
+    session, false_match = outcome(vi_map, mission, predict(vi_map, mission, progress))
+    session = session.take(before["born_s"][session.landmark] < session.time_s)
+    detection = learn_detection(before, persistence)
+    _, full = add_session(before, session)
+    evidence, _ = add_session(summarise_oldest(before, full, persistence, detection), session)
+    gone = existence(evidence, persistence, detection=detection) < _LIKELY
+    report = EvidenceReport(
+        session=to_hex(vi_map.missions.id[mission])[:8],
+        date=_date(session.time_s),
+        predicted=len(session.landmark),
+        matched=int(np.count_nonzero(session.matched)),
+        false_match=false_match,
+        detection=detection.mean,
+        probably_gone=int(gone.sum()),
+    )
+    return with_evidence(vi_map, evidence), report
+
+
+def gather_all(
+    vi_map: VIMap,
+    persistence: PersistenceOptions = _PERSISTENCE,
+    *,
+    at_s: float | None = None,
+    progress: Progress = SILENT,
+) -> tuple[VIMap, GatheringReport]:
+    """Add the evidence of all anchored missions, in the order of time, and judge the landmarks.
+
+    Args:
+        vi_map: The map.
+        persistence: Priors of existence.
+        at_s: Time of the probabilities [s since 1970]; None = that of the last mission.
+        progress: May cancel.
+
+    Raises:
+        EstimationError: The map has no descriptors.
+        MapError: The evidence in the map is damaged.
+    """
+    times = session_times_s(vi_map)
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    lines = []
+    for mission in np.argsort(times, kind="stable"):
+        if known[mission]:
+            vi_map, line = gather(vi_map, int(mission), persistence, progress=progress)
+            lines.append(line)
+    evidence = read_evidence(vi_map)
+    at_s = float(times.max(initial=1)) if at_s is None else at_s
+    detection = learn_detection(evidence, persistence)
+    used = evidence["recent"]["time_s"][:, -1] > 0
+    exists = existence(evidence[used], persistence, at_s=at_s, detection=detection)
+    counts = np.histogram(exists, [0.0, 0.1, 0.5, 0.9, 1.0 + 1e-9])[0]
+    unknown = int(np.count_nonzero(~known))
+    note = f"{unknown} missions are not anchored and tell nothing" if unknown else ""
+    report = GatheringReport(
+        sessions=tuple(lines),
+        landmarks=len(evidence),
+        with_evidence=int(used.sum()),
+        detection=detection.mean,
+        date=_date(at_s),
+        certain=int(counts[3]),
+        likely=int(counts[2]),
+        unlikely=int(counts[1]),
+        gone=int(counts[0]),
+        note=note,
+    )
+    return vi_map, report
+
+
+def _date(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M}"

@@ -1,0 +1,226 @@
+"""Prediction of which landmarks a session should see, and which it sees.
+
+A landmark is predicted in an image if it projects into it, from a direction and distance near those of its
+observers, and nothing nearer hides it: neither landmarks that the image observes around it, nor a map's
+surfaces. It is matched if the image observes it, or a similar descriptor is near its projection.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from maplab_py.algorithms.landmarks.sightings import cameras_of
+from maplab_py.algorithms.loop_closure.features import most_frequent_kind
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.map_update.evidence import Session, session_times_s
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.distinct import distinct
+from maplab_py.geometry import se3, so3
+from maplab_py.progress import SILENT, Progress
+from maplab_py.sensors.projection import project
+from maplab_py.vimap import LandmarkQuality, VIMap, starts_of_counts
+from maplab_py.vision.descriptors import differences
+
+_RADIUS_PX = 8.0
+_BORDER_PX = 12.0
+_TURN_RAD = np.deg2rad(15.0)
+"""Tolerance on the direction from which a landmark is expected to be visible."""
+_RANGE = 1.3
+"""Tolerance on the distance, as a factor."""
+_HIDDEN_RATIO = 0.8
+"""A landmark is hidden where what is seen around it has less than this share of its depth."""
+_AROUND_PX, _AROUND = 60.0, 3
+"""Observed landmarks within this distance say what is seen around a landmark: the nearest few."""
+_DESCRIPTORS = 12
+"""Observations of a landmark whose descriptors are compared."""
+_BIT_FACTOR = 0.75
+"""Limit of a match as a share of what lc allows, as in its guided matching."""
+_PLACE_M, _SECTORS = 1.0, 8
+"""Images of one place: within a cell of that size, in the same of so many directions."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Envelopes:
+    """Directions and distances from which landmarks (L,) were observed."""
+
+    direction: F64  # (L, 3) unit, from the landmark to the middle of its observers
+    least_cosine: F64  # (L,)
+    nearest_m: F64  # (L,)
+    farthest_m: F64  # (L,)
+
+
+def envelopes(vi_map: VIMap, keypoints: I64) -> Envelopes:
+    """Return where landmarks were observed from by some keypoints (O,); no direction without any."""
+    landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
+    keypoints = keypoints[np.argsort(landmark, kind="stable")]
+    landmark = np.sort(landmark)
+    toward = vi_map.T_G_I[vi_map.keypoint_vertex[keypoints], 4:] - vi_map.p_G[landmark]
+    distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
+    toward /= distance[:, None]
+    count = len(vi_map.landmarks)
+    direction: F64 = np.stack(
+        [np.bincount(landmark, toward[:, axis], minlength=count) for axis in range(3)], axis=1
+    )
+    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    spread, nearest, farthest = np.ones(count), np.full(count, np.inf), np.zeros(count)
+    np.minimum.at(spread, landmark, np.einsum("ni,ni->n", toward, direction[landmark]))
+    np.minimum.at(nearest, landmark, distance)
+    np.maximum.at(farthest, landmark, distance)
+    widest = np.minimum(np.arccos(np.clip(spread, -1.0, 1.0)) + _TURN_RAD, np.pi)
+    return Envelopes(direction, np.cos(widest), nearest / _RANGE, farthest * _RANGE)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sightings:
+    """Pairs (N,) of an image and a landmark that should be visible in it."""
+
+    frame: I64
+    landmark: I64
+    heading_rad: F64  # of the optical axis
+    is_matched: Mask
+    is_false: Mask  # a random other landmark would have been matched there, too
+
+
+def predict(vi_map: VIMap, mission: int, progress: Progress = SILENT) -> Sightings:
+    """Predict the landmarks of other missions in the images of a mission, and match them.
+
+    Raises:
+        EstimationError: The map has no descriptors.
+    """
+    search = _Search(vi_map, mission)
+    frames = np.flatnonzero(vi_map.vertices.mission[vi_map.frames.vertex] == mission)
+    parts = []
+    for number, frame in enumerate(frames.tolist()):
+        progress.step(number, len(frames), "images")
+        parts.append(search.sightings(frame))
+    columns = zip(*parts, strict=True) if parts else ([],) * 5
+    kinds = (np.int64, np.int64, np.float64, np.bool_, np.bool_)
+    empty = (np.zeros(0, dtype=kind) for kind in kinds)
+    return Sightings(*(np.concatenate([e, *c]) for e, c in zip(empty, columns, strict=True)))
+
+
+def outcome(vi_map: VIMap, mission: int, sightings: Sightings) -> tuple[Session, float]:
+    """Return the outcome of a mission by places, and the probability of a false match in it."""
+    vertex = vi_map.frames.vertex[sightings.frame]
+    sector = np.floor(sightings.heading_rad / (2.0 * np.pi) * _SECTORS)
+    cell = np.column_stack([np.floor(vi_map.T_G_I[vertex, 4:] / _PLACE_M), sector])
+    _, place = np.unique(cell, axis=0, return_inverse=True)
+    count, places = len(vi_map.landmarks), int(place.max(initial=0)) + 1
+    key = sightings.landmark * places + place.reshape(-1)
+
+    def places_of(mask: Mask) -> I64:
+        return np.bincount(distinct(key[mask]) // places, minlength=count)
+
+    predicted = places_of(np.ones(len(key), dtype=np.bool_))
+    matched, false = places_of(sightings.is_matched), places_of(sightings.is_false)
+    rows = np.flatnonzero(predicted)
+    rate = float(np.count_nonzero(false[rows])) / max(len(rows), 1)
+    time_s = int(session_times_s(vi_map)[mission])
+    return Session(time_s, rows, predicted[rows], matched[rows]), rate
+
+
+class _Search:
+    """Data of the map that the searches in all images of a mission use."""
+
+    def __init__(self, vi_map: VIMap, mission: int) -> None:
+        options = LoopClosureOptions()
+        keypoints = vi_map.observations
+        is_other = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]] != mission
+        others = keypoints[is_other]
+        self._map = vi_map
+        self._envelopes = envelopes(vi_map, others)
+        self._is_old = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
+        self._is_old[vi_map.keypoints.landmark[others]] = True
+        self._is_old &= vi_map.landmarks.quality == LandmarkQuality.GOOD
+        self._old = np.flatnonzero(self._is_old)
+        every = np.ones(len(vi_map.frames), dtype=np.bool_)
+        kind, self._described = most_frequent_kind(vi_map, every, options.type_number)
+        self._words = kind.comparable(
+            np.ascontiguousarray(vi_map.keypoints.descriptor[:, : kind.size])
+        )
+        limit = kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
+        self._limit = _BIT_FACTOR * limit
+        others = others[self._described[others]]
+        landmark = vi_map.keypoints.landmark[others]
+        order = np.lexsort((-others, landmark))  # the newest first
+        self._rows = others[order]
+        self._start = starts_of_counts(np.bincount(landmark, minlength=len(vi_map.landmarks)))
+        self._is_good = vi_map.landmarks.quality == LandmarkQuality.GOOD
+        self._random = np.random.default_rng(0).permutation(self._old)  # landmarks for comparison
+
+    def sightings(self, frame: int) -> tuple[I64, I64, F64, Mask, Mask]:
+        """Return the columns of the sightings of an image."""
+        vi_map = self._map
+        start = vi_map.keypoint_start
+        keypoints = np.arange(start[frame], start[frame + 1])
+        none = np.zeros(0, dtype=np.int64)
+        no = none.astype(np.bool_)
+        nothing = none, none, none.astype(np.float64), no, no
+        if len(keypoints) == 0 or len(self._old) == 0:
+            return nothing
+        camera, T_I_C, _ = next(iter(cameras_of(vi_map, keypoints[:1])))
+        T_G_C = se3.compose(vi_map.T_G_I[vi_map.frames.vertex[frame]], T_I_C)
+        rows = self._in_reach(T_G_C[4:])
+        p_C = se3.transform(se3.inverse(T_G_C), vi_map.p_G[rows])
+        uv, is_visible = project(camera, p_C)
+        inside = is_visible & np.all(uv > _BORDER_PX, axis=1)
+        inside &= np.all(uv < np.array([camera.width_px, camera.height_px]) - _BORDER_PX, axis=1)
+        rows, uv, depth_m = rows[inside], uv[inside], np.linalg.norm(p_C[inside], axis=1)
+        if len(rows) == 0:
+            return nothing
+        near = self._near(keypoints, uv)
+        is_matched = self._is_similar(rows, *near)
+        is_matched |= np.isin(rows, vi_map.keypoints.landmark[keypoints])
+        other = self._random[np.searchsorted(self._old, rows)]
+        is_false = self._is_similar(other, *near)
+        kept = is_matched | ~self._is_hidden(keypoints, uv, depth_m, T_G_C[4:])
+        rows = rows[kept]
+        axis_G = so3.rotate(T_G_C[:4], np.array([0.0, 0.0, 1.0]))
+        heading = np.full(len(rows), np.arctan2(axis_G[1], axis_G[0]))
+        return np.full(len(rows), frame), rows, heading, is_matched[kept], is_false[kept]
+
+    def _in_reach(self, eye: F64) -> I64:
+        """Return the old landmarks that are seen from a place (3,), as far as direction and distance tell."""
+        e, rows = self._envelopes, self._old
+        toward = eye - self._map.p_G[rows]
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = np.einsum("ni,ni->n", toward, e.direction[rows]) / np.maximum(distance, 1e-9)
+        reached = (distance > e.nearest_m[rows]) & (distance < e.farthest_m[rows])
+        return np.asarray(rows[reached & (cosine > e.least_cosine[rows])])
+
+    def _near(self, keypoints: I64, uv: F64) -> tuple[I64, I64]:
+        """Return keypoints near pixels (N, 2), as pairs of index and keypoint."""
+        mine = keypoints[self._described[keypoints]]
+        offset = uv[:, None] - self._map.keypoints.uv_px[mine][None]
+        index, column = np.nonzero(np.einsum("nki,nki->nk", offset, offset) < _RADIUS_PX**2)
+        return index, mine[column]
+
+    def _is_similar(self, landmarks: I64, index: I64, keypoint: I64) -> Mask:
+        """Return which landmarks (N,) look like one of their keypoints."""
+        counts = np.minimum(np.diff(self._start)[landmarks], _DESCRIPTORS)[index]
+        owner = np.repeat(np.arange(len(index)), counts)
+        within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+        row = self._rows[self._start[landmarks[index[owner]]] + within]
+        bits = differences(self._words, keypoint[owner], self._words, row)
+        result = np.zeros(len(landmarks), dtype=np.bool_)
+        result[index[owner[bits <= self._limit]]] = True
+        return result
+
+    def _is_hidden(self, keypoints: I64, uv: F64, depth_m: F64, eye: F64) -> Mask:
+        """Return which pixels (N, 2) show something much nearer than a depth (N,)."""
+        landmark = self._map.keypoints.landmark[keypoints]
+        seen = landmark >= 0
+        seen[seen] = self._is_good[landmark[seen]]
+        if not seen.any():
+            return np.zeros(len(uv), dtype=np.bool_)
+        seen_uv = self._map.keypoints.uv_px[keypoints[seen]]
+        seen_m = np.linalg.norm(self._map.p_G[landmark[seen]] - eye, axis=1)
+        squares = np.sum(np.square(uv[:, None] - seen_uv[None]), axis=2)
+        count = min(_AROUND, len(seen_m))
+        nearest = np.argpartition(squares, count - 1, axis=1)[:, :count]
+        is_near = np.take_along_axis(squares, nearest, axis=1) < _AROUND_PX**2
+        is_nearer = seen_m[nearest] < _HIDDEN_RATIO * depth_m[:, None]
+        around = is_near.sum(axis=1)
+        return np.asarray((around > 0) & (2 * (is_near & is_nearer).sum(axis=1) > around))

@@ -1,0 +1,92 @@
+"""Commands that keep a map up to date with new sessions."""
+
+from __future__ import annotations
+
+from maplab_plugins.evaluation import map_of_key_or_folder
+from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.map_update.options import (
+    GatheringReport,
+    MapUpdateReport,
+    UpdateOptions,
+)
+from maplab_py.algorithms.map_update.persistence import PersistenceOptions
+from maplab_py.plugin import CommandContext, UserError, command
+
+
+@command(
+    "update_map",
+    example="update_map --session=tuesday --max_landmarks=20000 --max_vertices=1000",
+    see_also=("gather_evidence", "landmark_sparsify", "compare_maps"),
+)
+def update_map(
+    context: CommandContext,
+    session: str = "",
+    *,
+    options: UpdateOptions = UpdateOptions(),
+    persistence: PersistenceOptions = PersistenceOptions(),
+    loop_options: LoopClosureOptions = LoopClosureOptions(),
+    keyframing: KeyframingOptions = KeyframingOptions(),
+    assign_new_ids: bool = False,
+) -> MapUpdateReport:
+    """Update the map with a new session, and keep it within a budget.
+
+    The session is keyframed, anchored, merged and optimised while most of the map is held fixed. What it
+    should have seen and what it saw becomes evidence. Landmarks that hardly exist any more are removed;
+    beyond the budget also those that are least useful, and vertices that others cover. Missions that lose
+    vertices lose their inertial measurements: their poses are joined by odometry edges.
+
+    Args:
+        session: Key of a map in memory, or folder of a map, with the missions of the session.
+        assign_new_ids: Add a session whose ids are in the map already once more.
+    """
+    from maplab_py.algorithms.map_update.update import update_map as update
+
+    if not session:
+        raise UserError("the session is missing: give --session=FOLDER, a map of the new session")
+    return context.apply(
+        update,
+        map_of_key_or_folder(context, session),
+        options,
+        persistence,
+        loop_options,
+        keyframing,
+        assign_new_ids=assign_new_ids,
+        progress=context.progress,
+    )
+
+
+@command(
+    "gather_evidence",
+    example="gather_evidence --date=2027-01-31",
+    see_also=("update_map", "landmark_sparsify"),
+)
+def gather_evidence(
+    context: CommandContext,
+    *,
+    persistence: PersistenceOptions = PersistenceOptions(),
+    date: str = "",
+    forget: bool = False,
+) -> GatheringReport:
+    """Compare what each session of the map saw with what it should have seen, and judge the landmarks.
+
+    Evidence of sessions that the map does not hold any more stays. landmark_sparsify chooses by the
+    evidence instead of by observer counts.
+
+    Args:
+        date: Date of the probabilities that landmarks exist, as 2027-01-31; empty = the last session's.
+        forget: Remove the evidence that the map has first.
+    """
+    from datetime import UTC, datetime
+
+    from maplab_py.algorithms.map_update.evidence import with_evidence
+    from maplab_py.algorithms.map_update.update import gather_all
+
+    try:
+        at_s = datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp() if date else None
+    except ValueError:
+        raise UserError(f"--date={date} is not a date: write it as 2027-01-31") from None
+    vi_map = with_evidence(context.vi_map, None) if forget else context.vi_map
+    result, report = gather_all(vi_map, persistence, at_s=at_s, progress=context.progress)
+    context.commit(result)
+    return report

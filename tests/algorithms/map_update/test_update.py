@@ -1,0 +1,107 @@
+"""Updates of a map with simulated sessions."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from maplab_py.algorithms.map_update.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.map_update.options import UpdateOptions
+from maplab_py.algorithms.map_update.update import prepare_session, update_map
+from maplab_py.console.session.session import Session
+from maplab_py.errors import MapError, UserError
+from maplab_py.simulation.scenario import ChangeOptions, SessionOptions
+from maplab_py.simulation.simulate import SimulatedData, simulate
+from maplab_py.vimap import VIMap
+from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.tables import Backbone
+from tests.simulation.small import SMALL
+
+SCAN = SessionOptions(duration_s=8.0, turns=0.5)
+YEAR = dataclasses.replace(
+    SMALL,
+    changes=ChangeOptions(days_between_sessions=30.0, moved_share=0.5, replaced_posters=1),
+    sessions=(SCAN, SCAN, dataclasses.replace(SCAN, height_m=1.6)),
+)
+
+
+@cache
+def sessions() -> SimulatedData:
+    return simulate(YEAR)
+
+
+@cache
+def first() -> VIMap:
+    prepared = prepare_session(sessions().maps[0])
+    known = prepared.baseframes.replace(is_known=np.ones(1, dtype=np.bool_))
+    return prepared.replace(baseframes=known)
+
+
+@cache
+def updated() -> tuple[VIMap, object]:
+    return update_map(first(), sessions().maps[1])
+
+
+def test_an_update_without_a_budget_keeps_everything_and_gathers_evidence() -> None:
+    vi_map, report = updated()
+    assert check_consistency(vi_map).errors == ()
+    assert report.landmarks_gone == report.landmarks_thinned == report.vertices_removed == 0
+    assert report.vertices_after == report.vertices_before + report.vertices_added
+    assert (vi_map.landmark_index.rows(first().landmarks.id) >= 0).mean() > 0.8
+    line = report.sessions[0]
+    assert line.predicted > 50
+    assert line.matched > 0.4 * line.predicted
+    assert line.false_match < 0.05
+    evidence = read_evidence(vi_map)
+    assert np.count_nonzero(evidence["recent"]["time_s"][:, -1]) == line.predicted
+
+
+def test_a_budget_is_kept_and_old_missions_are_joined_by_odometry() -> None:
+    vi_map, _ = updated()
+    options = UpdateOptions(max_landmarks=300, max_vertices=len(vi_map.vertices) - 4)
+    result, report = update_map(vi_map, sessions().maps[2], options)
+    assert check_consistency(result).errors == ()
+    assert len(result.landmarks) <= 300
+    assert len(result.vertices) == options.max_vertices == report.vertices_after
+    assert has_evidence(result)
+    thinned = result.missions.backbone == Backbone.ODOMETRY
+    assert np.count_nonzero(thinned) == report.missions_without_imu > 0
+    assert not thinned[-1]
+    assert not thinned[result.vertices.mission[result.imu_edges.from_vertex]].any()
+    assert len(result.transformation_edges) > 0
+
+
+def test_a_size_is_kept() -> None:
+    session = Session()
+    session.maps.add("session", sessions().maps[2])
+    session.maps.add("map", updated()[0])
+    before = session.vi_map
+    flags = {"session": "session", "max_map_mb": 0.4}
+    planned = session.run("update_map", dry_run=True, **flags)
+    assert session.vi_map is before
+    done = session.run("update_map", **flags)
+    assert done.megabytes_after == planned.megabytes_after <= 0.4 < done.megabytes_before
+    session.run("undo")
+    assert session.vi_map is before
+    judged = session.run("gather_evidence", date="2021-01-01")
+    assert judged.with_evidence == sum(
+        (judged.certain, judged.likely, judged.unlikely, judged.gone)
+    )
+    assert len(judged.sessions) == 2
+
+
+def test_mistakes_are_one_line() -> None:
+    vi_map, _ = updated()
+    with pytest.raises(MapError, match="is in both maps"):
+        update_map(vi_map, sessions().maps[1])
+    with pytest.raises(UserError, match="set_mission_baseframe_to_known"):
+        update_map(sessions().maps[0], sessions().maps[1])
+    session = Session()
+    session.maps.add("map", vi_map)
+    with pytest.raises(UserError, match="--session=FOLDER"):
+        session.run("update_map")
+    with pytest.raises(UserError, match="neither a map in memory"):
+        session.run("update_map", session="nowhere")
+    with pytest.raises(UserError, match="2027-01-31"):
+        session.run("gather_evidence", date="tomorrow")
