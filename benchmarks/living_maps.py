@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks.evidence import read_evidence, with_evidence
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import align_robustly, localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.map_update.evidence import read_evidence, with_evidence
 from maplab_py.algorithms.map_update.options import UpdateOptions
-from maplab_py.algorithms.map_update.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.map_update.thinning import choose_vertices, size_mb, thin
 from maplab_py.algorithms.map_update.update import gather, merge_session, prepare_session
 from maplab_py.algorithms.sparsification.options import SparsificationOptions

@@ -70,7 +70,7 @@ class _Builder:
             low, high = world.boxes[box]
             inside = np.all((world.p_G > low - _ON_BOX_M) & (world.p_G < high + _ON_BOX_M), axis=1)
             self._piece[inside] = box
-        share = 0.5 * changes.one_light_share
+        share = 0.5 * changes.single_light_share
         draw = rng.uniform(size=int(world.look.max()) + 1)
         self._light_of_look = np.where(draw < share, 0, np.where(draw < 2.0 * share, 1, -1))
 

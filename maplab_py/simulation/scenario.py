@@ -140,13 +140,13 @@ class ChangeOptions:
     refurbished_session: int = option(0, ge=0)  # before which much changes; 0 = none
     refurbished_share: float = option(0.5, ge=0, le=1)  # of the furniture: replaced by other pieces
     refurbished_posters: int = option(6, ge=0)  # per room
-    one_light_share: float = option(0.0, ge=0, le=1)  # of landmarks: seen in one of two lights
+    single_light_share: float = option(0.0, ge=0, le=1)  # of landmarks: seen in one of two lights
     light_change: float = option(0.0, ge=0)  # of activations, between the lights
 
     @property
     def are_any(self) -> bool:
         """Return whether the world differs between sessions."""
-        return max(self.moved_share, self.one_light_share) > 0.0 or (
+        return max(self.moved_share, self.single_light_share) > 0.0 or (
             max(self.replaced_posters, self.refurbished_session) > 0
         )
 

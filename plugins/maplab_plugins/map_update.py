@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from maplab_plugins.evaluation import map_of_key_or_folder
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.map_update.options import (
     GatheringReport,
     MapUpdateReport,
     UpdateOptions,
 )
-from maplab_py.algorithms.map_update.persistence import PersistenceOptions
 from maplab_py.plugin import CommandContext, UserError, command
 
 
@@ -79,7 +79,7 @@ def gather_evidence(
     """
     from datetime import UTC, datetime
 
-    from maplab_py.algorithms.map_update.evidence import with_evidence
+    from maplab_py.algorithms.landmarks.evidence import with_evidence
     from maplab_py.algorithms.map_update.update import gather_all
 
     try:

@@ -54,7 +54,7 @@ def test_posters_and_a_refurbishment_replace_points_by_others() -> None:
 
 
 def test_a_share_of_the_points_is_seen_in_one_light_only() -> None:
-    world = changing_world(ChangeOptions(moved_share=0.1, one_light_share=0.4))
+    world = changing_world(ChangeOptions(moved_share=0.1, single_light_share=0.4))
     seen = [visible_in_light(world, light) for light in (0, 1)]
     assert 0.1 < (~seen[0]).mean() < 0.3
     assert (seen[0] | seen[1]).all()

@@ -6,6 +6,12 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks.evidence import (
+    has_evidence,
+    inherit,
+    read_evidence,
+    with_evidence,
+)
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.landmarks.quality import predicted_sigma
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
@@ -14,12 +20,6 @@ from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
-from maplab_py.algorithms.map_update.evidence import (
-    has_evidence,
-    inherit,
-    read_evidence,
-    with_evidence,
-)
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3

@@ -9,7 +9,7 @@ from maplab_py.report import Report
 
 
 class UpdateOptions(Options, prefix=""):
-    """Budget of a map, and when landmarks count as gone."""
+    """Budget of a map, and when landmarks count as vanished."""
 
     max_landmarks: int = option(0, ge=0)
     """Largest number of landmarks after the update; 0 = no limit"""
@@ -17,7 +17,7 @@ class UpdateOptions(Options, prefix=""):
     """Largest number of vertices after the update; 0 = no limit"""
     max_map_mb: float = option(0.0, ge=0, unit="MB")
     """Largest size of the map in memory after the update; 0 = no limit"""
-    gone_below: float = option(0.05, ge=0, le=1)
+    vanished_below: float = option(0.05, ge=0, le=1)
     """Landmarks that exist with less than this probability are removed, never after a single miss"""
     observers_kept: int = option(3, ge=1, le=8)
     """Number of vertices that a landmark should keep as observers when vertices are removed"""
@@ -33,7 +33,7 @@ class EvidenceReport(Report):
     matched: int
     false_match: float  # probability that a random landmark would have been matched
     detection: float  # mean probability that an existing landmark is matched
-    probably_gone: int  # landmarks that now exist with a probability below one half
+    probably_vanished: int  # landmarks that now exist with a probability below one half
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class GatheringReport(Report):
     certain: int  # above 0.9
     likely: int  # 0.5 to 0.9
     unlikely: int  # 0.1 to 0.5
-    gone: int  # below 0.1
+    vanished: int  # below 0.1
     note: str = ""
 
 
@@ -65,7 +65,7 @@ class MapUpdateReport(Report):
     landmarks_before: int
     landmarks_added: int
     landmarks_merged: int
-    landmarks_gone: int  # removed because they hardly exist any more
+    landmarks_vanished: int  # removed because they hardly exist any more
     landmarks_thinned: int  # removed because others are more useful
     landmarks_after: int
     missions_removed: int  # none of their vertices stayed

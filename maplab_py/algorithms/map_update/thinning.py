@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.map_update.evidence import read_evidence
+from maplab_py.algorithms.landmarks.evidence import read_evidence
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.map_update.options import UpdateOptions
-from maplab_py.algorithms.map_update.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.selection import (
     CoverageProblem,
@@ -44,7 +44,7 @@ from maplab_py.vimap.tables import Backbone, ImuEdges, ImuSamples
 from maplab_py.vimap.vertex_removal import remove_vertices
 
 _MIN_MISSES = 2
-"""Sessions that missed a landmark before it counts as gone, however unlikely it is."""
+"""Sessions that missed a landmark before it counts as vanished, however unlikely it is."""
 _ROUNDS, _MARGIN = 6, 0.97
 """Rounds in which both budgets shrink until the map is small enough, and the margin of each."""
 _DRIFT, _SIGMA_M, _SIGMA_RAD = 0.01, 0.01, 0.005
@@ -55,7 +55,7 @@ _DRIFT, _SIGMA_M, _SIGMA_RAD = 0.01, 0.01, 0.005
 class Thinned:
     """Numbers of what was removed."""
 
-    landmarks_gone: int
+    landmarks_vanished: int
     landmarks_thinned: int
     vertices: int
     missions: int
@@ -74,7 +74,7 @@ def thin(
     persistence: PersistenceOptions,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, Thinned]:
-    """Remove landmarks that are gone, and what exceeds the budget.
+    """Remove landmarks that no longer exist, and what exceeds the budget.
 
     Args:
         vi_map: The map.
@@ -83,9 +83,9 @@ def thin(
         persistence: Priors of existence.
         progress: May cancel.
     """
-    gone = gone_landmarks(vi_map, options, persistence)
+    vanished = vanished_landmarks(vi_map, options, persistence)
     before = len(vi_map.landmarks)
-    vi_map = remove_landmarks(vi_map, gone)
+    vi_map = remove_landmarks(vi_map, vanished)
     start, ids = vi_map, vi_map.missions.id[new]
     landmarks = options.max_landmarks or len(vi_map.landmarks)
     vertices = options.max_vertices or len(vi_map.vertices)
@@ -98,22 +98,24 @@ def thin(
         landmarks = max(int(share * len(vi_map.landmarks)), 1)
         vertices = max(int(share * len(vi_map.vertices)), 1)
     return vi_map, Thinned(
-        landmarks_gone=int(gone.sum()),
-        landmarks_thinned=before - int(gone.sum()) - len(vi_map.landmarks),
+        landmarks_vanished=int(vanished.sum()),
+        landmarks_thinned=before - int(vanished.sum()) - len(vi_map.landmarks),
         vertices=len(start.vertices) - len(vi_map.vertices),
         missions=len(start.missions) - len(vi_map.missions),
         missions_without_imu=without_imu,
     )
 
 
-def gone_landmarks(vi_map: VIMap, options: UpdateOptions, persistence: PersistenceOptions) -> Mask:
+def vanished_landmarks(
+    vi_map: VIMap, options: UpdateOptions, persistence: PersistenceOptions
+) -> Mask:
     """Return the landmarks (L,) that hardly exist and were missed by several sessions."""
     evidence = read_evidence(vi_map)
     recent = evidence["recent"]
     missed = (recent["time_s"] > 0) & (recent["matched"] == 0)
     misses = evidence["misses"] + missed.sum(axis=1)
     exists = existence(evidence, persistence)
-    return np.asarray((exists < options.gone_below) & (misses >= _MIN_MISSES))
+    return np.asarray((exists < options.vanished_below) & (misses >= _MIN_MISSES))
 
 
 def _within(

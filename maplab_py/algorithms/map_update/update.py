@@ -9,31 +9,31 @@ import numpy as np
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.quality import evaluate_quality
-from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.algorithms.landmarks.triangulation import retriangulate
-from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
-from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.algorithms.map_update.evidence import (
+from maplab_py.algorithms.landmarks.evidence import (
     add_session,
     birth_times_s,
     read_evidence,
     session_times_s,
     with_evidence,
 )
+from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
+from maplab_py.algorithms.landmarks.persistence import (
+    PersistenceOptions,
+    existence,
+    learn_detection,
+    summarise_oldest,
+)
+from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.landmarks.tracks import init_tracks
+from maplab_py.algorithms.landmarks.triangulation import retriangulate
+from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.map_update.options import (
     EvidenceReport,
     GatheringReport,
     MapUpdateReport,
     UpdateOptions,
-)
-from maplab_py.algorithms.map_update.persistence import (
-    PersistenceOptions,
-    existence,
-    learn_detection,
-    summarise_oldest,
 )
 from maplab_py.algorithms.map_update.thinning import size_mb, thin
 from maplab_py.algorithms.map_update.visibility import outcome, predict
@@ -138,7 +138,7 @@ def update_map(
         landmarks_before=len(vi_map.landmarks),
         landmarks_added=len(prepared.landmarks),
         landmarks_merged=merged,
-        landmarks_gone=thinned.landmarks_gone,
+        landmarks_vanished=thinned.landmarks_vanished,
         landmarks_thinned=thinned.landmarks_thinned,
         landmarks_after=len(result.landmarks),
         missions_removed=thinned.missions,
@@ -218,7 +218,7 @@ def gather(
     detection = learn_detection(before, persistence)
     _, full = add_session(before, session)
     evidence, _ = add_session(summarise_oldest(before, full, persistence, detection), session)
-    gone = existence(evidence, persistence, detection=detection) < _LIKELY
+    vanished = existence(evidence, persistence, detection=detection) < _LIKELY
     report = EvidenceReport(
         session=to_hex(vi_map.missions.id[mission])[:8],
         date=_date(session.time_s),
@@ -226,7 +226,7 @@ def gather(
         matched=int(np.count_nonzero(session.matched)),
         false_match=false_match,
         detection=detection.mean,
-        probably_gone=int(gone.sum()),
+        probably_vanished=int(vanished.sum()),
     )
     return with_evidence(vi_map, evidence), report
 
@@ -274,7 +274,7 @@ def gather_all(
         certain=int(counts[3]),
         likely=int(counts[2]),
         unlikely=int(counts[1]),
-        gone=int(counts[0]),
+        vanished=int(counts[0]),
         note=note,
     )
     return vi_map, report

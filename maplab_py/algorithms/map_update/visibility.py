@@ -11,10 +11,10 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks.evidence import Session, session_times_s
 from maplab_py.algorithms.landmarks.sightings import cameras_of
 from maplab_py.algorithms.loop_closure.features import most_frequent_kind
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.map_update.evidence import Session, session_times_s
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3

@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.map_update.evidence import has_evidence, read_evidence
-from maplab_py.algorithms.map_update.persistence import (
+from maplab_py.algorithms.landmarks.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.landmarks.persistence import (
     PersistenceOptions,
     existence,
     learn_detection,
     match_rates,
 )
+from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.sparsification import selection
 from maplab_py.algorithms.sparsification.options import (
     CoverageOfMission,

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.map_update.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.landmarks.evidence import has_evidence, read_evidence
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.update import prepare_session, update_map
 from maplab_py.console.session.session import Session
@@ -46,7 +46,7 @@ def updated() -> tuple[VIMap, object]:
 def test_an_update_without_a_budget_keeps_everything_and_gathers_evidence() -> None:
     vi_map, report = updated()
     assert check_consistency(vi_map).errors == ()
-    assert report.landmarks_gone == report.landmarks_thinned == report.vertices_removed == 0
+    assert report.landmarks_vanished == report.landmarks_thinned == report.vertices_removed == 0
     assert report.vertices_after == report.vertices_before + report.vertices_added
     assert (vi_map.landmark_index.rows(first().landmarks.id) >= 0).mean() > 0.8
     line = report.sessions[0]
@@ -86,7 +86,7 @@ def test_a_size_is_kept() -> None:
     assert session.vi_map is before
     judged = session.run("gather_evidence", date="2021-01-01")
     assert judged.with_evidence == sum(
-        (judged.certain, judged.likely, judged.unlikely, judged.gone)
+        (judged.certain, judged.likely, judged.unlikely, judged.vanished)
     )
     assert len(judged.sessions) == 2
 

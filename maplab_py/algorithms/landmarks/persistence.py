@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.map_update.evidence import NEVER, RECENT
+from maplab_py.algorithms.landmarks.evidence import NEVER, RECENT
 from maplab_py.array_types import F64, Mask, NDArray
 from maplab_py.options import Options, option
 
@@ -108,7 +108,7 @@ def learn_detection(evidence: NDArray[Any], options: PersistenceOptions) -> Dete
     given = Detection(2.0 * options.detection, 2.0 * (1.0 - options.detection))
     if int(np.count_nonzero(used["recent"]["time_s"])) < _MIN_SESSIONS:
         return given
-    best, found = -np.inf, given
+    best, learned = -np.inf, given
     for mean in _MEANS:
         for strength in _STRENGTHS:
             prior = Detection(strength * mean, strength * (1.0 - mean))
@@ -119,8 +119,8 @@ def learn_detection(evidence: NDArray[Any], options: PersistenceOptions) -> Dete
             alive = state.exists + state.log_survival(state.time_s)
             total = float(np.logaddexp(state.vanished, alive).sum())
             if total > best:
-                best, found = total, prior
-    return found
+                best, learned = total, prior
+    return learned
 
 
 def summarise_oldest(

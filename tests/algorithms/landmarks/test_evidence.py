@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.map_update.evidence import (
+from maplab_py.algorithms.landmarks.evidence import (
     LANDMARK_EVIDENCE,
     RECENT,
     Session,
@@ -13,7 +13,7 @@ from maplab_py.algorithms.map_update.evidence import (
     read_evidence,
     with_evidence,
 )
-from maplab_py.algorithms.map_update.persistence import (
+from maplab_py.algorithms.landmarks.persistence import (
     Detection,
     PersistenceOptions,
     existence,
